@@ -31,10 +31,10 @@ def skew(v: Any) -> ca.SX:
 
 def rotation_about(axis: Any, angle: Any) -> ca.SX:
     """Rotation by `angle` about the constant unit `axis` (Rodrigues)."""
-    axis = np.asarray(axis, dtype=float)
-    k = ca.SX(ca.sparsify(ca.DM(skew(axis))))
-    kk = ca.SX(ca.sparsify(ca.DM(k @ k)))
-    return ca.SX.eye(3) + ca.sin(angle) * k + (1 - ca.cos(angle)) * kk
+    a = np.asarray(axis, dtype=float)
+    along = constant(np.outer(a, a))
+    across = constant(np.eye(3) - np.outer(a, a))
+    return along + ca.cos(angle) * across + ca.sin(angle) * constant(ca.DM(skew(a)))
 
 
 def rotation_from_vector(r: Any) -> ca.SX:
@@ -66,7 +66,7 @@ def transform(rotation: Any = None, translation: Any = None) -> ca.SX:
 
 
 def constant(T: Any) -> ca.SX:
-    """A numeric transform as SX with exact zeros dropped, so that products stay small."""
+    """A numeric matrix as SX with exact zeros dropped, so that products stay small."""
     return ca.SX(ca.sparsify(ca.DM(np.asarray(T, dtype=float))))
 
 
