@@ -1,0 +1,147 @@
+"""The chain under construction: what effects change, and how it is put together.
+
+    commanded joints → transmission → links → loads → compliance → tool/markers → tracker
+
+All fields are CasADi expressions in the arm's inputs (what the table says of one row), its
+parameters and the elastic deflections θ.  Positions and forces are in the data's frame
+(tracker frame, z vertical).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from elastocal.cell import Cell
+from elastocal.errors import InputError
+from elastocal.manipulator import rigid
+from elastocal.manipulator.chain import Chain
+
+
+@dataclass(frozen=True)
+class Spring:
+    """One elastic degree of freedom: a small joint inserted into the chain.
+
+    `site` is "base" (between base frame and joint 1's placement), "jointN" (just before joint
+    N moves, fixed to the proximal link) or "linkN" (at link N's distal end); `kind` and `axis`
+    as for a joint, in the frame of the site.  `law` gives the deflection as a function of the
+    generalised force that the loads exert on it: θ = law(τ).
+    """
+
+    name: str
+    site: str
+    kind: str
+    axis: tuple[float, float, float]
+    law: Callable[[ca.SX], ca.SX]
+
+    @classmethod
+    def linear(cls, name: str, site: str, kind: str, axis: Any, compliance: ca.SX) -> Spring:
+        """A spring with θ = k τ, k in rad/(N m) or m/N."""
+        x, y, z = (float(a) for a in axis)
+        return cls(name, site, kind, (x, y, z), lambda tau: compliance * tau)
+
+
+class Arm:
+    """Builder handed from effect to effect; `assemble` turns its pieces into positions."""
+
+    def __init__(self, chain: Chain, cell: Cell) -> None:
+        n = chain.n_joints
+        self.chain, self.cell = chain, cell
+        self.inputs: dict[str, ca.SX] = {}
+        self.q_commanded = self.input("q", n)
+        self.q = [self.q_commanded[i] for i in range(n)]
+        distal = [joint.placement for joint in chain.joints[1:]] + [chain.flange_placement]
+        self.links = [rigid.constant(T) for T in distal]
+        nominal = cell.model.nominal
+        self.T_tracker_base = rigid.transform(
+            None if nominal.base_rotation is None else rigid.constant(nominal.base_rotation),
+            None if nominal.base_position is None else rigid.constant(nominal.base_position),
+        )
+        self.markers = {
+            name: rigid.constant(position) for name, position in cell.tool.markers.items()
+        }
+        self.marker_rotation = {name: ca.SX.eye(3) for name in self.markers}
+        anchor = cell.tracker.anchor
+        self.anchor = ca.SX.zeros(3) if anchor is None else rigid.constant(anchor)
+        self.length_offset = ca.SX(0)
+        self.springs: list[Spring] = []
+        self.potential = ca.SX(0)
+        self.theta = ca.SX.zeros(0, 1)
+        self.T_tracker_link: list[ca.SX] = []
+        self.T_tracker_flange = ca.SX.eye(4)
+        self.reading: dict[str, ca.SX] = {}
+
+    def input(self, name: str, size: int) -> ca.SX:
+        """The row's value of a table quantity ("q", "force", "time", …), declared on first use."""
+        if name not in self.inputs:
+            self.inputs[name] = ca.SX.sym(name, size)
+        return self.inputs[name]
+
+    def add_spring(self, spring: Spring) -> None:
+        self.springs.append(spring)
+
+    def add_force(self, point: ca.SX, force: Any) -> None:
+        """Dead force (3,) N at a point (3,) that moves with the arm: V = −f·p."""
+        self.potential -= ca.dot(ca.SX(force), point)
+
+    def add_potential(self, potential: ca.SX) -> None:
+        """Potential energy in J of a conservative load."""
+        self.potential += potential
+
+    def joint_angle(self, i: int) -> ca.SX:
+        """Joint i's angle (0-based) with the deflection of its own springs about its axis."""
+        axis = tuple(float(a) for a in self.chain.joints[i].axis)
+        own = [
+            self.theta[k]
+            for k, s in enumerate(self.springs)
+            if s.site == f"joint{i + 1}" and s.axis == axis
+        ]
+        return self.q[i] + sum(own)
+
+    def assemble(self) -> None:
+        """Compose base, springs, joints and links into frames and marker positions."""
+        self.theta = ca.SX.sym("theta", len(self.springs))
+        T = self.T_tracker_base @ self._deflection("base")
+        T = T @ rigid.constant(self.chain.joints[0].placement)
+        for i, joint in enumerate(self.chain.joints):
+            motion = rigid.joint_motion(joint.kind, joint.axis, self.q[i])
+            T = T @ self._deflection(f"joint{i + 1}") @ motion
+            self.T_tracker_link.append(T)
+            T = T @ self.links[i] @ self._deflection(f"link{i + 1}")
+        self.T_tracker_flange = T
+        chosen = self._one_hot_sum(self.markers)
+        self.reading["position"] = rigid.point(T, chosen)
+        reach = self.reading["position"] - self.anchor
+        self.reading["distance"] = ca.sqrt(ca.sumsqr(reach)) + self.length_offset
+        self.reading["rotation"] = T[:3, :3] @ self._one_hot_sum(self.marker_rotation)
+
+    def _deflection(self, site: str) -> ca.SX:
+        T = ca.SX.eye(4)
+        for k, spring in enumerate(self.springs):
+            if spring.site == site:
+                T = T @ rigid.joint_motion(spring.kind, spring.axis, self.theta[k])
+        return T
+
+    def _one_hot_sum(self, choices: dict[str, ca.SX]) -> ca.SX:
+        # One marker per row: the table's marker enters as a 0/1 input per name.
+        if len(choices) == 1:
+            return next(iter(choices.values()))
+        chosen = self.input("marker", len(choices))
+        return sum((chosen[k] * value for k, value in enumerate(choices.values())), ca.SX(0))
+
+    def generalised_forces(self) -> ca.SX:
+        """τ = −∂V/∂θ: the load's force on every spring, at the deflected pose."""
+        return -ca.gradient(self.potential, self.theta)
+
+    def deflection_laws(self, tau: ca.SX) -> ca.SX:
+        """θ = law(τ) of every spring, stacked."""
+        return ca.vertcat(*[s.law(tau[k]) for k, s in enumerate(self.springs)])
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise InputError with `message` unless `condition` holds."""
+    if not condition:
+        raise InputError(message)

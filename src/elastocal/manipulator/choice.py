@@ -1,0 +1,57 @@
+"""What the cell asks for: which robot, which effects, at which places."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+
+from elastocal.cell import Cell
+from elastocal.errors import InputError
+from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.effects.base import Effect
+
+
+def load_chain(cell: Cell) -> Chain:
+    """The nominal chain of the cell's robot, from its URDF or its DH table."""
+    from elastocal.manipulator.dh import read_dh
+    from elastocal.manipulator.urdf import read_urdf
+
+    robot = cell.robot
+    if robot.urdf is not None:
+        return read_urdf(robot.urdf, base=robot.base, flange=robot.flange)
+    if robot.dh is not None:
+        return read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
+    raise InputError(f"{cell.path}: [robot] needs urdf or dh")
+
+
+def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
+    """(effect, place) for everything active, in the catalogue's order.
+
+    The table's force always acts (`payload`); link weights act where `link_gravity` says so.
+    Raises InputError for an unknown effect or place, with the nearest valid one.
+    """
+    wanted: dict[str, list[str | None]] = {"payload": [None]}
+    if cell.model.link_gravity:
+        wanted["link_gravity"] = [None]
+    for choice in cell.model.effects:
+        if choice.name not in CATALOGUE:
+            raise InputError(_unknown("effect", choice.name, list(CATALOGUE), cell))
+        wanted.setdefault(choice.name, []).append(choice.where)
+    chosen = []
+    for name, effect in CATALOGUE.items():
+        places = effect.places(chain, cell)
+        asked = wanted.get(name, [])
+        for where in asked:
+            if where is not None and where not in places:
+                raise InputError(_unknown(f"place of {name}", where, list(places), cell))
+        chosen += [(effect, place) for place in places if None in asked or place in asked]
+    return chosen
+
+
+def _unknown(what: str, found: str, valid: list[str], cell: Cell) -> str:
+    near = get_close_matches(found, valid, n=1, cutoff=0.0)
+    hint = f"; did you mean '{near[0]}'?" if near else ""
+    return (
+        f"{cell.path or cell.name}: [model] effects: unknown {what} '{found}'{hint} "
+        f"Valid: {', '.join(valid)}"
+    )

@@ -1,0 +1,69 @@
+"""What every effect is: its parameters, its places in the chain, its expression."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import casadi as ca
+
+from elastocal.cell import Cell
+from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.parameter import ParameterSpec
+
+if TYPE_CHECKING:
+    from elastocal.manipulator.arm import Arm
+
+Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "tracker"]
+Symbols = Mapping[str, ca.SX]
+
+
+class Effect:
+    """One physical effect on the chain.  It knows nothing about estimation.
+
+    A subclass states `name` and `stage`, the places where it can act, the
+    parameters it has at a place, and overrides the one hook its stage calls for:
+
+    - `shape`: changes joint motion, link transforms, springs, markers, base frame;
+      called before the chain is put together.
+    - `load`: adds forces or potentials; called when every point's position is known
+      as a function of the elastic deflections.
+    - `read`: changes what the instrument reports; called last.
+
+    Parameter symbols arrive as a mapping from the keys of `parameters` to CasADi scalars.
+    """
+
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        """Every place where this effect makes sense on this arm, e.g. ("joint1", …)."""
+        raise NotImplementedError
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        """The parameters at one place; loads may have none."""
+        return ()
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        """Change the pieces of the chain before it is assembled."""
+
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
+        """Add forces or potentials once points are known."""
+
+    def read(self, arm: Arm, place: str, p: Symbols) -> None:
+        """Change the instrument's reading."""
+
+
+def joints(chain: Chain) -> tuple[str, ...]:
+    """Places "joint1" … "jointN"."""
+    return tuple(f"joint{i + 1}" for i in range(chain.n_joints))
+
+
+def links(chain: Chain) -> tuple[str, ...]:
+    """Places "link1" … "linkN"; link i is the body that joint i moves."""
+    return tuple(f"link{i + 1}" for i in range(chain.n_joints))
+
+
+def index(place: str) -> int:
+    """0-based index of "joint3" or "link3"."""
+    return int(place.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1

@@ -1,0 +1,53 @@
+"""The static equilibrium of all poses at once, and the exact derivative through it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.manipulator.tape import Tape
+
+MAX_STEPS = 30
+TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
+
+
+class Equilibrium:
+    """Deflections θ with F(θ) = θ − law(τ(θ)) = 0, τ = −∂V/∂θ at the deflected pose.
+
+    Written with compliances, so a rigid joint (k = 0) needs no special case.
+    """
+
+    def __init__(self, inputs: Sequence[ca.SX], p: ca.SX, theta: ca.SX, residual: ca.SX) -> None:
+        self.size = theta.shape[0]
+        jacobian = ca.jacobian(residual, theta)
+        self._tape = Tape([*inputs, p, theta], [residual, jacobian])
+
+    def solve(self, inputs: Sequence[NDArray], p: NDArray) -> NDArray:
+        """θ (n, size) by Newton's method on all rows; rows that do not settle become NaN."""
+        n = len(inputs[0])
+        theta = np.zeros((n, self.size), dtype=np.result_type(np.float64, p, *inputs))
+        active = np.arange(n)
+        step = np.zeros(0)
+        for _ in range(MAX_STEPS):
+            rows = [a[active] for a in inputs]
+            F, F_theta = self._tape(*rows, p, theta[active])
+            finite = np.isfinite(F_theta).all(axis=(1, 2)) & np.isfinite(F[..., 0]).all(axis=1)
+            theta[active[~finite]] = np.nan
+            active, F, F_theta = active[finite], F[finite], F_theta[finite]
+            if not len(active):
+                return theta
+            try:
+                step = np.linalg.solve(F_theta, F)[..., 0]
+            except np.linalg.LinAlgError:  # a pose at the verge of buckling
+                theta[active] = np.nan
+                return theta
+            theta[active] -= step
+            settled = np.abs(step).max(axis=1) <= TOLERANCE + 1e-12 * np.abs(theta[active]).max(1)
+            active = active[~settled]
+            if not len(active):
+                return theta
+        theta[active] = np.nan
+        return theta
