@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell import Cell, EffectChoice
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import ElastocalError
 from elastocal.manipulator import rigid
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Array, Chain
@@ -103,9 +103,15 @@ class Model:
     def nominal(self) -> Array:
         return np.array([p.nominal for p in self.parameters])
 
-    @property
-    def typical(self) -> Array:
-        return np.array([p.typical for p in self.parameters])
+    def sizes(self, B: Array) -> Array:
+        """Typical deviation (parameters,) of each parameter, in its unit.
+
+        Where none is known beforehand, the deviation that moves the readings behind `B` by 1 mm.
+        """
+        largest = np.abs(B).max(axis=0, initial=0.0)
+        moved = np.divide(1e-3, largest, out=np.ones(len(largest)), where=largest > 0)
+        given = [p.typical for p in self.parameters]
+        return np.array([m if s is None else s for s, m in zip(given, moved, strict=True)])
 
     # --- expressions -----------------------------------------------------------------------
 
@@ -201,15 +207,20 @@ class Model:
         h, B = self._tape("B", columns)(*inputs, x, theta, adjoint)
         return h[..., 0], B
 
-    def predict(self, table: Measurements, x: Array | None = None) -> NDArray:
+    def predict(
+        self,
+        table: Measurements,
+        x: Array | None = None,
+        observations: Observations | None = None,
+    ) -> NDArray:
         """Predicted observations (rows,) at parameter values x (default nominal).
 
-        Rows without an equilibrium are NaN.
+        `observations` spares pairing the table anew.  Rows without an equilibrium are NaN.
         """
         x = self.nominal if x is None else np.asarray(x)
         inputs = row_inputs(self._arm, table)
         h = self._tape("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
-        return observe(table, self.observe).apply(h).ravel()
+        return (observations or observe(table, self.observe)).apply(h).ravel()
 
     def regressor(
         self,
@@ -244,11 +255,10 @@ class Model:
         return self._tape("flange")(*inputs, x, self._settle(inputs, x))[0]
 
 
-def nominal_model(chain: Chain, cell: Cell) -> Model:
-    """The arm without any effect, base at the data's origin: what registration starts from."""
-    nominal = replace(cell.model.nominal, base_position=None, base_rotation=None)
-    spec = replace(cell.model, effects=(), observe="position", nominal=nominal)
-    spec = replace(spec, link_gravity=False)
-    if not chain.n_joints:
-        raise InputError("the chain has no joints")
-    return Model(chain, replace(cell, model=spec))
+def rigid_model(model: Model) -> Model:
+    """The nominal arm with no effect and its base at the data's origin, for registration."""
+    nominal = replace(model.cell.model.nominal, base_position=None, base_rotation=None)
+    spec = replace(
+        model.cell.model, effects=(), observe="position", nominal=nominal, link_gravity=False
+    )
+    return Model(model.chain, replace(model.cell, model=spec))

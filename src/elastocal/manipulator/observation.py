@@ -76,6 +76,15 @@ def observe(table: Measurements, kind: str) -> Observations:
     return Observations(kind, value.ravel(), combine, lead, table)
 
 
+def subset(seen: Observations, chosen: NDArray[np.bool_]) -> Observations:
+    """The observations where `chosen` (N,) holds, with only the table rows they need."""
+    combine = seen.combine[chosen]
+    rows = np.unique(combine.indices)
+    value = seen.value.reshape(-1, seen.size)[chosen].ravel()
+    lead = np.searchsorted(rows, seen.lead[chosen])
+    return Observations(seen.kind, value, combine[:, rows], lead, seen.table.take(rows))
+
+
 def _needed(column: Array | None, table: Measurements, names: str, kind: str) -> Array:
     if column is None:
         raise InputError(

@@ -13,12 +13,14 @@ class ParameterSpec:
 
     `typical` is the size one expects of the deviation from nominal; columns of B
     are scaled by it before any rank is judged, so that metres and rad/(N m) compare.
+    None means that no size is known beforehand (a compliance without a nominal value):
+    it is then the deviation that would move the readings by 1 mm.
     """
 
     key: str
     unit: str
     nominal: float
-    typical: float
+    typical: float | None
     lower: float = -np.inf
     upper: float = np.inf
 
@@ -32,6 +34,6 @@ class Parameter:
     where: str
     unit: str
     nominal: float
-    typical: float
+    typical: float | None
     lower: float = -np.inf
     upper: float = np.inf

@@ -12,7 +12,7 @@ where p0 is the (immobile) joint frame that carries the base link.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     base = tree.root if base is None else tree.find_link("base", base)
     flange = tree.last_link(base) if flange is None else tree.find_link("flange", flange)
     moving = tree.serial_chain(base, flange)
-    model = _pinocchio_model(tree, {joint.name for joint in moving})
+    model = _pinocchio_model(tree, moving)
     base_in_parent = _link_placement(model, base)
     joints = []
     for i, source in enumerate(moving, start=1):
@@ -82,16 +82,16 @@ def _link_placement(model: Any, link: str) -> Any:
     return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement
 
 
-def _pinocchio_model(tree: Tree, moving: Collection[str]) -> Any:
+def _pinocchio_model(tree: Tree, moving: Sequence[UrdfJoint]) -> Any:
     import pinocchio as pin
 
     try:
-        model = pin.buildModelFromXML(skeleton(tree, moving))
+        model = pin.buildModelFromXML(skeleton(tree, {joint.name for joint in moving}))
     except Exception as error:  # pinocchio raises ValueError, RuntimeError and its own
         raise InputError(f"{tree.path}: pinocchio cannot read it: {error}") from error
     found = list(model.names)[1:]
-    expected = [name for name in tree.joints if name in moving]
-    if sorted(found) != sorted(expected) or list(model.parents)[1:] != list(range(len(found))):
+    expected = [joint.name for joint in moving]
+    if found != expected or list(model.parents)[1:] != list(range(len(found))):
         raise InputError(
             f"{tree.path}: pinocchio reads the joints {found} as something else than the serial "
             f"chain {expected}; simplify the URDF"

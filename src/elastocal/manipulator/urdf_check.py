@@ -93,7 +93,7 @@ def _without_namespace(path: Path, root: ET.Element) -> ET.Element:
             "sdf": "; this is SDF, export it as URDF",
         }.get(root.tag, "")
         raise InputError(
-            f"{path}: the root element is <{root.tag}>, a URDF has <robot name=\"…\">{hint}"
+            f'{path}: the root element is <{root.tag}>, a URDF has <robot name="…">{hint}'
         )
     return root
 
@@ -101,7 +101,7 @@ def _without_namespace(path: Path, root: ET.Element) -> ET.Element:
 def _xacro(path: Path, what: str) -> str:
     return (
         f"{path}: xacro macros are left in ({what}); "
-        f"run xacro first: xacro {path.name} > {path.name.split('.')[0]}.urdf"
+        f"run xacro first: xacro {path.name} > expanded.urdf"
     )
 
 
@@ -110,7 +110,7 @@ def _name(path: Path, element: ET.Element, known: dict) -> str:
     if not name:
         raise InputError(
             f"{path}: {element.tag} number {len(known) + 1} has no name; "
-            f"write <{element.tag} name=\"…\">"
+            f'write <{element.tag} name="…">'
         )
     if name in known:
         raise InputError(
@@ -126,7 +126,7 @@ def _link(where: str, name: str, element: ET.Element) -> Link:
     mass_element = inertial.find("mass")
     if mass_element is None or mass_element.get("value") is None:
         raise InputError(
-            f"{where}: <inertial> without <mass value=\"…\">; add it or remove <inertial>"
+            f'{where}: <inertial> without <mass value="…">; add it or remove <inertial>'
         )
     mass = _number(f"{where}, mass value", mass_element.get("value", ""))
     if mass < 0:
@@ -138,7 +138,7 @@ def _link(where: str, name: str, element: ET.Element) -> Link:
 def _joint(where: str, name: str, element: ET.Element, links: dict[str, Link]) -> UrdfJoint:
     kind = element.get("type")
     if kind is None:
-        raise InputError(f"{where} has no type; write type=\"{'|'.join(JOINT_TYPES)}\"")
+        raise InputError(f'{where} has no type; write type="{"|".join(JOINT_TYPES)}"')
     if kind not in JOINT_TYPES:
         raise InputError(
             f"{where}: unknown joint type '{kind}'{did_you_mean(kind, JOINT_TYPES)}; "
@@ -147,9 +147,9 @@ def _joint(where: str, name: str, element: ET.Element, links: dict[str, Link]) -
     origin = element.find("origin")
     zero = (0.0, 0.0, 0.0)
     axis = _vector(where, element.find("axis"), "axis", "xyz", (1.0, 0.0, 0.0))  # URDF default
-    length = math.sqrt(sum(a * a for a in axis))
+    length = math.hypot(*axis)
     if kind in MOVING and length < 1e-9:
-        raise InputError(f"{where}: axis is zero; give a direction such as xyz=\"0 0 1\"")
+        raise InputError(f'{where}: axis is zero; give a direction such as xyz="0 0 1"')
     limit = element.find("limit")
     bounds = None
     if limit is not None:
@@ -175,7 +175,7 @@ def _end(where: str, element: ET.Element, side: str, links: dict[str, Link]) -> 
     end = element.find(side)
     name = None if end is None else end.get("link")
     if not name:
-        raise InputError(f"{where} has no {side} link; add <{side} link=\"…\"/>")
+        raise InputError(f'{where} has no {side} link; add <{side} link="…"/>')
     if name not in links:
         raise InputError(
             f"{where}: {side} link '{name}' is not there{did_you_mean(name, links)}; "

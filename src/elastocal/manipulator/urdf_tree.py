@@ -66,7 +66,7 @@ class Tree:
         if len(reached) < len(self.links):
             cycle = self._cycle(next(name for name in self.links if name not in reached))
             raise InputError(
-                f"{self.path}: joints {listed(f"'{name}'" for name in cycle)} form a closed loop "
+                f"{self.path}: joints {listed(cycle)} form a closed loop "
                 "that hangs on no root link; loops are not supported, open it at one joint"
             )
         if len(roots) > 1:
@@ -181,8 +181,8 @@ class Tree:
             return
         if joint.limit is None:
             raise InputError(
-                f"{where} is {joint.kind} without <limit>; add <limit lower=\"…\" upper=\"…\" "
-                "effort=\"0\" velocity=\"0\"/> or make it continuous"
+                f'{where} is {joint.kind} without <limit>; add <limit lower="…" upper="…" '
+                'effort="0" velocity="0"/> or make it continuous'
             )
         lower, upper = joint.limit
         if lower >= upper:

@@ -22,7 +22,7 @@ class BaseCompliance(Effect):
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return tuple(
-            ParameterSpec(f"tilt_compliance_{a}", "rad/(N*m)", 0.0, 5e-8) for a in AXES
+            ParameterSpec(f"tilt_compliance_{a}", "rad/(N*m)", 0.0, None, lower=0.0) for a in AXES
         )
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:

@@ -40,7 +40,7 @@ class GravityCompensator(Effect):
         anchor_x, anchor_y = given["anchor_m"]
         stiffness = float(given["stiffness_N_per_m"])
         return (
-            ParameterSpec("compensator_stiffness", "N/m", stiffness, abs(stiffness) or 1e5),
+            ParameterSpec("compensator_stiffness", "N/m", stiffness, abs(stiffness) or None),
             ParameterSpec("compensator_anchor_x", "m", float(anchor_x), 1e-2),
             ParameterSpec("compensator_anchor_y", "m", float(anchor_y), 1e-2),
             ParameterSpec("compensator_arm", "m", float(given["arm_m"]), 1e-2),

@@ -8,8 +8,6 @@ from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
 from elastocal.manipulator.parameter import ParameterSpec
 
-TYPICAL = 1e-6  # rad/(N m) or m/N where the cell gives no nominal value
-
 
 class JointCompliance(Effect):
     """δq_j = k_j τ_j, k_j in rad/(N m) (m/N for a prismatic joint).
@@ -38,12 +36,12 @@ class JointCompliance(Effect):
             f"but the arm has {chain.n_joints} joints; give one per joint",
         )
         nominal = 0.0 if given is None else float(given[i])
-        typical = abs(nominal) or TYPICAL
+        typical = abs(nominal) or None
         levels = cell.model.compliance_levels.get(place)
         if levels is None:
-            return (ParameterSpec("compliance", unit, nominal, typical),)
+            return (ParameterSpec("compliance", unit, nominal, typical, lower=0.0),)
         return tuple(
-            ParameterSpec(f"compliance_level{n + 1}", unit, nominal, typical)
+            ParameterSpec(f"compliance_level{n + 1}", unit, nominal, typical, lower=0.0)
             for n in range(len(levels))
         )
 

@@ -37,9 +37,10 @@ class OffAxisCompliance(Effect):
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         given = cell.model.nominal.joint_compliance
-        typical = 0.2 * given[index(place)] if given else 2e-7
+        typical = 0.2 * given[index(place)] if given else None
         return tuple(
-            ParameterSpec(f"off_axis_compliance_{a}", "rad/(N*m)", 0.0, typical) for a in "xy"
+            ParameterSpec(f"off_axis_compliance_{a}", "rad/(N*m)", 0.0, typical, lower=0.0)
+            for a in "xy"
         )
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:

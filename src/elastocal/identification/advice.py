@@ -1,0 +1,115 @@
+"""Warnings as sentences that name the remedy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import linalg
+
+from elastocal.identification.result import IdentificationResult
+from elastocal.identification.solve import Solution
+
+FEW_DOF_PER_PARAMETER = 1.0
+ILL_CONDITIONED = 1e4
+FAR_ABOVE_STATED = 2.0
+
+
+def warnings_for(result: IdentificationResult, solution: Solution) -> IdentificationResult:
+    """The same result with its warnings."""
+    found = [
+        *_convergence(result),
+        *_few_poses(result),
+        *_conditioning(result, solution),
+        *_noise(result),
+        *_bounds(result, solution),
+        *_outliers(result),
+    ]
+    return replace(result, warnings=tuple(found))
+
+
+def _convergence(result: IdentificationResult) -> list[str]:
+    if result.converged:
+        return []
+    return [
+        f"The fit did not converge: {result.reason}. Give start hints in [model.nominal], fit "
+        "fewer effects, or measure more poses."
+    ]
+
+
+def _few_poses(result: IdentificationResult) -> list[str]:
+    found, n = [], len(result.determined)
+    if result.dof < FEW_DOF_PER_PARAMETER * n:
+        found.append(
+            f"Only {result.dof} degrees of freedom for {n} determined parameters: intervals are "
+            "wide and the residual flatters the model. Measure more poses."
+        )
+    if not np.isfinite(result.heldout_rms):
+        found.append(
+            "Some configuration alone determines a parameter, so there is no held-out error for "
+            "it. Measure more configurations."
+        )
+    return found
+
+
+def _conditioning(result: IdentificationResult, solution: Solution) -> list[str]:
+    kept = solution.reduction.kept
+    scaled = solution.problem.weights.apply(solution.fit.B) * solution.sizes[kept]
+    _, singular, Vt = linalg.svd(linalg.qr(scaled, mode="r")[0][: len(kept)])
+    if singular[0] <= ILL_CONDITIONED * singular[-1]:
+        return []
+    worst = np.argsort(-np.abs(Vt[-1]))[:3]
+    names = ", ".join(result.determined[i] for i in worst)
+    return [
+        f"Ill-conditioned (condition number {singular[0] / singular[-1]:.1e} after scaling): the "
+        f"data barely separate {names}. Measure poses in which these joints differ more, or fix "
+        "one of them."
+    ]
+
+
+def _noise(result: IdentificationResult) -> list[str]:
+    ratio = result.noise["ratio_to_stated"]
+    if ratio is None or ratio < FAR_ABOVE_STATED:
+        return []
+    return [
+        f"The residual is {ratio:.1f} times the stated noise ({result.noise['description']}): "
+        "something is unmodelled or the stated noise is too small. The intervals use the "
+        "residual, not the stated noise; add effects or run diagnose."
+    ]
+
+
+def _bounds(result: IdentificationResult, solution: Solution) -> list[str]:
+    found = []
+    for e, p in zip(result.estimates, result.model.parameters, strict=True):
+        if p.lower < e.held < p.upper or not (np.isfinite(p.lower) or np.isfinite(p.upper)):
+            continue
+        bound = p.lower if e.held <= p.lower else p.upper
+        if solution.problem.bounded:
+            found.append(
+                f"{e.name} stands at its bound {bound:g} {e.unit}; its interval does not hold. "
+                "Check load direction and torque signs, or fix it there."
+            )
+        elif e.value is not None:
+            found.append(
+                f"{e.name} = {e.value:.3g} ± {e.std:.2g} {e.unit} lies beyond its physical bound "
+                f"{bound:g}: check load direction and torque signs, measure poses that load it "
+                "more, or fit with bounds."
+            )
+    return found
+
+
+def _outliers(result: IdentificationResult) -> list[str]:
+    found = []
+    if result.outliers:
+        lines = ", ".join(str(o.line) for o in result.outliers[:8])
+        more = " …" if len(result.outliers) > 8 else ""
+        found.append(
+            f"{len(result.outliers)} readings lie beyond what the noise explains (lines {lines}"
+            f"{more}). Check them; --drop-outliers leaves them out and says so."
+        )
+    if result.excluded:
+        found.append(
+            f"{len(result.excluded)} readings were left out as faulty; they are listed in the "
+            "result under 'excluded'."
+        )
+    return found

@@ -1,0 +1,148 @@
+"""Does the table fit the robot?  Checked once, before anything is fitted."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from elastocal.errors import InputError, InsufficientDataError
+from elastocal.manipulator.model import Model, rigid_model
+from elastocal.manipulator.observation import Observations
+from elastocal.measurements import Measurements
+
+Array = NDArray[np.float64]
+
+# Readings and nominal arm may differ this much in extent (a long tool, few joints moving)
+# before a wrong unit is the likelier cause.
+EXTENT_FACTOR = 30.0
+LIMIT_SLACK = np.radians(0.5)  # controllers overshoot soft limits by a little
+SAME = 1e-9
+
+
+def check_table(model: Model, table: Measurements) -> None:
+    """Joint count, joint limits and units of a table against the robot.
+
+    Raises InputError that names file, line, joint and remedy.
+    """
+    n = model.chain.n_joints
+    if table.q.shape[1] != n:
+        raise InputError(
+            f"{table.source} has {table.q.shape[1]} joint columns, but robot "
+            f"'{model.chain.name}' has {n} joints"
+        )
+    _check_limits(model, table)
+    _check_units(model, table)
+
+
+def limits(model: Model) -> tuple[Array, Array]:
+    """Lower and upper joint limits (n,) in rad or m: the robot's, narrowed by the cell's."""
+    lower = np.array([j.lower for j in model.chain.joints])
+    upper = np.array([j.upper for j in model.chain.joints])
+    for name, (low, high) in model.cell.limits.items():
+        i = int(name.removeprefix("joint")) - 1
+        lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
+    return lower, upper
+
+
+def _check_limits(model: Model, table: Measurements) -> None:
+    revolute = np.array([k == "revolute" for k in model.chain.kinds])
+    wound = np.abs(table.q[:, revolute]) > 4 * np.pi
+    if wound.any():
+        i = int(np.flatnonzero(wound.any(axis=1))[0])
+        raise InputError(
+            f"{table.source}, line {table.row[i]}: a joint stands at {np.abs(table.q[i]).max():.4g} "
+            f"rad, more than two turns ({int(wound.any(axis=1).sum())} lines); these are probably "
+            "degrees in a column named …_rad: rename it to …_deg"
+        )
+    lower, upper = limits(model)
+    beyond = (table.q < lower - LIMIT_SLACK) | (table.q > upper + LIMIT_SLACK)
+    if beyond.any():
+        i, j = (int(v) for v in np.argwhere(beyond)[0])
+        unit, factor = ("°", 180 / np.pi) if revolute[j] else (" m", 1.0)
+        share = beyond.any(axis=1).mean()
+        hint = (
+            "; most lines are beyond: probably degrees given as radians (or the reverse), or "
+            "another robot"
+            if share > 0.5
+            else "; correct the line or the limits"
+        )
+        raise InputError(
+            f"{table.source}, line {table.row[i]}: joint{j + 1} ({model.chain.joints[j].name}) at "
+            f"{table.q[i, j] * factor:.4g}{unit} is beyond its limits "
+            f"[{lower[j] * factor:.4g}, {upper[j] * factor:.4g}]{unit} "
+            f"({int(beyond.any(axis=1).sum())} of {len(table)} lines){hint}"
+        )
+
+
+def _check_units(model: Model, table: Measurements) -> None:
+    """Compare the extent of the readings with that of the nominal arm at the same joints."""
+    poses = np.unique(table.q, axis=0)
+    if len(poses) < 2:
+        raise InsufficientDataError(
+            f"{table.source}: all {len(table)} rows hold the same pose; measure at different "
+            "joint angles (at least as many poses as a third of the parameters)"
+        )
+    if table.position is None:
+        return
+    flange = rigid_model(model).flange_poses(table)[:, :3, 3]
+    reach = float(np.linalg.norm(np.ptp(flange, axis=0)))
+    extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
+    if reach < SAME or extent < SAME:
+        return
+    ratio = extent / reach
+    if 1 / EXTENT_FACTOR < ratio < EXTENT_FACTOR:
+        return
+    if ratio > EXTENT_FACTOR and np.abs(table.q).max() < 0.12:
+        cause = "the joint angles are probably radians in columns named …_deg"
+    elif ratio > EXTENT_FACTOR:
+        cause = "the positions are probably millimetres in columns named …_m: rename to …_mm"
+    else:
+        cause = "the positions are probably metres in columns named …_mm: rename to …_m"
+    raise InputError(
+        f"{table.source}: the readings extend over {extent * 1e3:.4g} mm, but the nominal arm's "
+        f"flange moves over {reach * 1e3:.4g} mm at these joint values; {cause}"
+    )
+
+
+def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
+    """Indices of the parameters to fit; `fixed` names parameters, places or effects to hold.
+
+    Raises InputError for a name that is none of these, or when nothing is left.
+    """
+    held = set()
+    for name in fixed:
+        match = [i for i, p in enumerate(model.parameters) if name in (p.name, p.where, p.effect)]
+        if not match:
+            valid = sorted({v for p in model.parameters for v in (p.name, p.where, p.effect)})
+            near = get_close_matches(name, valid, n=1, cutoff=0.0)
+            raise InputError(
+                f"cannot fix '{name}': the model has no such parameter, place or effect"
+                + (f"; did you mean '{near[0]}'?" if near else "")
+            )
+        held |= set(match)
+    free = np.array([i for i in range(len(model.parameters)) if i not in held], dtype=np.int64)
+    if not len(free):
+        raise InputError(
+            "nothing is left to identify: choose effects with parameters in [model] effects"
+        )
+    return free
+
+
+def check_enough(model: Model, seen: Observations, scaled: Array) -> None:
+    """Refuse when the equations are too few for the minimal set; `scaled` (rows, free)."""
+    rows = len(seen.value)
+    kept = linalg.qr(scaled, mode="r", pivoting=True)[0]
+    diagonal = np.abs(np.diag(kept))
+    rank = int((diagonal > 1e-7 * diagonal.max(initial=0.0)).sum())
+    if rank < rows:
+        return
+    lacking = -(-(rank + 1) // seen.size)
+    raise InsufficientDataError(
+        f"{seen.table.source}: {rows} equations from {len(seen.lead)} readings cannot determine "
+        f"the model's {scaled.shape[1]} parameters and their uncertainty; measure more poses "
+        f"(more than {max(lacking, -(-scaled.shape[1] // seen.size))} readings) or fit fewer "
+        "effects"
+    )

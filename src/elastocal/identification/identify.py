@@ -1,0 +1,99 @@
+"""From a model and a table to calibrated parameters: the whole identification, step by step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.identification.checks import check_table, fixed_and_free
+from elastocal.identification.estimates import summarise
+from elastocal.identification.noise import WeightKind, scaled_by_component, weights_for
+from elastocal.identification.outliers import describe, find_faulty
+from elastocal.identification.result import IdentificationResult, TestErrors
+from elastocal.identification.solve import Problem, Progress, Solution, solve
+from elastocal.identification.start import start_values
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import Observations, observe, subset
+from elastocal.measurements import Measurements
+
+Array = NDArray[np.float64]
+@dataclass(frozen=True)
+class Options:
+    """How to identify.
+
+    `weights`: auto, none (OLS), rows, axis, polar or covariance (then `covariance` (rows, rows)
+    in m²).  `fixed`: names of parameters held at their start.  `bounded`: keep parameters inside
+    their physical bounds.  `drop_outliers`: leave readings out that the fit itself finds to be
+    faulty (they are listed in the result either way).  `seed`: of the multi-start.
+    """
+
+    weights: WeightKind = "auto"
+    covariance: Array | None = None
+    fixed: tuple[str, ...] = ()
+    bounded: bool = False
+    drop_outliers: bool = False
+    seed: int = 0
+
+
+def identify(
+    model: Model,
+    table: Measurements,
+    options: Options | None = None,
+    test: Measurements | None = None,
+    progress: Progress = lambda message: None,
+) -> IdentificationResult:
+    """Nonlinear weighted least squares from nothing but the nominal arm (eq. 9 and 10).
+
+    Start by registration, a first fit weakly tied to it, choice of a minimal complete set of
+    parameters, final fit of that set, held-out check by configurations, t intervals.
+
+    Raises InputError for data that contradict robot or cell, InsufficientDataError where the
+    data cannot determine the model.
+    """
+    options = options or Options()
+    check_table(model, table)
+    if test is not None:
+        check_table(model, test)
+    seen = observe(table, model.observe)
+    progress("finding the start")
+    x0 = start_values(model, table, options.seed)
+    whole = _solution(model, seen, x0, options, progress)
+
+    def refit(good: NDArray[np.bool_]) -> Solution:
+        return _solution(model, subset(seen, good), x0, options, progress)
+
+    progress("looking for faulty readings")
+    faulty, clean = find_faulty(whole, refit)
+    found = describe(whole, clean, faulty)
+    progress("intervals and held-out residuals")
+    if options.drop_outliers:
+        result = summarise(model, clean, (), found)
+    else:
+        result = summarise(model, whole, found, ())
+    return result if test is None else replace(result, test=_test_errors(model, result.x, test))
+
+
+def _solution(
+    model: Model, seen: Observations, x0: Array, options: Options, progress: Progress
+) -> Solution:
+    free = fixed_and_free(model, options.fixed)
+    weights = weights_for(seen, model.cell.tracker, options.weights, options.covariance)
+    problem = Problem(model, seen, weights, x0, free, options.bounded)
+    solution = solve(problem, progress)
+    if seen.kind == "pose" and weights.kind == "none" and options.weights == "auto":
+        # Without stated noise, metres and radians get their relative weight from a first fit.
+        parts = solution.fit.residual.reshape(-1, 6)
+        sigma = np.repeat([parts[:, :3].std(), parts[:, 3:].std()], 3)
+        weights = scaled_by_component(seen, np.maximum(sigma, 1e-12))
+        solution = solve(replace(problem, weights=weights), progress)
+    return solution
+
+
+def _test_errors(model: Model, x: Array, table: Measurements) -> TestErrors:
+    seen = observe(table, model.observe)
+    error = (seen.value - model.predict(table, x, seen)).reshape(-1, seen.size)[:, :3]
+    length = np.linalg.norm(error, axis=1)
+    rms = float(np.sqrt(np.mean(length**2)))
+    return TestErrors(rms, float(length.mean()), float(length.max()), len(length))

@@ -1,0 +1,196 @@
+"""Measurement noise: covariance of the observations and the weights W with W Σ = I.
+
+Weights as in Klimchik et al. 2013, eq. (9) to (13), generalised from a diagonal Σ to blocks:
+a polar tracker's errors are correlated in x, y, z, and deflections that share an unloaded
+reading are correlated with each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from elastocal.cell import CartesianNoise, PolarNoise, Tracker
+from elastocal.errors import InputError
+from elastocal.manipulator.observation import Observations
+from elastocal.measurements import Measurements
+
+Array = NDArray[np.float64]
+WeightKind = Literal["auto", "none", "rows", "axis", "polar", "covariance"]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """`whiten` (rows, rows) with whiten · Σ · whitenᵀ = I, or None for unit weights.
+
+    `absolute` says whether Σ is stated in m² (then a whitened residual has expected size 1)
+    or holds only up to a common factor, which the residual must tell.
+    """
+
+    kind: str
+    whiten: sparse.csr_array | None
+    absolute: bool
+    description: str
+
+    def apply(self, rows: Array) -> Array:
+        """Whiten a vector (rows,) or matrix (rows, k)."""
+        return rows if self.whiten is None else self.whiten @ rows
+
+
+def weights_for(
+    seen: Observations, tracker: Tracker, kind: WeightKind = "auto", covariance: Array | None = None
+) -> Weights:
+    """Weights for the observations; "auto" takes the table's sigmas, else the cell's, else none.
+
+    "rows" uses the table's sigma columns (Cartesian or polar), "axis" the cell's `sigma_um`,
+    "polar" the cell's range and transverse noise, "covariance" the matrix (rows, rows) given.
+    Raises InputError where the noise that `kind` names is not there.
+    """
+    chosen = _available(seen, tracker) if kind == "auto" and covariance is None else kind
+    if covariance is not None or chosen == "covariance":
+        return _given(seen, covariance)
+    if chosen == "none":
+        return Weights("none", None, False, "unit weights (ordinary least squares)")
+    if seen.kind == "distance":
+        _need(tracker.distance_sigma is not None, "distances need [tracker] distance_um")
+        sigma = float(tracker.distance_sigma or 1.0)
+        whiten = sparse.csr_array(sparse.eye_array(len(seen.value)) / sigma)
+        return Weights("axis", whiten, True, f"distance sigma {sigma * 1e6:.3g} µm from the cell")
+    blocks, text = _position_covariance(seen.table, tracker, chosen)
+    if seen.kind == "pose":
+        _need(tracker.rotation_sigma is not None, "poses need [tracker] rotation_urad")
+        full = np.zeros((len(seen.table), 6, 6))
+        full[:, :3, :3] = blocks
+        full[:, 3:, 3:] = np.eye(3) * float(tracker.rotation_sigma or 1.0) ** 2
+        blocks = full
+    mix = sparse.kron(seen.combine, sparse.eye_array(seen.size), format="csr")
+    covariance_rows = sparse.csr_array(mix @ _block_diagonal(blocks) @ mix.T)
+    return Weights(chosen, _whitener(covariance_rows), True, text)
+
+
+def scaled_by_component(seen: Observations, sigma: Array) -> Weights:
+    """Weights from one sigma per component (size,), known up to a common factor.
+
+    For full poses without stated noise: positions in m and rotations in rad need a relative
+    weight, which is estimated from the residuals of a first fit.
+    """
+    diagonal = np.tile(1.0 / sigma, len(seen.lead))
+    text = "position and rotation weighted by the spread of their residuals in a first fit"
+    return Weights("component", sparse.csr_array(sparse.diags_array(diagonal)), False, text)
+
+
+def _available(seen: Observations, tracker: Tracker) -> str:
+    if seen.kind == "distance":
+        return "none" if tracker.distance_sigma is None else "axis"
+    if seen.kind == "pose" and tracker.rotation_sigma is None:
+        return "none"
+    if seen.table.sigma is not None:
+        return "rows"
+    if isinstance(tracker.noise, PolarNoise):
+        return "polar"
+    return "none" if tracker.noise is None else "axis"
+
+
+def _need(condition: bool, message: str) -> None:
+    if not condition:
+        raise InputError(f"these weights cannot be formed: {message}")
+
+
+def _given(seen: Observations, covariance: Array | None) -> Weights:
+    _need(covariance is not None, "weights 'covariance' need a matrix (--covariance FILE)")
+    matrix = np.asarray(covariance, dtype=float)
+    n = len(seen.value)
+    _need(
+        matrix.shape == (n, n),
+        f"the covariance is {matrix.shape}, but there are {n} rows (observations × components)",
+    )
+    _need(
+        bool(np.isfinite(matrix).all()) and np.allclose(matrix, matrix.T, rtol=1e-9),
+        "the covariance must be finite and symmetric",
+    )
+    return Weights("covariance", _whitener(sparse.csr_array(matrix)), True, "given covariance")
+
+
+def _position_covariance(
+    table: Measurements, tracker: Tracker, kind: str
+) -> tuple[NDArray[np.float64], str]:
+    """Covariance (n, 3, 3) in m² of each row's x, y, z, and where it comes from."""
+    n = len(table)
+    if kind == "rows":
+        _need(table.sigma is not None, f"{table.source} has no sigma_… columns")
+        sigma = np.asarray(table.sigma)
+        text = f"per-row {table.sigma_frame} sigmas from the table"
+        polar = table.sigma_frame == "polar"
+    elif kind == "axis":
+        _need(isinstance(tracker.noise, CartesianNoise), "the cell has no [tracker] sigma_um")
+        assert isinstance(tracker.noise, CartesianNoise)
+        sigma, polar = np.tile(tracker.noise.sigma, (n, 1)), False
+        text = f"tracker sigma {np.round(tracker.noise.sigma * 1e6, 3).tolist()} µm along x, y, z"
+    else:
+        _need(isinstance(tracker.noise, PolarNoise), "the cell has no [tracker] range_um, …")
+        assert isinstance(tracker.noise, PolarNoise)
+        model, polar = tracker.noise, True
+        reach = np.linalg.norm(_position(table) - tracker.position, axis=1)
+        along = model.range + model.range_per_m * reach
+        across = model.transverse + model.transverse_per_m * reach
+        sigma = np.column_stack([along, across, across])
+        text = "polar tracker noise (range and transverse) from the cell"
+    if not polar:
+        return np.eye(3) * (sigma**2)[:, None, :], text
+    axes = polar_axes(_position(table) - tracker.position)
+    return np.einsum("nki,nk,nkj->nij", axes, sigma**2, axes), text
+
+
+def _position(table: Measurements) -> Array:
+    _need(table.position is not None, f"{table.source} has no positions")
+    return np.asarray(table.position)
+
+
+def polar_axes(sight: Array) -> Array:
+    """Unit vectors (n, 3, 3): range, azimuth and elevation direction of each line of sight."""
+    length = np.linalg.norm(sight, axis=1, keepdims=True)
+    _need(bool((length > 0).all()), "a marker stands at the tracker's own position")
+    radial = sight / length
+    azimuth = np.column_stack([-radial[:, 1], radial[:, 0], np.zeros(len(radial))])
+    flat = np.linalg.norm(azimuth, axis=1)
+    # Straight above the tracker azimuth is undefined; any horizontal direction serves.
+    azimuth = np.where(flat[:, None] > 1e-9, azimuth / np.maximum(flat, 1e-300)[:, None], [1, 0, 0])
+    return np.stack([radial, azimuth, np.cross(radial, azimuth)], axis=1)
+
+
+def _block_diagonal(blocks: Array) -> sparse.csr_array:
+    n, d, _ = blocks.shape
+    pattern = sparse.bsr_array((blocks, np.arange(n), np.arange(n + 1)), shape=(n * d, n * d))
+    return sparse.csr_array(pattern)
+
+
+def _whitener(covariance: sparse.csr_array) -> sparse.csr_array:
+    """L⁻¹ of the Cholesky factor, block by block over groups of correlated rows."""
+    count, label = sparse.csgraph.connected_components(covariance, directed=False)
+    order = np.argsort(label, kind="stable")
+    sizes = np.bincount(label, minlength=count)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    rows, columns, values = [], [], []
+    for size in np.unique(sizes):
+        groups = np.flatnonzero(sizes == size)
+        members = order[starts[groups][:, None] + np.arange(size)]
+        i, j = members[:, :, None], members[:, None, :]
+        i, j = np.broadcast_arrays(i, j)
+        dense = np.asarray(covariance[i.ravel(), j.ravel()]).reshape(i.shape)
+        try:
+            factor = np.linalg.cholesky(dense)
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "the noise covariance is not positive definite; check sigmas and covariance"
+            ) from None
+        inverse = np.linalg.solve(factor, np.broadcast_to(np.eye(size), factor.shape))
+        keep = np.tril(np.ones((size, size), dtype=bool))
+        rows.append(i[:, keep].ravel())
+        columns.append(j[:, keep].ravel())
+        values.append(inverse[:, keep].ravel())
+    triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csr_array(triplets, shape=covariance.shape)

@@ -1,0 +1,206 @@
+"""The frozen result of an identification: estimates, intervals, what could not be known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import COMPONENTS, Observations
+
+Array = NDArray[np.float64]
+
+SCHEMA = "elastocal/identification/1"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter.  `value`, `std` and `ci95` are None unless the data determine it alone.
+
+    `held` is the value the fitted model uses for it: the estimate where there is one, else the
+    value at which it was kept or the share of a combination that was put on it.  It is needed
+    to predict, and it is not an estimate.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    held: float
+    value: float | None = None
+    std: float | None = None
+    ci95: tuple[float, float] | None = None
+    combined_with: tuple[str, ...] = ()
+    note: str = ""
+
+    @property
+    def identifiable(self) -> bool:
+        return self.value is not None
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A sum Σ factor·parameter that the data determine although its members they do not.
+
+    `terms` maps parameter names to factors (SI units); deviations of all members but the first
+    are counted from their held value.  `value`, `std`, `ci95` in the first member's unit.
+    """
+
+    terms: dict[str, float]
+    unit: str
+    value: float
+    std: float
+    ci95: tuple[float, float]
+
+    @property
+    def expression(self) -> str:
+        first, *rest = self.terms.items()
+        text = first[0]
+        for name, factor in rest:
+            size = "" if abs(abs(factor) - 1) < 1e-6 else f"{abs(factor):.4g}·"
+            text += f" {'-' if factor < 0 else '+'} {size}{name}"
+        return text
+
+
+@dataclass(frozen=True)
+class TestErrors:
+    """Length of the position error on data never fitted, in m."""
+
+    __test__ = False  # not a pytest class
+    rms: float
+    mean: float
+    maximum: float
+    n: int
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A reading whose residual lies beyond what the noise explains."""
+
+    line: int
+    configuration: str
+    marker: str
+    residual: float
+    ratio: float
+
+
+@dataclass(frozen=True)
+class IdentificationResult:
+    """What `identify` found.
+
+    `x` (parameters,) are the values the model uses; `covariance` (determined, determined) goes
+    with `determined`, the kept parameters in order (alone or as first member of a combination).
+    `residual` (rows,) observed minus predicted in m (rad); `held_out` the same with each
+    configuration predicted by a fit to the others.  `sigma` is the residual's standard
+    deviation per whitened row (in m where unit weights were used), with `dof` degrees of freedom.
+    """
+
+    model: Model
+    method: str
+    noise: dict[str, Any]
+    estimates: tuple[Estimate, ...]
+    combinations: tuple[Combination, ...]
+    x: Array
+    determined: tuple[str, ...]
+    covariance: Array
+    correlations: tuple[tuple[str, str, float], ...]
+    observations: Observations
+    residual: Array
+    held_out: Array
+    sigma: float
+    dof: int
+    residual_rms: float
+    heldout_rms: float
+    nominal_rms: float
+    converged: bool
+    reason: str
+    outliers: tuple[Outlier, ...]
+    excluded: tuple[Outlier, ...]
+    warnings: tuple[str, ...]
+    test: TestErrors | None = None
+
+    def estimate(self, name: str) -> Estimate:
+        """The estimate of one parameter by name; KeyError lists what exists."""
+        for e in self.estimates:
+            if e.name == name:
+                return e
+        raise KeyError(f"no parameter '{name}'; there are {[e.name for e in self.estimates]}")
+
+    def combination(self, first: str) -> Combination:
+        """The combination whose first member is `first`."""
+        for c in self.combinations:
+            if next(iter(c.terms)) == first:
+                return c
+        raise KeyError(f"no combination starts with '{first}'")
+
+    def residual_table(self) -> list[dict[str, Any]]:
+        """One row per observation: line, configuration, repeat, marker, residuals in µm (µrad)."""
+        seen = self.observations
+        parts = self.residual.reshape(-1, seen.size)
+        held = self.held_out.reshape(-1, seen.size)
+        rows = []
+        for k, i in enumerate(seen.lead):
+            row: dict[str, Any] = {
+                "line": int(seen.table.row[i]),
+                "configuration": seen.table.configuration_labels[seen.table.configuration[i]],
+                "repeat": int(seen.table.repeat[i]),
+                "marker": seen.table.marker_names[seen.table.marker[i]],
+            }
+            for j, name in enumerate(COMPONENTS[seen.kind]):
+                unit = "urad" if name.startswith("r") else "um"
+                row[f"residual_{name}_{unit}"] = float(parts[k, j]) * 1e6
+                row[f"heldout_{name}_{unit}"] = float(held[k, j]) * 1e6
+            rows.append(row)
+        return rows
+
+    def to_json(self) -> dict[str, Any]:
+        """The result as a JSON-ready dictionary (DESIGN: identify → JSON)."""
+        return {
+            "schema": SCHEMA,
+            "robot": self.model.chain.name,
+            "cell": self.model.cell.name,
+            "data": self.observations.table.source,
+            "method": self.method,
+            "parameters": [_estimate_json(e) for e in self.estimates],
+            "combinations": [
+                {"terms": c.terms, "expression": c.expression, "unit": c.unit,
+                 "value": c.value, "std": c.std, "ci95": list(c.ci95)}
+                for c in self.combinations
+            ],
+            "covariance": self.covariance.tolist(),
+            "covariance_of": list(self.determined),
+            "correlations": [list(c) for c in self.correlations],
+            "n_rows": len(self.residual),
+            "dof": self.dof,
+            "residual_rms_um": _um(self.residual_rms),
+            "heldout_rms_um": _um(self.heldout_rms),
+            "nominal_rms_um": _um(self.nominal_rms),
+            "test": None if self.test is None else {
+                "rms_um": _um(self.test.rms), "mean_um": _um(self.test.mean),
+                "max_um": _um(self.test.maximum), "n": self.test.n,
+            },
+            "test_rms_um": None if self.test is None else _um(self.test.rms),
+            "test_mean_um": None if self.test is None else _um(self.test.mean),
+            "test_max_um": None if self.test is None else _um(self.test.maximum),
+            "noise": self.noise,
+            "converged": self.converged,
+            "outliers": [vars(o) for o in self.outliers],
+            "excluded": [vars(o) for o in self.excluded],
+            "warnings": list(self.warnings),
+        }  # fmt: skip
+
+
+def _estimate_json(e: Estimate) -> dict[str, Any]:
+    return {
+        "name": e.name, "value": e.value, "unit": e.unit, "std": e.std,
+        "ci95": None if e.ci95 is None else list(e.ci95), "identifiable": e.identifiable,
+        "combined_with": list(e.combined_with), "nominal": e.nominal, "held": e.held,
+        "note": e.note,
+    }  # fmt: skip
+
+
+def _um(value: float) -> float | None:
+    """Metres to µm; None where there is no number (JSON has no infinity)."""
+    return value * 1e6 if np.isfinite(value) else None

@@ -1,0 +1,169 @@
+"""An independent elastic arm: MuJoCo's kinematics, springs and weights, not ours.
+
+Every joint of the chain is a hinge or slide with a spring of stiffness 1/k about its commanded
+value.  At rest, with a dead force f (3,) at the load point and weights if `gravity` is given,
+
+    r(δ) = k ∘ [ τ_spring(q, δ) − τ_bias(q + δ) + J(q + δ)ᵀ f ] = 0,      τ_spring = −δ / k
+
+whose solution δ (n,) is the deflection.  The bracket is MuJoCo's own generalised force
+(qfrc_passive − qfrc_bias + mj_applyFT); the factor k turns it into radians or metres, so that
+soft and stiff joints are solved to the same accuracy.  Rigid joints (k = 0) do not move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from elastocal.errors import ElastocalError, InputError
+from elastocal.manipulator.chain import Chain, LinkMass
+from elastocal.simulation.mjcf import write_mjcf
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-13  # last Newton step, rad or m
+MAX_STEPS = 50
+DIFFERENCE_STEP = 1e-6  # central differences of r, rad or m: relative error of the slope 1e-9
+
+
+class MujocoArm:
+    """The elastic arm of a chain in MuJoCo; the world is the base frame.
+
+    compliance: (n,) joint compliances k in rad/(N·m), or m/N for prismatic joints, ≥ 0.
+    load_point: (3,) m in the flange frame, where forces act.
+    markers: name → (3,) m in the flange frame.
+    masses: one LinkMass per joint, default the chain's own; they count where gravity is given.
+    gravity: (3,) m/s² in the base frame, e.g. (0, 0, -9.80665); default none.
+
+    Raises InputError for wrong shapes or values, or where MuJoCo is not installed.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        compliance: ArrayLike,
+        load_point: ArrayLike = (0.0, 0.0, 0.0),
+        markers: Mapping[str, ArrayLike] | None = None,
+        masses: Sequence[LinkMass] | None = None,
+        gravity: ArrayLike | None = None,
+    ) -> None:
+        self._mujoco = _import_mujoco()
+        n = chain.n_joints
+        self.compliance = _vector("compliance", compliance, n)
+        if np.any(self.compliance < 0):
+            raise InputError(f"compliance {self.compliance.tolist()}: must be 0 (rigid) or more")
+        self.masses = tuple(chain.masses if masses is None else masses)
+        if len(self.masses) not in (0, n):
+            raise InputError(f"masses: {len(self.masses)} given, the chain has {n} joints")
+        self.marker_names = tuple(markers or {})
+        sites = {"load point": _vector("load_point", load_point, 3)}
+        for name, position in (markers or {}).items():
+            sites[f"marker {name}"] = _vector(f"marker {name}", position, 3)
+        g = np.zeros(3) if gravity is None else _vector("gravity", gravity, 3)
+        self.mjcf = write_mjcf(chain, self.compliance, sites, self.masses, g)
+        self._model = self._mujoco.MjModel.from_xml_string(self.mjcf)
+        self._data = self._mujoco.MjData(self._model)
+        self._flange = self._model.body("flange").id
+        self._elastic = np.flatnonzero(self.compliance > 0)
+
+    def flange(self, q: ArrayLike) -> Array:
+        """T_base_flange (4, 4) at joint values q (n,), springs or not."""
+        self._move_to(_vector("q", q, self._model.nq))
+        T = np.eye(4)
+        T[:3, :3] = self._data.xmat[self._flange].reshape(3, 3)
+        T[:3, 3] = self._data.xpos[self._flange]
+        return T
+
+    def markers(self, q: ArrayLike) -> dict[str, Array]:
+        """Marker positions (3,) in m in the base frame at joint values q (n,), by name.
+
+        Where the arm gives way, hand in the deflected joint values of `equilibrium`.
+        """
+        self._move_to(_vector("q", q, self._model.nq))
+        return {name: self._data.site(f"marker {name}").xpos.copy() for name in self.marker_names}
+
+    def equilibrium(self, q: ArrayLike, force: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+        """Joint values (n,) at rest, commanded to q (n,), under `force` (3,) N at the load point.
+
+        The force keeps its direction in the base frame while the arm gives way.
+        Raises ElastocalError where no stable equilibrium is found.
+        """
+        q = _vector("q", q, self._model.nq)
+        force = _vector("force", force, 3)
+        self._model.qpos_spring[:] = q
+        delta = np.zeros(len(self._elastic))
+        for _ in range(MAX_STEPS):
+            slope = self._slope(q, delta, force)
+            step = np.linalg.solve(slope, self._residual(q, delta, force))
+            delta = delta - step
+            if not np.all(np.isfinite(delta)):
+                break
+            if np.max(np.abs(step), initial=0.0) < TOLERANCE:
+                self._check_stable(slope)
+                return self._deflected(q, delta)
+        raise ElastocalError(
+            f"no static equilibrium near q = {q.tolist()} under {force.tolist()} N; "
+            "check compliances and load"
+        )
+
+    def _deflected(self, q: Array, delta: Array) -> Array:
+        deflected = q.copy()
+        deflected[self._elastic] += delta
+        return deflected
+
+    def _move_to(self, q: Array) -> None:
+        """Frames, passive forces and bias forces of MuJoCo at q, at rest."""
+        self._data.qpos[:] = q
+        self._data.qvel[:] = 0.0
+        self._mujoco.mj_fwdPosition(self._model, self._data)
+        self._mujoco.mj_fwdVelocity(self._model, self._data)
+
+    def _residual(self, q: Array, delta: Array, force: Array) -> Array:
+        """r(δ) (n_elastic,) in rad or m."""
+        self._move_to(self._deflected(q, delta))
+        load = np.zeros(self._model.nv)
+        point = self._data.site("load point").xpos
+        self._mujoco.mj_applyFT(
+            self._model, self._data, force, np.zeros(3), point, self._flange, load
+        )
+        total = self._data.qfrc_passive - self._data.qfrc_bias + load
+        return (self.compliance * total)[self._elastic]
+
+    def _slope(self, q: Array, delta: Array, force: Array) -> Array:
+        """∂r/∂δ (n_elastic, n_elastic) by central differences."""
+        slope = np.empty((len(delta), len(delta)))
+        for j in range(len(delta)):
+            h = np.zeros(len(delta))
+            h[j] = DIFFERENCE_STEP
+            ahead, behind = (self._residual(q, delta + s * h, force) for s in (1, -1))
+            slope[:, j] = (ahead - behind) / (2 * DIFFERENCE_STEP)
+        return slope
+
+    def _check_stable(self, slope: Array) -> None:
+        # −∂r/∂δ = K⁻¹ (K − ∂τ/∂δ) has the signs of the symmetric total stiffness K − ∂τ/∂δ.
+        if np.any(np.linalg.eigvals(-slope).real <= 0):
+            raise ElastocalError(
+                "the equilibrium is unstable: the load buckles the joints; "
+                "check compliances and load"
+            )
+
+
+def _vector(name: str, value: ArrayLike, size: int) -> Array:
+    vector = np.array(value, dtype=float)
+    if vector.shape != (size,) or not np.all(np.isfinite(vector)):
+        raise InputError(f"{name}: {size} finite numbers are needed, not {vector.tolist()}")
+    return vector
+
+
+def _import_mujoco() -> Any:
+    try:
+        import mujoco
+    except ImportError:
+        raise InputError(
+            "the independent arm needs MuJoCo, which is not installed; "
+            "run: pip install elastocal[mujoco]"
+        ) from None
+    return mujoco

@@ -1,0 +1,110 @@
+"""The linear solver against the certified values of the NIST reference sets.
+
+Data and certified values: NIST Statistical Reference Datasets, linear least squares,
+https://www.itl.nist.gov/div898/strd/lls/lls.shtml.  nist/NAME.csv holds the observations (y, then
+the predictors), nist/certified.json the powers of the predictors in the model (0: constant term),
+the parameters, their standard deviations and the residual standard deviation, as certified.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from elastocal.identification.linear import solve_weighted
+
+FOLDER = Path(__file__).parent / "nist"
+CERTIFIED = json.loads((FOLDER / "certified.json").read_text(encoding="utf-8"))
+HARD = {"Filip", "Wampler4", "Wampler5"}
+EXACT_FIT = {"Wampler1", "Wampler2"}
+
+every_set = pytest.mark.parametrize("name", sorted(CERTIFIED))
+
+
+def read(name):
+    """B, y of the model, certified values."""
+    certified = CERTIFIED[name]
+    table = np.loadtxt(FOLDER / f"{name}.csv", delimiter=",", skiprows=1)
+    y, predictors = table[:, 0], table[:, 1:]
+    columns = [np.ones((y.size, 1))] if 0 in certified["powers"] else []
+    columns += [predictors**k for k in certified["powers"] if k > 0]
+    return np.hstack(columns), y, certified
+
+
+def digits(value, certified):
+    """Correct significant digits of the worst entry."""
+    value, certified = np.atleast_1d(value), np.atleast_1d(certified)
+    error = np.abs(value - certified) / np.abs(certified)
+    return float(np.min(-np.log10(np.maximum(error, 1e-17))))
+
+
+def assert_certified(name, solution):
+    certified = CERTIFIED[name]
+    x, std = np.array(certified["x"]), np.array(certified["std"])
+    needed = 7 if name in HARD else 9
+    assert solution.rank == x.size and solution.dropped.size == 0
+    assert digits(solution.x, x) >= needed
+    if name in EXACT_FIT:
+        assert np.all(solution.std() < 1e-9 * x)
+    else:
+        assert digits(solution.std(), std) >= needed
+        assert digits(np.sqrt(solution.sigma2), certified["residual_std"]) >= needed
+
+
+@every_set
+def test_certified_values(name):
+    B, y, _ = read(name)
+    assert_certified(name, solve_weighted(B, y))
+
+
+def test_sets_are_complete():
+    observations = {"Norris": 36, "Pontius": 40, "NoInt1": 11, "NoInt2": 3, "Filip": 82,
+                    "Longley": 16} | {f"Wampler{k}": 21 for k in range(1, 6)}
+    assert {name: read(name)[1].size for name in CERTIFIED} == observations
+
+
+@pytest.mark.parametrize("name", sorted(set(CERTIFIED) - {"Filip"}))
+def test_far_more_digits_where_the_data_are_exact_numbers(name):
+    # Filip is limited by the rounding of x**k to double, which its condition of 5e9 amplifies
+    B, y, certified = read(name)
+    solution = solve_weighted(B, y)
+    assert digits(solution.x, certified["x"]) > 13
+    if name not in EXACT_FIT:
+        assert digits(solution.std(), certified["std"]) > 13
+
+
+@every_set
+def test_weights_that_are_powers_of_two_change_not_one_bit(name):
+    B, y, _ = read(name)
+    w = 2.0 ** np.random.default_rng(1).integers(-20, 20, y.size)
+    plain, weighted = solve_weighted(B, y), solve_weighted(B / w[:, None], y / w, w)
+    assert np.array_equal(weighted.x, plain.x)
+    assert np.array_equal(weighted.std(), plain.std())
+    assert np.array_equal(weighted.residual * w, plain.residual)
+
+
+@every_set
+def test_certified_values_through_row_weights(name):
+    # rows times k, weights 1/k; k B and k y are exact numbers except for Filip's powers
+    B, y, _ = read(name)
+    k = np.random.default_rng(2).integers(1, 1000, y.size).astype(float)
+    assert_certified(name, solve_weighted(B * k[:, None], y * k, 1 / k))
+
+
+@pytest.mark.parametrize("name", sorted(set(CERTIFIED) - {"Wampler5"}))
+def test_certified_values_through_any_row_weights(name):
+    # here B/w and y/w are rounded; Wampler5, whose residual is 1e7 times its signal, cannot
+    # keep 7 digits then: exact arithmetic on the rounded rows gives 6
+    B, y, _ = read(name)
+    w = np.random.default_rng(3).uniform(0.1, 10, y.size)
+    assert_certified(name, solve_weighted(B / w[:, None], y / w, w))
+
+
+@every_set
+def test_column_units_do_not_matter(name):
+    B, y, certified = read(name)
+    units = 2.0 ** np.random.default_rng(4).integers(-40, 40, B.shape[1])
+    plain, scaled = solve_weighted(B, y), solve_weighted(B * units, y)
+    assert np.array_equal(scaled.x * units, plain.x)
+    assert np.array_equal(scaled.std() * units, plain.std())

@@ -1,0 +1,176 @@
+"""The independent arm: same kinematics as ours and pinocchio's, torque balance at rest."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from support.robots import KR270, random_chain_urdf
+
+from elastocal.errors import ElastocalError, InputError
+from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.rigid import nominal_flange
+from elastocal.manipulator.urdf import read_urdf
+from elastocal.simulation import mjcf, mujoco_arm
+from elastocal.simulation.mujoco_arm import MujocoArm
+
+pytest.importorskip("mujoco")
+
+# Table 3 of Klimchik et al. (2013) in rad/(N m); k1 is not in it, k2 near its first level.
+COMPLIANCE = np.array([0.35, 0.29, 0.416, 2.786, 3.483, 2.074]) * 1e-6
+LOAD_POINT = np.array([0.20, 0.0, 0.25])
+DOWN = np.array([0.0, 0.0, -2600.0])
+GRAVITY = np.array([0.0, 0.0, -9.80665])
+
+
+@pytest.fixture(scope="module")
+def kr270() -> Chain:
+    return read_urdf(KR270)
+
+
+def configurations(chain: Chain, count: int, seed: int = 0) -> np.ndarray:
+    low = [max(joint.lower, -np.pi) for joint in chain.joints]
+    high = [min(joint.upper, np.pi) for joint in chain.joints]
+    return np.random.default_rng(seed).uniform(low, high, (count, chain.n_joints))
+
+
+def loaded_pinocchio() -> tuple[pin.Model, pin.Data, int]:
+    model = pin.buildModelFromUrdf(str(KR270))
+    flange = model.getFrameId("flange", pin.FrameType.BODY)
+    parent = model.frames[flange].parentJoint
+    placement = model.frames[flange].placement * pin.SE3(np.eye(3), LOAD_POINT)
+    load = model.addFrame(pin.Frame("load", parent, flange, placement, pin.FrameType.OP_FRAME))
+    return model, model.createData(), load
+
+
+def load_torques(model, data, frame: int, q: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """τ = J(q)ᵀ f at the load point, by pinocchio."""
+    J = pin.computeFrameJacobian(model, data, q, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+    return J[:3].T @ force
+
+
+@pytest.mark.parametrize("seed", [None, *range(10)])
+def test_kinematics_agree(tmp_path: Path, kr270: Chain, seed: int | None) -> None:
+    chain = kr270
+    if seed is not None:
+        path = tmp_path / "chain.urdf"
+        path.write_text(random_chain_urdf(seed))
+        chain = read_urdf(path, base="base", flange="flange")
+    marker = np.array([0.1, -0.2, 0.3])
+    arm = MujocoArm(chain, np.ones(chain.n_joints), markers={"M1": marker})
+    symbol = ca.SX.sym("q", chain.n_joints)
+    ours = ca.Function("T", [symbol], [nominal_flange(chain, symbol)])
+    for q in configurations(chain, 20):
+        T = ours(q).full()
+        np.testing.assert_allclose(arm.flange(q), T, rtol=0, atol=1e-12)
+        expected = T[:3, :3] @ marker + T[:3, 3]
+        np.testing.assert_allclose(arm.markers(q)["M1"], expected, rtol=0, atol=1e-12)
+
+
+def test_torques_balance_under_the_load_by_pinocchio(kr270: Chain) -> None:
+    model, data, frame = loaded_pinocchio()
+    arm = MujocoArm(kr270, COMPLIANCE, LOAD_POINT)
+    largest = 0.0
+    for q in configurations(kr270, 50):
+        for force in (DOWN, np.array([900.0, -1500.0, -2600.0])):
+            rest = arm.equilibrium(q, force)
+            expected = COMPLIANCE * load_torques(model, data, frame, rest, force)
+            np.testing.assert_allclose(rest - q, expected, rtol=0, atol=1e-12)
+            largest = max(largest, float(np.abs(expected).max()))
+    assert largest > 1e-3  # the load does bend the arm, by milliradians
+
+
+def test_weights_add_to_the_load(kr270: Chain) -> None:
+    model, data, frame = loaded_pinocchio()
+    model.gravity.linear = GRAVITY
+    arm = MujocoArm(kr270, COMPLIANCE, LOAD_POINT, gravity=GRAVITY)
+    for q in configurations(kr270, 20):
+        rest = arm.equilibrium(q, DOWN)
+        load = load_torques(model, data, frame, rest, DOWN)
+        weights = -pin.computeGeneralizedGravity(model, data, rest)
+        np.testing.assert_allclose(rest - q, COMPLIANCE * (load + weights), rtol=0, atol=1e-12)
+
+
+def test_slides_give_way_by_compliance_times_force(tmp_path: Path) -> None:
+    path = tmp_path / "chain.urdf"
+    path.write_text(random_chain_urdf(4))
+    text = path.read_text()
+    chain = read_urdf(path, base="root", flange="flange")
+    assert set(chain.kinds) == {"revolute", "prismatic"}
+    model = pin.buildModelFromXML(text)
+    arm = MujocoArm(chain, np.full(chain.n_joints, 1e-6))
+    symbol = ca.SX.sym("q", chain.n_joints)
+    position = nominal_flange(chain, symbol)[:3, 3]
+    force = np.array([300.0, -200.0, 500.0])
+    tau = ca.Function("tau", [symbol], [ca.jacobian(position, symbol).T @ ca.DM(force)])
+    assert model.njoints > chain.n_joints
+    for q in configurations(chain, 10):
+        rest = arm.equilibrium(q, force)
+        np.testing.assert_allclose(rest - q, 1e-6 * tau(rest).full().ravel(), rtol=0, atol=1e-12)
+
+
+def test_without_load_or_with_rigid_joints_nothing_moves(kr270: Chain) -> None:
+    q = configurations(kr270, 1)[0]
+    np.testing.assert_array_equal(MujocoArm(kr270, COMPLIANCE).equilibrium(q), q)
+    np.testing.assert_array_equal(MujocoArm(kr270, np.zeros(6)).equilibrium(q, DOWN), q)
+    stiff_wrist = COMPLIANCE * [1, 1, 1, 0, 0, 0]
+    rest = MujocoArm(kr270, stiff_wrist).equilibrium(q, DOWN)
+    assert np.all(rest[3:] == q[3:])
+    assert np.all(rest[1:3] != q[1:3])
+
+
+def test_a_buckling_load_is_refused(kr270: Chain) -> None:
+    """Upright and pushed down with more than its joints can hold, the arm falls over."""
+    soft = np.full(6, 1e-3)
+    with pytest.raises(ElastocalError, match="unstable|no static equilibrium"):
+        MujocoArm(kr270, soft).equilibrium(np.radians([0, -90, 0, 0, 0, 0]), [0, 0, -1e5])
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"compliance": np.ones(5)}, "compliance: 6 finite numbers are needed"),
+        ({"compliance": -COMPLIANCE}, r"must be 0 \(rigid\) or more"),
+        ({"load_point": [0, 0]}, "load_point: 3 finite numbers"),
+        ({"markers": {"M1": [0, np.nan, 0]}}, "marker M1: 3 finite numbers"),
+        ({"gravity": 9.81}, "gravity: 3 finite numbers"),
+        ({"masses": [None]}, "masses: 1 given, the chain has 6 joints"),
+    ],
+)
+def test_wrong_arguments_are_explained(kr270: Chain, arguments: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        MujocoArm(kr270, **{"compliance": COMPLIANCE, **arguments})
+
+
+def test_wrong_poses_and_forces_are_explained(kr270: Chain) -> None:
+    arm = MujocoArm(kr270, COMPLIANCE)
+    with pytest.raises(InputError, match="q: 6 finite numbers"):
+        arm.equilibrium(np.zeros(5))
+    with pytest.raises(InputError, match="force: 3 finite numbers"):
+        arm.equilibrium(np.zeros(6), [0, 0])
+
+
+def test_missing_mujoco_says_what_to_install(kr270: Chain, monkeypatch) -> None:
+    genuine = builtins.__import__
+
+    def without_mujoco(name, *args, **kwargs):
+        if name == "mujoco":
+            raise ImportError(name)
+        return genuine(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_mujoco)
+    with pytest.raises(InputError, match=r"pip install elastocal\[mujoco\]"):
+        MujocoArm(kr270, COMPLIANCE)
+
+
+def test_it_is_independent_of_our_kinematics() -> None:
+    for module in (mujoco_arm, mjcf):
+        lines = Path(str(module.__file__)).read_text().splitlines()
+        imported = {line.split()[1] for line in lines if line.startswith("from elastocal")}
+        assert imported <= {
+            "elastocal.errors", "elastocal.manipulator.chain", "elastocal.simulation.mjcf"
+        }  # fmt: skip
