@@ -64,7 +64,7 @@ class Tracker:
 
 @dataclass(frozen=True)
 class EffectChoice:
-    """One entry of `effects`: "joint_compliance" or, for one place only, "joint_compliance:joint2"."""
+    """One entry of `effects`: "joint_compliance", or "joint_compliance:joint2" for one place."""
 
     name: str
     where: str | None = None

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-KR270 = Path(__file__).parents[2] / "experiment_design" / "kr270" / "kr270_2.urdf"
+KR270 = Path(__file__).parents[2] / "src" / "elastocal" / "demo" / "kr270_2.urdf"
 
 # name → (distribution, end of the file's path, flange link or None)
 PACKAGED = {

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
@@ -12,6 +10,7 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.manipulator.model import Model, rigid_model
 from elastocal.manipulator.observation import Observations
 from elastocal.measurements import Measurements
+from elastocal.nearest import did_you_mean
 
 Array = NDArray[np.float64]
 
@@ -33,7 +32,7 @@ def check_table(model: Model, table: Measurements) -> None:
             f"{table.source} has {table.q.shape[1]} joint columns, but robot "
             f"'{model.chain.name}' has {n} joints"
         )
-    _check_limits(model, table)
+    check_limits(model, table)
     _check_units(model, table)
 
 
@@ -47,15 +46,17 @@ def limits(model: Model) -> tuple[Array, Array]:
     return lower, upper
 
 
-def _check_limits(model: Model, table: Measurements) -> None:
+def check_limits(model: Model, table: Measurements) -> None:
+    """Joint values within the limits of robot and cell; InputError names line, joint and remedy."""
     revolute = np.array([k == "revolute" for k in model.chain.kinds])
     wound = np.abs(table.q[:, revolute]) > 4 * np.pi
     if wound.any():
         i = int(np.flatnonzero(wound.any(axis=1))[0])
         raise InputError(
-            f"{table.source}, line {table.row[i]}: a joint stands at {np.abs(table.q[i]).max():.4g} "
-            f"rad, more than two turns ({int(wound.any(axis=1).sum())} lines); these are probably "
-            "degrees in a column named …_rad: rename it to …_deg"
+            f"{table.source}, line {table.row[i]}: a joint stands at "
+            f"{np.abs(table.q[i]).max():.4g} rad, more than two turns "
+            f"({int(wound.any(axis=1).sum())} lines); these are probably degrees in a column "
+            "named …_rad: rename it to …_deg"
         )
     lower, upper = limits(model)
     beyond = (table.q < lower - LIMIT_SLACK) | (table.q > upper + LIMIT_SLACK)
@@ -117,10 +118,9 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
         match = [i for i, p in enumerate(model.parameters) if name in (p.name, p.where, p.effect)]
         if not match:
             valid = sorted({v for p in model.parameters for v in (p.name, p.where, p.effect)})
-            near = get_close_matches(name, valid, n=1, cutoff=0.0)
             raise InputError(
                 f"cannot fix '{name}': the model has no such parameter, place or effect"
-                + (f"; did you mean '{near[0]}'?" if near else "")
+                f"{did_you_mean(name, valid)}"
             )
         held |= set(match)
     free = np.array([i for i in range(len(model.parameters)) if i not in held], dtype=np.int64)

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from elastocal.cell import CartesianNoise, PolarNoise, Tracker
+from elastocal.cell import Tracker
 from elastocal.errors import InputError
 from elastocal.manipulator.observation import Observations
-from elastocal.measurements import Measurements
+from elastocal.tracker_noise import available_noise, position_covariance
 
 Array = NDArray[np.float64]
 WeightKind = Literal["auto", "none", "rows", "axis", "polar", "covariance"]
@@ -60,7 +60,7 @@ def weights_for(
         sigma = float(tracker.distance_sigma or 1.0)
         whiten = sparse.csr_array(sparse.eye_array(len(seen.value)) / sigma)
         return Weights("axis", whiten, True, f"distance sigma {sigma * 1e6:.3g} µm from the cell")
-    blocks, text = _position_covariance(seen.table, tracker, chosen)
+    blocks, text = position_covariance(seen.table, tracker, chosen)
     if seen.kind == "pose":
         _need(tracker.rotation_sigma is not None, "poses need [tracker] rotation_urad")
         full = np.zeros((len(seen.table), 6, 6))
@@ -88,11 +88,7 @@ def _available(seen: Observations, tracker: Tracker) -> str:
         return "none" if tracker.distance_sigma is None else "axis"
     if seen.kind == "pose" and tracker.rotation_sigma is None:
         return "none"
-    if seen.table.sigma is not None:
-        return "rows"
-    if isinstance(tracker.noise, PolarNoise):
-        return "polar"
-    return "none" if tracker.noise is None else "axis"
+    return available_noise(seen.table, tracker)
 
 
 def _need(condition: bool, message: str) -> None:
@@ -113,53 +109,6 @@ def _given(seen: Observations, covariance: Array | None) -> Weights:
         "the covariance must be finite and symmetric",
     )
     return Weights("covariance", _whitener(sparse.csr_array(matrix)), True, "given covariance")
-
-
-def _position_covariance(
-    table: Measurements, tracker: Tracker, kind: str
-) -> tuple[NDArray[np.float64], str]:
-    """Covariance (n, 3, 3) in m² of each row's x, y, z, and where it comes from."""
-    n = len(table)
-    if kind == "rows":
-        _need(table.sigma is not None, f"{table.source} has no sigma_… columns")
-        sigma = np.asarray(table.sigma)
-        text = f"per-row {table.sigma_frame} sigmas from the table"
-        polar = table.sigma_frame == "polar"
-    elif kind == "axis":
-        _need(isinstance(tracker.noise, CartesianNoise), "the cell has no [tracker] sigma_um")
-        assert isinstance(tracker.noise, CartesianNoise)
-        sigma, polar = np.tile(tracker.noise.sigma, (n, 1)), False
-        text = f"tracker sigma {np.round(tracker.noise.sigma * 1e6, 3).tolist()} µm along x, y, z"
-    else:
-        _need(isinstance(tracker.noise, PolarNoise), "the cell has no [tracker] range_um, …")
-        assert isinstance(tracker.noise, PolarNoise)
-        model, polar = tracker.noise, True
-        reach = np.linalg.norm(_position(table) - tracker.position, axis=1)
-        along = model.range + model.range_per_m * reach
-        across = model.transverse + model.transverse_per_m * reach
-        sigma = np.column_stack([along, across, across])
-        text = "polar tracker noise (range and transverse) from the cell"
-    if not polar:
-        return np.eye(3) * (sigma**2)[:, None, :], text
-    axes = polar_axes(_position(table) - tracker.position)
-    return np.einsum("nki,nk,nkj->nij", axes, sigma**2, axes), text
-
-
-def _position(table: Measurements) -> Array:
-    _need(table.position is not None, f"{table.source} has no positions")
-    return np.asarray(table.position)
-
-
-def polar_axes(sight: Array) -> Array:
-    """Unit vectors (n, 3, 3): range, azimuth and elevation direction of each line of sight."""
-    length = np.linalg.norm(sight, axis=1, keepdims=True)
-    _need(bool((length > 0).all()), "a marker stands at the tracker's own position")
-    radial = sight / length
-    azimuth = np.column_stack([-radial[:, 1], radial[:, 0], np.zeros(len(radial))])
-    flat = np.linalg.norm(azimuth, axis=1)
-    # Straight above the tracker azimuth is undefined; any horizontal direction serves.
-    azimuth = np.where(flat[:, None] > 1e-9, azimuth / np.maximum(flat, 1e-300)[:, None], [1, 0, 0])
-    return np.stack([radial, azimuth, np.cross(radial, azimuth)], axis=1)
 
 
 def _block_diagonal(blocks: Array) -> sparse.csr_array:

@@ -34,9 +34,11 @@ def start_values(model: Model, table: Measurements, seed: int = 0) -> Array:
         return x
     names = list(model.cell.tool.markers)
     codes = np.array([names.index(m) for m in table.marker_names])[table.marker]
-    # Deflected readings would pull the start; unloaded ones serve alone where there are enough.
+    # Deflected readings would pull the start; unloaded ones serve alone where they are enough
+    # and show every marker.
     light = ~np.any(table.force != 0, axis=1)
-    rows = np.flatnonzero(light) if light.sum() >= 12 else np.arange(len(table))
+    enough = light.sum() >= 12 and set(codes[light]) == set(codes)
+    rows = np.flatnonzero(light) if enough else np.arange(len(table))
     T = rigid_model(model).flange_poses(table.take(rows))
     nominal = model.cell.model.nominal
     problem = RegistrationProblem(

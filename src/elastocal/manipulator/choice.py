@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
-
 from elastocal.cell import Cell
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.effects.base import Effect
+from elastocal.nearest import did_you_mean, listed
 
 
 def load_chain(cell: Cell) -> Chain:
@@ -49,9 +48,7 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
 
 
 def _unknown(what: str, found: str, valid: list[str], cell: Cell) -> str:
-    near = get_close_matches(found, valid, n=1, cutoff=0.0)
-    hint = f"; did you mean '{near[0]}'?" if near else ""
     return (
-        f"{cell.path or cell.name}: [model] effects: unknown {what} '{found}'{hint} "
-        f"Valid: {', '.join(valid)}"
+        f"{cell.path or cell.name}: [model] effects: unknown {what} '{found}'"
+        f"{did_you_mean(found, valid)}; valid: {listed(valid)}"
     )

@@ -31,8 +31,8 @@ from elastocal.manipulator.chain import (
     JointKind,
     LinkMass,
 )
-from elastocal.manipulator.nearest import did_you_mean, listed
 from elastocal.manipulator.number_table import Quantity, Row, Table, read_table
+from elastocal.nearest import did_you_mean, listed
 
 Convention = Literal["standard", "modified"]
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")

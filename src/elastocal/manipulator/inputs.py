@@ -68,7 +68,8 @@ def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
     if off.any():
         i = int(np.flatnonzero(off)[0])
         raise InputError(
-            f"{table.source}, line {table.row[i]}: {joint} stands at {np.degrees(q[i]):.3f}°, which "
-            f"is none of its levels in [model.compliance_levels]; add the level or drop the row"
+            f"{table.source}, line {table.row[i]}: {joint} stands at {np.degrees(q[i]):.3f}°, "
+            "which is none of its levels in [model.compliance_levels]; add the level or drop the "
+            "row"
         )
     return _one_hot(nearest, len(levels))

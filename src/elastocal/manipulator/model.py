@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell import Cell, EffectChoice
 from elastocal.errors import ElastocalError
-from elastocal.manipulator import rigid
-from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Array, Chain
-from elastocal.manipulator.choice import choose_effects, load_chain
-from elastocal.manipulator.equilibrium import Equilibrium
+from elastocal.manipulator.choice import load_chain
 from elastocal.manipulator.inputs import row_inputs
 from elastocal.manipulator.observation import Observations, observe
-from elastocal.manipulator.parameter import Parameter
-from elastocal.manipulator.tape import Tape
+from elastocal.manipulator.symbolic import SymbolicArm
 from elastocal.measurements import Measurements
 
 
@@ -50,33 +44,8 @@ class Model:
     def __init__(self, chain: Chain, cell: Cell) -> None:
         self.chain, self.cell = chain, cell
         self.observe = cell.model.observe
-        arm = Arm(chain, cell)
-        chosen = choose_effects(chain, cell)
-        parameters: list[Parameter] = []
-        symbols: list[ca.SX] = []
-        bound = []
-        for effect, place in chosen:
-            own = {}
-            for spec in effect.parameters(place, chain, cell):
-                own[spec.key] = ca.SX.sym(f"{place}.{spec.key}")
-                symbols.append(own[spec.key])
-                parameters.append(
-                    Parameter(f"{place}.{spec.key}", effect.name, place, spec.unit,
-                              spec.nominal, spec.typical, spec.lower, spec.upper)
-                )  # fmt: skip
-            bound.append((effect, place, own))
-        for effect, place, own in bound:
-            effect.shape(arm, place, own)
-        arm.assemble()
-        for effect, place, own in bound:
-            effect.load(arm, place, own)
-        for effect, place, own in bound:
-            effect.read(arm, place, own)
-        self.parameters = tuple(parameters)
-        self._p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
-        self._arm = arm
-        self._reading = self._expression()
-        self._tapes: dict[tuple[str, tuple[int, ...]], Tape] = {}
+        self._symbolic = SymbolicArm(chain, cell)
+        self.parameters = self._symbolic.parameters
 
     @classmethod
     def from_cell(cls, cell: Cell, marker_names: tuple[str, ...] = ()) -> Model:
@@ -113,98 +82,30 @@ class Model:
         given = [p.typical for p in self.parameters]
         return np.array([m if s is None else s for s, m in zip(given, moved, strict=True)])
 
-    # --- expressions -----------------------------------------------------------------------
-
-    def _expression(self) -> ca.SX:
-        """The reading of one row (3, 6 or 1 components) as an expression."""
-        arm = self._arm
-        if self.observe == "distance":
-            return arm.reading["distance"]
-        if self.observe == "pose":
-            measured = rigid.rotation_from_vector(arm.input("rotation", 3))
-            relative = measured.T @ arm.reading["rotation"]
-            return ca.vertcat(arm.reading["position"], rigid.vector_from_rotation(relative))
-        return arm.reading["position"]
-
-    @cached_property
-    def _linear(self) -> bool:
-        """Deflections by eq. (3)."""
-        return bool(self._arm.springs) and self.cell.model.deflection_model == "linear"
-
-    @cached_property
-    def _implicit(self) -> bool:
-        """Deflections by the equilibrium F(θ) = 0."""
-        return bool(self._arm.springs) and not self._linear
-
-    @cached_property
-    def _residual(self) -> ca.SX:
-        arm = self._arm
-        return arm.theta - arm.deflection_laws(arm.generalised_forces())
-
-    def _linearised(self, expression: ca.SX) -> ca.SX:
-        """Eq. (3): h(0) + ∂h/∂θ · law(τ(0)), loads and lever arms of the undeflected pose."""
-        theta = self._arm.theta
-        rest = ca.SX.zeros(theta.shape[0], 1)
-        deflection = ca.substitute(theta - self._residual, theta, rest)
-        slope = ca.substitute(ca.jacobian(expression, theta), theta, rest)
-        return ca.substitute(expression, theta, rest) + slope @ deflection
-
-    @cached_property
-    def _equilibrium(self) -> Equilibrium:
-        inputs = list(self._arm.inputs.values())
-        return Equilibrium(inputs, self._p, self._arm.theta, self._residual)
-
-    def _tape(self, name: str, columns: tuple[int, ...] = ()) -> Tape:
-        """Tapes are built on first use: "reading", "slopes", "B" (of `columns`), "flange"."""
-        if (name, columns) not in self._tapes:
-            self._tapes[name, columns] = self._build_tape(name, list(columns))
-        return self._tapes[name, columns]
-
-    def _build_tape(self, name: str, columns: list[int]) -> Tape:
-        arm, p, theta = self._arm, self._p, self._arm.theta
-        inputs = [*arm.inputs.values(), p, theta]
-        if name == "flange":
-            T = ca.vec(arm.T_tracker_flange)
-            return Tape(inputs, [ca.reshape(self._linearised(T) if self._linear else T, 4, 4)])
-        h = self._linearised(self._reading) if self._linear else self._reading
-        if name == "reading":
-            return Tape(inputs, [h])
-        if name == "slopes":
-            return Tape(inputs, [ca.jacobian(h, theta), ca.jacobian(self._residual, theta)])
-        if not self._implicit:
-            return Tape(inputs, [h, ca.jacobian(h, p)[:, columns]])
-        # Adjoint of the equilibrium: with λ = F_θ⁻ᵀ h_θᵀ the total derivative of component c is
-        # the partial one of h_c − λ_cᵀ F, a few reverse sweeps instead of all of ∂F/∂X.
-        adjoint = ca.SX.sym("adjoint", h.shape[0], theta.shape[0])
-        lagrangian = h - adjoint @ self._residual
-        return Tape([*inputs, ca.vec(adjoint.T)], [h, ca.jacobian(lagrangian, p)[:, columns]])
-
-    # --- evaluation ------------------------------------------------------------------------
-
     def deflection(self, table: Measurements, x: Array | None = None) -> NDArray:
         """Elastic deflections θ (n_rows, springs) at equilibrium; NaN where none is found."""
         x = self.nominal if x is None else np.asarray(x)
-        return self._settle(row_inputs(self._arm, table), x)
+        return self._settle(row_inputs(self._symbolic.arm, table), x)
 
     def _settle(self, inputs: list[NDArray], x: NDArray) -> NDArray:
-        if not self._implicit:
-            return np.zeros((len(inputs[0]), len(self._arm.springs)), dtype=x.dtype)
-        return self._equilibrium.solve(inputs, x)
+        if not self._symbolic.implicit:
+            return np.zeros((len(inputs[0]), len(self._symbolic.arm.springs)), dtype=x.dtype)
+        return self._symbolic.equilibrium.solve(inputs, x)
 
     def _rows(
         self, table: Measurements, x: NDArray, columns: tuple[int, ...]
     ) -> tuple[NDArray, NDArray]:
         """Reading (n_rows, size) and B (n_rows, size, columns) of every table row."""
-        inputs = row_inputs(self._arm, table)
+        inputs = row_inputs(self._symbolic.arm, table)
         theta = self._settle(inputs, x)
-        if not self._implicit:
-            h, B = self._tape("B", columns)(*inputs, x, theta)
+        if not self._symbolic.implicit:
+            h, B = self._symbolic.tape("B", columns)(*inputs, x, theta)
             return h[..., 0], B
-        h_theta, F_theta = self._tape("slopes")(*inputs, x, theta)
+        h_theta, F_theta = self._symbolic.tape("slopes")(*inputs, x, theta)
         F_theta[~np.isfinite(theta).all(axis=1)] = np.eye(F_theta.shape[1])
         adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), h_theta.transpose(0, 2, 1))
         adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
-        h, B = self._tape("B", columns)(*inputs, x, theta, adjoint)
+        h, B = self._symbolic.tape("B", columns)(*inputs, x, theta, adjoint)
         return h[..., 0], B
 
     def predict(
@@ -218,8 +119,8 @@ class Model:
         `observations` spares pairing the table anew.  Rows without an equilibrium are NaN.
         """
         x = self.nominal if x is None else np.asarray(x)
-        inputs = row_inputs(self._arm, table)
-        h = self._tape("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
+        inputs = row_inputs(self._symbolic.arm, table)
+        h = self._symbolic.tape("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
         return (observations or observe(table, self.observe)).apply(h).ravel()
 
     def regressor(
@@ -250,9 +151,18 @@ class Model:
 
     def flange_poses(self, table: Measurements, x: Array | None = None) -> NDArray:
         """T_tracker_flange (n_rows, 4, 4) at parameter values x, deflections included."""
+        return self._frames(table, x)[0]
+
+    def target_poses(self, table: Measurements, x: Array | None = None) -> tuple[NDArray, NDArray]:
+        """Rotation (n_rows, 3, 3) and position (n_rows, 3) of each row's marker as the tracker
+        would report them, whatever the model observes.  Rows without an equilibrium are NaN."""
+        _, position, rotation = self._frames(table, x)
+        return rotation, position[..., 0]
+
+    def _frames(self, table: Measurements, x: Array | None) -> list[NDArray]:
         x = self.nominal if x is None else np.asarray(x)
-        inputs = row_inputs(self._arm, table)
-        return self._tape("flange")(*inputs, x, self._settle(inputs, x))[0]
+        inputs = row_inputs(self._symbolic.arm, table)
+        return self._symbolic.tape("frames")(*inputs, x, self._settle(inputs, x))
 
 
 def rigid_model(model: Model) -> Model:

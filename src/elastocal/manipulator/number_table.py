@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from elastocal.errors import InputError
-from elastocal.manipulator.nearest import did_you_mean, listed
+from elastocal.nearest import did_you_mean, listed
 
 SI = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3, "kg": 1.0}
 MAX_BYTES = 10_000_000

@@ -12,8 +12,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from elastocal.errors import InputError
-from elastocal.manipulator.nearest import did_you_mean
 from elastocal.manipulator.urdf_tree import MOVING, Link, Tree, UrdfJoint, Vector
+from elastocal.nearest import did_you_mean
 
 MAX_BYTES = 50_000_000
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")

@@ -1,0 +1,5 @@
+"""python -m elastocal."""
+
+from elastocal.cli import main
+
+main()

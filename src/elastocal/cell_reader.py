@@ -1,0 +1,222 @@
+"""Reads the cell file: TOML → checked tables → frozen dataclasses in SI units."""
+
+from __future__ import annotations
+
+import tomllib
+import unicodedata
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from elastocal.cell import (
+    Array,
+    CartesianNoise,
+    Cell,
+    EffectChoice,
+    ModelSpec,
+    Nominal,
+    PolarNoise,
+    Robot,
+    Tool,
+    Tracker,
+)
+from elastocal.cell_complaint import complaint
+from elastocal.cell_joints import joint_values
+from elastocal.cell_schema import (
+    CellTable,
+    ModelTable,
+    NominalTable,
+    RobotTable,
+    ToolTable,
+    TrackerTable,
+)
+from elastocal.errors import InputError
+from elastocal.files import check_exists, read_text
+from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.units import to_si
+
+MAX_BYTES = 5_000_000
+POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
+
+
+def read_cell(path: str | Path, known_effects: tuple[str, ...] | None = None) -> Cell:
+    """The cell that a TOML file describes, in SI units.
+
+    Paths in it are relative to the file; the robot's files must exist.  `known_effects`: the
+    names that `[model] effects` may use; None leaves them unchecked.  `[workspace]` and
+    `[design]` are handed on as they stand.
+
+    Raises InputError that names file, key, what the key takes and the nearest valid name.
+    """
+    path = Path(path)
+    data = _parse(path)
+    try:
+        table = CellTable.model_validate(data)
+    except ValidationError as error:
+        raise complaint(path, data, error) from None
+    return Cell(
+        name=table.name or path.stem,
+        path=path,
+        robot=_robot(path, table.robot),
+        tool=_tool(path, table.tool or ToolTable()),
+        tracker=_tracker(path, table.tracker or TrackerTable()),
+        model=_model(path, table.model or ModelTable(), known_effects),
+        limits=_limits(path, table.limits or {}),
+        workspace=table.workspace or {},
+        design=table.design or {},
+    )
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    text = read_text(path, "cell file", MAX_BYTES)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        reason = str(error)
+        if "(at end of document)" in reason:
+            lines = text.split("\n")
+            place = f"(at line {len(lines)}, column {len(lines[-1]) + 1}, the end of the file)"
+            reason = reason.replace("(at end of document)", place)
+        raise InputError(f"{path}: not valid TOML: {reason}") from None
+
+
+def _robot(path: Path, table: RobotTable) -> Robot:
+    given = [key for key in ("urdf", "dh") if getattr(table, key) is not None]
+    if len(given) != 1:
+        found = "both are given" if given else "neither is given"
+        raise InputError(f"{path}: [robot] takes exactly one of urdf and dh; {found}")
+    other = {"urdf": ("dh_convention", "masses"), "dh": ("base", "flange")}[given[0]]
+    for key in other:
+        if getattr(table, key) is not None:
+            raise InputError(f"{path}: key robot.{key} has no meaning beside {given[0]}; drop it")
+
+    def file(key: str) -> Path | None:
+        text = getattr(table, key)
+        return None if text is None else check_exists(path.parent / text, f"robot.{key}", path)
+
+    convention = table.dh_convention or "standard"
+    return Robot(file("urdf"), table.base, table.flange, file("dh"), convention, file("masses"))
+
+
+def _tool(path: Path, table: ToolTable) -> Tool:
+    markers = table.markers_m or {}
+    for name in markers:
+        if name != name.strip() or not name or any(map(_is_control, name)):
+            raise InputError(
+                f"{path}: marker name {quoted(name)} in [tool.markers_m] cannot stand in a "
+                "table; use a non-empty text on one line without blanks at its ends"
+            )
+    point = table.load_point_m or [0.0, 0.0, 0.0]
+    return Tool(np.array(point), {name: np.array(p) for name, p in markers.items()})
+
+
+def _is_control(character: str) -> bool:
+    return unicodedata.category(character) in ("Cc", "Cs")
+
+
+def _tracker(path: Path, table: TrackerTable) -> Tracker:
+    polar = [key for key in POLAR_KEYS if getattr(table, key) is not None]
+    if polar and table.sigma_um is not None:
+        raise InputError(
+            f"{path}: keys tracker.sigma_um and tracker.{polar[0]} are two styles of noise; "
+            f"keep sigma_um, or {', '.join(POLAR_KEYS)}"
+        )
+    noise: CartesianNoise | PolarNoise | None = None
+    if table.sigma_um is not None:
+        noise = CartesianNoise(to_si(np.broadcast_to(np.array(table.sigma_um), 3), "um"))
+    elif polar:
+        if table.range_um is None or table.transverse_um is None:
+            missing = "range_um" if table.range_um is None else "transverse_um"
+            raise InputError(
+                f"{path}: key tracker.{missing} is missing; beside tracker.{polar[0]} it takes "
+                "a positive number in µm"
+            )
+        noise = PolarNoise(
+            range=to_si(table.range_um, "um"),
+            range_per_m=to_si(table.range_ppm or 0.0, "ppm"),
+            transverse=to_si(table.transverse_um, "um"),
+            transverse_per_m=to_si(table.transverse_ppm or 0.0, "ppm"),
+        )
+    return Tracker(
+        position=np.array(table.position_m or [0.0, 0.0, 0.0]),
+        noise=noise,
+        anchor=None if table.anchor_m is None else np.array(table.anchor_m),
+        rotation_sigma=None if table.rotation_urad is None else to_si(table.rotation_urad, "urad"),
+        distance_sigma=None if table.distance_um is None else to_si(table.distance_um, "um"),
+    )
+
+
+def _model(path: Path, table: ModelTable, known_effects: tuple[str, ...] | None) -> ModelSpec:
+    levels = joint_values(path, ("model", "compliance_levels"), table.compliance_levels or {})
+    for joint, values in levels.items():
+        if len(set(values)) < len(values):
+            raise InputError(
+                f"{path}: [model.compliance_levels] repeats a level of {joint}; give each once"
+            )
+    return ModelSpec(
+        observe=table.observe or "position",
+        effects=_effects(path, table.effects or [], known_effects),
+        torque=table.torque or "computed",
+        link_gravity=bool(table.link_gravity),
+        deflection_model=table.deflection_model or "equilibrium",
+        compliance_levels=levels,
+        gear_ripple_orders=tuple(table.gear_ripple_orders or ()),
+        nominal=_nominal(table.nominal or NominalTable()),
+    )
+
+
+def _nominal(table: NominalTable) -> Nominal:
+    compliance, spring = table.joint_compliance, table.gravity_compensator
+    return Nominal(
+        joint_compliance=None if compliance is None else tuple(compliance),
+        base_position=None if table.base_position_m is None else np.array(table.base_position_m),
+        base_rotation=None if table.base_rpy_deg is None else _rotation(table.base_rpy_deg),
+        gravity_compensator=None if spring is None else spring.model_dump(exclude_none=True),
+    )
+
+
+def _rotation(rpy_deg: Sequence[float]) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(np.radians(rpy_deg)), np.sin(np.radians(rpy_deg))
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    return about_z @ about_y @ about_x
+
+
+def _effects(
+    path: Path, entries: Sequence[str], known: tuple[str, ...] | None
+) -> tuple[EffectChoice, ...]:
+    choices: list[EffectChoice] = []
+    for i, entry in enumerate(entries):
+        name, colon, where = entry.partition(":")
+        key = f"key model.effects[{i}]"
+        if not name or (colon and not where) or entry != entry.strip():
+            raise InputError(
+                f'{path}: {key} takes "effect" or "effect:where"; found {quoted(entry)}'
+            )
+        if known is not None and name not in known:
+            raise InputError(
+                f"{path}: {key} names the unknown effect {quoted(name)}"
+                f"{did_you_mean(name, known)}; known effects: {listed(known)}"
+            )
+        choice = EffectChoice(name, where or None)
+        if choice in choices:
+            raise InputError(f"{path}: {key} repeats {quoted(entry)}; keep one")
+        choices.append(choice)
+    return tuple(choices)
+
+
+def _limits(path: Path, table: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
+    limits: dict[str, tuple[float, float]] = {}
+    for joint, (low, high) in joint_values(path, ("limits",), table).items():
+        if not low < high:
+            raise InputError(
+                f"{path}: the limits of {joint} in [limits] take [lower, upper] with "
+                "lower < upper; swap or correct them"
+            )
+        limits[joint] = (low, high)
+    return limits

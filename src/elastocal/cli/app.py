@@ -1,0 +1,109 @@
+"""What all commands share: the app, errors and exit codes, progress, output checks."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from elastocal import __version__
+from elastocal.errors import ElastocalError, InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+# Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
+
+app = typer.Typer(
+    help="Calibrate industrial robot arms and explain what is left over.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+
+CellFile = Annotated[Path, typer.Argument(help="Cell file (TOML): robot, tool, tracker, model.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout.")]
+Seed = Annotated[int, typer.Option(help="Seed of all random draws.")]
+
+
+def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
+    """Turn what the user can act on into a message and an exit code, never a traceback."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except ElastocalError as error:
+            _complain(str(error))
+            raise typer.Exit(error.exit_code) from None
+        except KeyboardInterrupt:
+            _complain("interrupted")
+            raise typer.Exit(130) from None
+        except BrokenPipeError:
+            # The reader of stdout went away (… | head): nothing is wrong with the input.
+            sys.stderr.close()
+            raise typer.Exit(0) from None
+        except OSError as error:
+            _complain(f"{error.filename or 'file'}: {error.strerror or error}")
+            raise typer.Exit(2) from None
+
+    return run
+
+
+def _complain(message: str) -> None:
+    typer.echo(f"elastocal: {message}", err=True)
+
+
+def console(stderr: bool = False) -> Console:
+    """A rich console; colours respect NO_COLOR and are off where the output is no terminal."""
+    from rich.console import Console
+
+    return Console(stderr=stderr, highlight=False)
+
+
+@contextmanager
+def progress_line(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A status line on stderr; silent where that is no terminal and `quiet` is asked for."""
+    if quiet:
+        yield lambda message: None
+        return
+    screen = console(stderr=True)
+    if not screen.is_terminal:
+        yield lambda message: screen.print(f"… {message}")
+        return
+    with screen.status("starting") as status:
+        yield lambda message: status.update(message)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"elastocal {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")
+    ] = False,
+) -> None:
+    """Calibrate industrial robot arms and explain what is left over."""
+
+
+def check_outputs(*paths: Path | None) -> None:
+    """Refuse an output that cannot be written before the work starts, not after it."""
+    for path in paths:
+        if path is None:
+            continue
+        if path.is_dir():
+            raise InputError(f"{path} is a directory; name a file to write")
+        if not path.absolute().parent.is_dir():
+            raise InputError(
+                f"{path}: the folder {path.absolute().parent} does not exist; create it first"
+            )

@@ -1,0 +1,39 @@
+"""elastocal demo: the worked example."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from elastocal.cli.app import Seed, app, console, progress_line, reporting_errors
+
+
+@app.command()
+@reporting_errors
+def demo(
+    folder: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for the example's files.")
+    ] = Path("demo_out"),
+    seed: Seed = 2013,
+) -> None:
+    """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
+
+    Example: elastocal demo -o demo_out
+    """
+    from elastocal.cli.results import write_results
+    from elastocal.demo import run_demo
+
+    with progress_line(quiet=False) as progress:
+        done = run_demo(folder, seed, progress)
+        report = folder / "report.html"
+        inputs = [done.cell, done.plan, done.data]
+        write_results(done.result, folder / "result.json", report, None, inputs, done.truth)
+    from elastocal.report.tables import print_result
+
+    print_result(console(), done.result, truth=done.truth)
+    typer.echo(
+        f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"
+        f"Report to open: {report.absolute()}"
+    )

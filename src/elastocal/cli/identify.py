@@ -1,0 +1,137 @@
+"""elastocal identify: parameters and intervals from measurements."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from elastocal.cli.app import (
+    CellFile,
+    Json,
+    Seed,
+    app,
+    check_outputs,
+    console,
+    progress_line,
+    reporting_errors,
+)
+from elastocal.errors import InputError
+
+if TYPE_CHECKING:
+    from elastocal.manipulator.model import Model
+    from elastocal.measurements import Measurements
+
+WEIGHTS = ("auto", "none", "rows", "axis", "polar", "covariance")
+
+
+@app.command()
+@reporting_errors
+def identify(
+    cell: CellFile,
+    data: Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Write the result as JSON.")
+    ] = None,
+    test: Annotated[
+        Path | None, typer.Option(help="Measurements never fitted, to test the result on.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write a report (one HTML page).")
+    ] = None,
+    residuals: Annotated[
+        Path | None, typer.Option(help="Write residuals of every reading as CSV.")
+    ] = None,
+    weights: Annotated[
+        str,
+        typer.Option(help="auto, none (ordinary least squares), rows, axis, polar, covariance."),
+    ] = "auto",
+    covariance: Annotated[
+        Path | None, typer.Option(help="Noise covariance in m² (CSV without header, or .npy).")
+    ] = None,
+    fix: Annotated[
+        list[str] | None,
+        typer.Option(help="Hold a parameter, place or effect at its start; repeatable."),
+    ] = None,
+    bounded: Annotated[
+        bool, typer.Option("--bounded", help="Keep parameters inside their physical bounds.")
+    ] = False,
+    drop_outliers: Annotated[
+        bool, typer.Option("--drop-outliers", help="Leave faulty readings out; they are listed.")
+    ] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """What are the parameters of my arm, and how sure are we?
+
+    Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
+    """
+    from elastocal.cli.results import write_results
+    from elastocal.identification.identify import Options
+    from elastocal.identification.identify import identify as run
+
+    if weights not in WEIGHTS:
+        raise InputError(f"--weights takes one of {', '.join(WEIGHTS)}; found '{weights}'")
+    check_outputs(output, report, residuals)
+    with progress_line(quiet) as progress:
+        progress("reading")
+        model, tables = _load(cell, [data] if test is None else [data, test])
+        chosen = Options(
+            weights=weights,  # type: ignore[arg-type]
+            covariance=None if covariance is None else _read_covariance(covariance),
+            fixed=tuple(fix or ()),
+            bounded=bounded,
+            drop_outliers=drop_outliers,
+            seed=seed,
+        )
+        result = run(model, tables[0], chosen, None if test is None else tables[1], progress)
+        inputs = [p for p in (cell, data, test, covariance) if p is not None]
+        write_results(result, output, report, residuals, inputs)
+    if as_json:
+        typer.echo(json.dumps(result.to_json(), indent=1))
+        return
+    from elastocal.report.tables import print_result
+
+    print_result(console(), result)
+    for path in (output, report, residuals):
+        if path is not None:
+            typer.echo(f"wrote {path}")
+
+
+def _load(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]:
+    """Model and tables; every file is checked before anything is computed."""
+    from elastocal.cell_reader import read_cell
+    from elastocal.manipulator.choice import load_chain
+    from elastocal.manipulator.effects import CATALOGUE
+    from elastocal.manipulator.model import Model
+    from elastocal.measurement_reader import read_measurements
+
+    cell = read_cell(cell_path, known_effects=tuple(CATALOGUE))
+    chain = load_chain(cell)
+    tables = [
+        read_measurements(
+            path,
+            joint_kinds=chain.kinds,
+            marker_names=tuple(cell.tool.markers),
+            observe=cell.model.observe,
+        )
+        for path in data
+    ]
+    names: tuple[str, ...] = tuple(dict.fromkeys(m for t in tables for m in t.marker_names))
+    return Model.from_cell(cell, names), tables
+
+
+def _read_covariance(path: Path) -> Any:
+    import numpy as np
+
+    try:
+        if path.suffix == ".npy":
+            return np.load(path, allow_pickle=False)
+        return np.loadtxt(path, delimiter=",", ndmin=2)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; --covariance needs a CSV or .npy matrix") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not a matrix of numbers ({error})") from None

@@ -1,0 +1,40 @@
+"""Writing an identification's result: JSON, residual table, report."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+
+from elastocal.files import atomic_write_text
+from elastocal.identification.result import IdentificationResult
+
+
+def write_results(
+    result: IdentificationResult,
+    output: Path | None,
+    report: Path | None,
+    residuals: Path | None,
+    inputs: list[Path],
+    truth: dict[str, float] | None = None,
+) -> None:
+    """Write what was asked for, each file whole or not at all.
+
+    `inputs` are named with their hashes in the report; `truth` (SI) stands beside the estimates.
+    """
+    if output is not None:
+        atomic_write_text(output, json.dumps(result.to_json(), indent=1) + "\n")
+    if residuals is not None:
+        rows = result.residual_table()
+        text = io.StringIO()
+        writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        atomic_write_text(residuals, text.getvalue())
+    if report is not None:
+        from elastocal.report.html import write_report
+
+        command = " ".join(["elastocal", *sys.argv[1:]])
+        write_report(result, report, truth=truth, command=command, inputs=inputs)

@@ -1,0 +1,100 @@
+"""The worked example: the KR 270 of Klimchik et al. 2013, simulated and identified end to end."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import numpy as np
+
+from elastocal.identification.result import IdentificationResult
+
+LOAD_N = (0.0, 0.0, -2600.0)  # 265 kg: the paper hung 250 to 280 kg
+REPEATS = 6
+SEED = 2013
+UNSEEN_COMPLIANCE = 0.35e-6  # rad/(N m); joint 1, which a vertical load cannot show
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What the demo did: its files, the true values, and what was found."""
+
+    cell: Path
+    plan: Path
+    data: Path
+    truth: dict[str, float]
+    published: dict[str, tuple[float, float]]
+    result: IdentificationResult
+
+
+def run_demo(
+    folder: Path, seed: int = SEED, progress: Callable[[str], None] = lambda message: None
+) -> Demo:
+    """Table 2's poses, Table 1's noise and Table 3's WLS compliances, measured and identified.
+
+    Writes cell, robot, plan and data into `folder`, so that every step can be repeated by hand.
+    Table 1 states the spread of deflections, the difference of two readings, so each reading
+    gets 1/√2 of it.
+    """
+    from elastocal.cell_reader import read_cell
+    from elastocal.identification.identify import identify
+    from elastocal.manipulator.model import Model
+    from elastocal.measurement_reader import read_plan
+    from elastocal.measurement_writer import write_measurements
+    from elastocal.simulation.simulate import expand_plan, simulate, values_from
+
+    progress("copying the example")
+    cell_path, plan_path = _copy_example(folder)
+    cell = read_cell(cell_path)
+    model = Model.from_cell(cell)
+    plan = read_plan(plan_path, joint_kinds=model.chain.kinds)
+    rows = expand_plan(plan, tuple(cell.tool.markers), REPEATS, np.array(LOAD_N))
+    rows = replace(rows, sigma=_reading_sigma(folder)[rows.configuration])
+    truth, published = _compliances(folder)
+    progress(f"measuring {len(rows)} simulated readings")
+    table = simulate(model, rows, values_from(model, truth), seed)
+    data_path = folder / "data.csv"
+    write_measurements(table, data_path)
+    result = identify(model, replace(table, source=str(data_path)), progress=progress)
+    return Demo(cell_path, plan_path, data_path, truth, published, result)
+
+
+def _copy_example(folder: Path) -> tuple[Path, Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    with as_file(files("elastocal.demo")) as source:
+        for path in source.iterdir():
+            if path.suffix in (".toml", ".urdf", ".csv"):
+                shutil.copyfile(path, folder / path.name)
+    return folder / "cell.toml", folder / "plan.csv"
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="", encoding="utf-8") as handle:
+        return list(csv.DictReader(handle))
+
+
+def _reading_sigma(folder: Path) -> np.ndarray:
+    """Standard deviation (configurations, 3) in m of one reading, from Table 1."""
+    table = _rows(folder / "table1_noise.csv")
+    deflection = np.array([[float(row[f"sigma_{a}_um"]) for a in "xyz"] for row in table])
+    return deflection * 1e-6 / np.sqrt(2)
+
+
+def _compliances(folder: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """True values in rad/(N m), and the published OLS value with its ±3σ, by parameter name."""
+    truth = {"joint1.compliance": UNSEEN_COMPLIANCE}
+    published = {}
+    for row in _rows(folder / "table3_compliances.csv"):
+        key = row["parameter"]
+        joint, level = key[1], key[2:]
+        name = f"joint{joint}.compliance" + (f"_level{level}" if level else "")
+        truth[name] = float(row["wls_urad_per_Nm"]) * 1e-6
+        published[name] = (
+            float(row["ols_urad_per_Nm"]) * 1e-6,
+            float(row["ols_ci3sigma_urad_per_Nm"]) * 1e-6,
+        )
+    return truth, published

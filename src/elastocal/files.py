@@ -1,0 +1,134 @@
+"""Files at the edge: reading small text files, and writing that never leaves half a file."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO, TextIO
+
+from elastocal.errors import InputError
+
+
+@contextmanager
+def open_input(path: str | Path, what: str) -> Iterator[BinaryIO]:
+    """An existing regular file opened for binary reading; `what` names it in messages.
+
+    Raises InputError where it is absent, a directory, no regular file, or unreadable, and
+    where reading it fails within the `with` block.
+    """
+    try:
+        if stat.S_ISDIR(os.stat(path).st_mode):
+            raise InputError(f"{path}: is a directory; give the {what} itself")
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise InputError(f"{path}: is not a regular file; save the {what} to disk first")
+        with open(path, "rb") as handle:
+            yield handle
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path of the {what}") from None
+    except PermissionError:
+        raise InputError(f"{path}: no permission to read the {what}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def read_text(path: str | Path, what: str, max_bytes: int) -> str:
+    """The text of a UTF-8 file (a byte order mark is dropped) of at most `max_bytes`.
+
+    Raises InputError where the file cannot be read, is larger, or is not UTF-8.
+    """
+    _check_path(path)
+    with open_input(path, what) as handle:
+        data = handle.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise InputError(
+            f"{path}: larger than {max_bytes / 1e6:.0f} MB, which no {what} is; check the path"
+        )
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{path}, line {line}: not UTF-8 text (byte 0x{data[error.start]:02x}); "
+            f"save the {what} as UTF-8"
+        ) from None
+
+
+def check_exists(path: Path, key: str, owner: Path) -> Path:
+    """`path`, which `key` of the file `owner` names, where it is an existing file.
+
+    Raises InputError that names the owner, the key and the path.
+    """
+    try:
+        _check_path(path)
+        mode = os.stat(path).st_mode
+    except (OSError, InputError):
+        raise InputError(
+            f"{owner}: key {key} names {str(path)!r}, which does not exist or cannot be reached; "
+            "paths are relative to the cell file"
+        ) from None
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{owner}: key {key} names {str(path)!r}, a directory; name the file itself")
+    return path
+
+
+def _check_path(path: str | Path) -> None:
+    if "\0" in str(path):
+        raise InputError(f"{str(path)!r}: no file can have this name; check the path")
+
+
+@contextmanager
+def atomic_writer(path: str | Path) -> Iterator[TextIO]:
+    """A text handle (UTF-8) whose content appears under `path` only when all of it is written.
+
+    Raises InputError where the folder is missing or not writable; whatever fails within the
+    `with` block leaves no temporary file and the old content of `path` untouched.
+    """
+    _check_path(path)
+    target = Path(path)
+    if target.is_dir():
+        raise InputError(f"{target}: is a directory; name a file to write")
+    if target.exists() and not target.is_file():
+        # Renaming over /dev/stdout or /dev/null would replace the device itself.
+        with _write_errors(target), open(target, "w", encoding="utf-8", newline="\n") as device:
+            yield device
+        return
+    target = Path(os.path.realpath(target))  # a link keeps pointing to what it points to
+    temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.tmp")
+    with _write_errors(target):
+        try:
+            with open(temporary, "x", encoding="utf-8", newline="\n") as handle:
+                yield handle
+                handle.flush()
+                os.fsync(handle.fileno())
+            os.replace(temporary, target)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink()
+            raise
+
+
+def atomic_write_text(path: str | Path, text: str) -> None:
+    """Write `text` as UTF-8 under `path`, whole or not at all.
+
+    Raises InputError where the folder is missing or not writable, or the disk is full.
+    """
+    with atomic_writer(path) as handle:
+        handle.write(text)
+
+
+@contextmanager
+def _write_errors(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(
+            f"{target}: the folder {target.parent} does not exist; create it first"
+        ) from None
+    except PermissionError:
+        raise InputError(f"{target}: no permission to write in {target.parent}") from None
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error.strerror or error})") from None

@@ -1,0 +1,119 @@
+"""The symbolic arm: effects applied to the chain, its expressions, and their tapes."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import casadi as ca
+
+from elastocal.cell import Cell
+from elastocal.manipulator import rigid
+from elastocal.manipulator.arm import Arm
+from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.choice import choose_effects
+from elastocal.manipulator.equilibrium import Equilibrium
+from elastocal.manipulator.parameter import Parameter
+from elastocal.manipulator.tape import Tape
+
+
+class SymbolicArm:
+    """h(inputs, X, θ) and F(inputs, X, θ) = θ − law(τ) of one row, as CasADi expressions.
+
+    `parameters` are those of all active effects, in order; `arm.inputs` what a row must give.
+    """
+
+    def __init__(self, chain: Chain, cell: Cell) -> None:
+        arm = Arm(chain, cell)
+        chosen = choose_effects(chain, cell)
+        parameters: list[Parameter] = []
+        symbols: list[ca.SX] = []
+        bound = []
+        for effect, place in chosen:
+            own = {}
+            for spec in effect.parameters(place, chain, cell):
+                own[spec.key] = ca.SX.sym(f"{place}.{spec.key}")
+                symbols.append(own[spec.key])
+                parameters.append(
+                    Parameter(f"{place}.{spec.key}", effect.name, place, spec.unit,
+                              spec.nominal, spec.typical, spec.lower, spec.upper)
+                )  # fmt: skip
+            bound.append((effect, place, own))
+        for effect, place, own in bound:
+            effect.shape(arm, place, own)
+        arm.assemble()
+        for effect, place, own in bound:
+            effect.load(arm, place, own)
+        for effect, place, own in bound:
+            effect.read(arm, place, own)
+        self.arm = arm
+        self.parameters = tuple(parameters)
+        self.p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
+        self._reading = self._expression(cell.model.observe)
+        self._linear_model = cell.model.deflection_model == "linear"
+        self._tapes: dict[tuple[str, tuple[int, ...]], Tape] = {}
+
+    def _expression(self, observe: str) -> ca.SX:
+        """The reading of one row (3, 6 or 1 components) as an expression."""
+        arm = self.arm
+        if observe == "distance":
+            return arm.reading["distance"]
+        if observe == "pose":
+            measured = rigid.rotation_from_vector(arm.input("rotation", 3))
+            relative = measured.T @ arm.reading["rotation"]
+            return ca.vertcat(arm.reading["position"], rigid.vector_from_rotation(relative))
+        return arm.reading["position"]
+
+    @cached_property
+    def _linear(self) -> bool:
+        """Deflections by eq. (3)."""
+        return bool(self.arm.springs) and self._linear_model
+
+    @cached_property
+    def implicit(self) -> bool:
+        """Deflections by the equilibrium F(θ) = 0."""
+        return bool(self.arm.springs) and not self._linear
+
+    @cached_property
+    def _residual(self) -> ca.SX:
+        arm = self.arm
+        return arm.theta - arm.deflection_laws(arm.generalised_forces())
+
+    def _linearised(self, expression: ca.SX) -> ca.SX:
+        """Eq. (3): h(0) + ∂h/∂θ · law(τ(0)), loads and lever arms of the undeflected pose."""
+        theta = self.arm.theta
+        rest = ca.SX.zeros(theta.shape[0], 1)
+        deflection = ca.substitute(theta - self._residual, theta, rest)
+        slope = ca.substitute(ca.jacobian(expression, theta), theta, rest)
+        return ca.substitute(expression, theta, rest) + slope @ deflection
+
+    @cached_property
+    def equilibrium(self) -> Equilibrium:
+        inputs = list(self.arm.inputs.values())
+        return Equilibrium(inputs, self.p, self.arm.theta, self._residual)
+
+    def tape(self, name: str, columns: tuple[int, ...] = ()) -> Tape:
+        """Tapes are built on first use: "reading", "slopes", "B" (of `columns`), "frames"."""
+        if (name, columns) not in self._tapes:
+            self._tapes[name, columns] = self._build_tape(name, list(columns))
+        return self._tapes[name, columns]
+
+    def _build_tape(self, name: str, columns: list[int]) -> Tape:
+        arm, p, theta = self.arm, self.p, self.arm.theta
+        inputs = [*arm.inputs.values(), p, theta]
+        if name == "frames":
+            frames = [arm.T_tracker_flange, arm.reading["position"], arm.reading["rotation"]]
+            if self._linear:
+                frames = [ca.reshape(self._linearised(ca.vec(f)), *f.shape) for f in frames]
+            return Tape(inputs, frames)
+        h = self._linearised(self._reading) if self._linear else self._reading
+        if name == "reading":
+            return Tape(inputs, [h])
+        if name == "slopes":
+            return Tape(inputs, [ca.jacobian(h, theta), ca.jacobian(self._residual, theta)])
+        if not self.implicit:
+            return Tape(inputs, [h, ca.jacobian(h, p)[:, columns]])
+        # Adjoint of the equilibrium: with λ = F_θ⁻ᵀ h_θᵀ the total derivative of component c is
+        # the partial one of h_c − λ_cᵀ F, a few reverse sweeps instead of all of ∂F/∂X.
+        adjoint = ca.SX.sym("adjoint", h.shape[0], theta.shape[0])
+        lagrangian = h - adjoint @ self._residual
+        return Tape([*inputs, ca.vec(adjoint.T)], [h, ca.jacobian(lagrangian, p)[:, columns]])

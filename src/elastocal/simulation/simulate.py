@@ -1,0 +1,124 @@
+"""Synthetic measurements from the model itself: chosen parameter values, chosen noise, a seed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from elastocal.errors import InputError
+from elastocal.manipulator.model import Model
+from elastocal.measurements import Measurements
+from elastocal.nearest import did_you_mean, listed
+from elastocal.tracker_noise import available_noise, position_covariance
+
+Array = NDArray[np.float64]
+
+
+def values_from(model: Model, chosen: dict[str, float]) -> Array:
+    """Parameter values (parameters,): nominal, with the `chosen` ones replaced by name (SI).
+
+    Raises InputError for a name the model does not have.
+    """
+    x = model.nominal.copy()
+    names = list(model.names)
+    for name, value in chosen.items():
+        if name not in names:
+            hint = did_you_mean(name, names) or "; it has: " + listed(names)
+            raise InputError(f"the model has no parameter '{name}'{hint}")
+        if not np.isfinite(value):
+            raise InputError(f"parameter '{name}' must be a finite number, found {value}")
+        x[names.index(name)] = value
+    return x
+
+
+def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[str, float]:
+    """Random true values: nominal + scale · typical size · N(0, 1) for every parameter.
+
+    Parameters without a known typical size vary by 20 % of their nominal value.
+    """
+    drawn = {}
+    for p in model.parameters:
+        size = p.typical if p.typical is not None else 0.2 * abs(p.nominal)
+        if p.effect == "joint_compliance":
+            size = 0.2 * abs(p.nominal)
+        drawn[p.name] = p.nominal + scale * size * float(rng.normal())
+    return drawn
+
+
+def expand_plan(
+    plan: Measurements,
+    marker_names: tuple[str, ...],
+    repeats: int = 1,
+    load: Array | None = None,
+) -> Measurements:
+    """Every pose of a plan once per load state, repeat and marker.
+
+    `load` (3,) in N adds a loaded reading after each unloaded one where the plan itself states
+    no forces.  Rows are ordered as one would measure: configuration, repeat, load, marker.
+    """
+    forces = [plan.force]
+    if load is not None:
+        if np.any(plan.force != 0):
+            raise InputError(
+                f"{plan.source}: the plan has forces of its own; leave --load away or drop them"
+            )
+        forces = [plan.force, plan.force + load]
+    parts = [
+        (i, r, f, m)
+        for i in range(len(plan))
+        for r in range(repeats)
+        for f in range(len(forces))
+        for m in range(len(marker_names))
+    ]
+    index, repeat, state, marker = (np.array(v) for v in zip(*parts, strict=True))
+    rows = plan.take(index)
+    return replace(
+        rows,
+        row=np.arange(len(index)) + 2,
+        repeat=plan.repeat[index] * repeats + repeat,
+        marker=marker,
+        marker_names=marker_names,
+        force=np.stack(forces)[state, index],
+    )
+
+
+def simulate(
+    model: Model, rows: Measurements, x: Array, rng: np.random.Generator | int, noise: bool = True
+) -> Measurements:
+    """Readings of the model at parameter values x for every row, with the cell's noise.
+
+    Per-row sigmas of `rows` win over the cell's tracker noise, as when identifying; without
+    either the readings are exact.  Positions in m in the tracker frame; rotations and distances
+    where the model observes them.
+
+    Raises ElastocalError where a pose has no static equilibrium.
+    """
+    rng = np.random.default_rng(rng)
+    n = len(rows)
+    if model.observe == "distance":
+        exact = model.regressor(replace(rows, distance=np.ones(n)), x, np.zeros(0, int)).prediction
+        sigma = model.cell.tracker.distance_sigma if noise else None
+        return replace(rows, distance=exact + (sigma or 0.0) * rng.normal(size=n))
+    rotation, position = model.target_poses(rows, x)
+    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
+    if len(lost):
+        raise InputError(
+            f"{rows.source}, line {rows.row[lost[0]]}: no static equilibrium under this load; the "
+            "compliances are too large for the force"
+        )
+    exact = replace(rows, position=position)
+    if model.observe == "pose":
+        turn = rotation
+        if noise and model.cell.tracker.rotation_sigma is not None:
+            shake = rng.normal(size=(n, 3)) * model.cell.tracker.rotation_sigma
+            turn = (Rotation.from_matrix(rotation) * Rotation.from_rotvec(shake)).as_matrix()
+        exact = replace(exact, rotation=Rotation.from_matrix(turn).as_rotvec())
+    kind = available_noise(exact, model.cell.tracker) if noise else "none"
+    if kind == "none":
+        return exact
+    covariance, _ = position_covariance(exact, model.cell.tracker, kind)
+    shake = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(n, 3)))
+    return replace(exact, position=position + shake)

@@ -1,0 +1,157 @@
+"""The KR 270-2 as a cell, and random tables to evaluate models on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.spatial.transform import Rotation
+from support.robots import KR270
+
+from elastocal.cell import Array, Cell, EffectChoice, ModelSpec, Nominal, Robot, Tool, Tracker
+from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.rigid import nominal_flange
+from elastocal.manipulator.urdf import read_urdf
+from elastocal.measurements import Measurements
+
+# Table 3 of Klimchik et al. (2013) in rad/(N m), k2 at its first level; k1 is not in it.
+COMPLIANCE = (3.5e-7, 0.287e-6, 0.416e-6, 2.786e-6, 3.483e-6, 2.074e-6)
+LOAD_POINT = np.array([0.20, 0.0, 0.25])
+# Three non-collinear markers, each 0.25 m from the flange's origin.
+MARKERS = {
+    "M1": np.array([0.25, 0.0, 0.0]),
+    "M2": np.array([-0.10, 0.20, 0.1118]),
+    "M3": np.array([-0.10, -0.20, 0.1118]),
+}
+ANCHOR = np.array([2.0, -1.5, 0.3])
+# An example with the geometry FACTS remembers for this robot; the stiffness is a guess.
+COMPENSATOR = {
+    "joint": "joint2",
+    "stiffness_N_per_m": 1.4e5,
+    "anchor_m": (0.686, 0.120),
+    "arm_m": 0.185,
+    "free_length_m": 0.458,
+}
+DOWN = np.array([0.0, 0.0, -2600.0])
+SLANTED = np.array([900.0, -1500.0, -2600.0])
+
+# Table 2 of Klimchik et al. (2013): the 15 measurement configurations, joint angles in degrees.
+TABLE_2 = np.radians(
+    [
+        [79.2, -0.01, -5.57, 51, -97.52, -91.67],
+        [63, -0.01, -12.22, -56.49, 41.42, 150.55],
+        [63, -0.01, -47.98, -70.04, -61.55, 177.16],
+        [95, -25.24, 33, 129.69, -98.1, 90.57],
+        [95, -25.24, -107.01, 109.95, -61.19, 174.21],
+        [105, -25.24, 14.3, 55.21, 41.26, -152.97],
+        [56.6, -56.9, 44.54, -55.11, 41.9, 152.06],
+        [56.6, -56.9, 64.73, -129.65, -98.26, -90.55],
+        [144.8, -56.9, 104.49, -69.41, 61.67, -6.33],
+        [-41, -99.85, -91.68, 55.12, 41.53, -152.48],
+        [-143, -99.85, -32.64, 110.31, -61.47, -6.29],
+        [-143, -99.85, -72.01, 129.65, -98.09, 90.82],
+        [133, -140, 147.68, 129.64, -97.9, 90.99],
+        [-60, -140, 7.59, -110.09, -61.36, -174.09],
+        [-60, -140, -52, -124.89, -41.62, 27.78],
+    ]
+)
+
+
+@lru_cache
+def kr270_chain() -> Chain:
+    return read_urdf(KR270)
+
+
+def kr270_cell(effects: Sequence[str] = (), observe: str = "position", **model: Any) -> Cell:
+    """A cell of the KR 270-2; `effects` as in a cell file ("name" or "name:place").
+
+    `model` goes to ModelSpec; the nominal compliances are Table 3's unless `nominal` is given.
+    """
+    model.setdefault("nominal", Nominal(joint_compliance=COMPLIANCE))
+    return Cell(
+        name="kr270",
+        path=None,
+        robot=Robot(urdf=KR270),
+        tool=Tool(LOAD_POINT, dict(MARKERS)),
+        tracker=Tracker(anchor=ANCHOR),
+        model=ModelSpec(observe=observe, effects=choices(effects), **model),  # type: ignore[arg-type]
+    )
+
+
+def choices(effects: Sequence[str]) -> tuple[EffectChoice, ...]:
+    """ "joint_compliance:joint2" → EffectChoice("joint_compliance", "joint2")."""
+    parts = [effect.partition(":") for effect in effects]
+    return tuple(EffectChoice(name, where or None) for name, _, where in parts)
+
+
+def random_poses(chain: Chain, n: int, seed: int) -> Array:
+    """(n, joints) in rad or m, inside the joint limits; ±π where there is none."""
+    low = [max(joint.lower, -np.pi) for joint in chain.joints]
+    high = [min(joint.upper, np.pi) for joint in chain.joints]
+    return np.random.default_rng(seed).uniform(low, high, (n, chain.n_joints))
+
+
+def table_of(
+    poses: Array, force: Array, markers: Sequence[str] = tuple(MARKERS), both: bool = False
+) -> Measurements:
+    """Every pose once per marker under `force` (3,); with `both`, also without load, before.
+
+    Positions are zero: such a table is for predicting.
+    """
+    loads = np.array([np.zeros(3), force] if both else [force])
+    cases = [(i, f, m) for i in range(len(poses)) for f in range(len(loads)) for m in markers]
+    pose, load = (np.array([case[k] for case in cases]) for k in (0, 1))
+    n = len(cases)
+    return Measurements(
+        source="table",
+        row=np.arange(n) + 2,
+        q=np.asarray(poses, dtype=float)[pose],
+        configuration=pose,
+        configuration_labels=tuple(str(i + 1) for i in range(len(poses))),
+        repeat=np.zeros(n, dtype=np.int64),
+        marker=np.array([markers.index(m) for _, _, m in cases]),
+        marker_names=tuple(markers),
+        force=loads[load],
+        position=np.zeros((n, 3)),
+    )
+
+
+def random_table(
+    chain: Chain,
+    n: int,
+    seed: int,
+    force: Array = SLANTED,
+    markers: Sequence[str] = tuple(MARKERS),
+) -> Measurements:
+    """`n` random poses, each unloaded and loaded, with every column a model may ask for.
+
+    Loads scatter about `force`; measured rotations lie within about 0.2 rad of the nominal
+    flange; everything else is noise of a plausible size.
+    """
+    rng = np.random.default_rng(seed + 1000)
+    table = table_of(random_poses(chain, n, seed), np.asarray(force, dtype=float), markers, True)
+    rows = len(table)
+    per_pose = rng.uniform(0.7, 1.3, (n, 3))
+    turned = Rotation.from_matrix(nominal_flanges(chain, table.q)[:, :3, :3])
+    return replace(
+        table,
+        force=table.force * per_pose[table.configuration],
+        position=rng.normal(size=(rows, 3)),
+        rotation=(turned * Rotation.from_rotvec(0.1 * rng.normal(size=(rows, 3)))).as_rotvec(),
+        distance=rng.uniform(1.0, 4.0, rows),
+        torque=rng.normal(size=(rows, chain.n_joints)) * 2000.0,
+        time=np.sort(rng.uniform(0.0, 7200.0, rows)),
+        approach=rng.choice([-1.0, 1.0], (rows, chain.n_joints)),
+        temperature=rng.uniform(18.0, 26.0, rows),
+    )
+
+
+def nominal_flanges(chain: Chain, q: Array) -> Array:
+    """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
+    symbol = ca.SX.sym("q", chain.n_joints)
+    function = ca.Function("T", [symbol], [nominal_flange(chain, symbol)])
+    return np.array([function(row).full() for row in q])
