@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ from elastocal.cell_schema import (
 )
 from elastocal.errors import InputError
 from elastocal.files import check_exists, read_text
+from elastocal.labels import is_label
 from elastocal.nearest import did_you_mean, listed, quoted
 from elastocal.units import to_si
 
@@ -104,17 +104,13 @@ def _robot(path: Path, table: RobotTable) -> Robot:
 def _tool(path: Path, table: ToolTable) -> Tool:
     markers = table.markers_m or {}
     for name in markers:
-        if name != name.strip() or not name or any(map(_is_control, name)):
+        if not is_label(name):
             raise InputError(
                 f"{path}: marker name {quoted(name)} in [tool.markers_m] cannot stand in a "
                 "table; use a non-empty text on one line without blanks at its ends"
             )
     point = table.load_point_m or [0.0, 0.0, 0.0]
     return Tool(np.array(point), {name: np.array(p) for name, p in markers.items()})
-
-
-def _is_control(character: str) -> bool:
-    return unicodedata.category(character) in ("Cc", "Cs")
 
 
 def _tracker(path: Path, table: TrackerTable) -> Tracker:

@@ -91,6 +91,8 @@ class CellTable(Table):
     tool: ToolTable | None = _key("a table")
     tracker: TrackerTable | None = _key("a table")
     model: ModelTable | None = _key("a table")
-    limits: dict[str, Vector2] | None = _key("two numbers per joint, as in joint1_deg = [-170.0, 170.0]")
+    limits: dict[str, Vector2] | None = _key(
+        "two numbers per joint, as in joint1_deg = [-170.0, 170.0]"
+    )
     workspace: dict[str, Any] | None = _key("a table")
     design: dict[str, Any] | None = _key("a table")

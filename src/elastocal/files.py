@@ -20,6 +20,7 @@ def open_input(path: str | Path, what: str) -> Iterator[BinaryIO]:
     Raises InputError where it is absent, a directory, no regular file, or unreadable, and
     where reading it fails within the `with` block.
     """
+    _check_path(path)
     try:
         if stat.S_ISDIR(os.stat(path).st_mode):
             raise InputError(f"{path}: is a directory; give the {what} itself")
@@ -40,7 +41,6 @@ def read_text(path: str | Path, what: str, max_bytes: int) -> str:
 
     Raises InputError where the file cannot be read, is larger, or is not UTF-8.
     """
-    _check_path(path)
     with open_input(path, what) as handle:
         data = handle.read(max_bytes + 1)
     if len(data) > max_bytes:
@@ -71,7 +71,9 @@ def check_exists(path: Path, key: str, owner: Path) -> Path:
             "paths are relative to the cell file"
         ) from None
     if stat.S_ISDIR(mode):
-        raise InputError(f"{owner}: key {key} names {str(path)!r}, a directory; name the file itself")
+        raise InputError(
+            f"{owner}: key {key} names {str(path)!r}, a directory; name the file itself"
+        )
     return path
 
 
@@ -89,16 +91,16 @@ def atomic_writer(path: str | Path) -> Iterator[TextIO]:
     """
     _check_path(path)
     target = Path(path)
-    if target.is_dir():
-        raise InputError(f"{target}: is a directory; name a file to write")
-    if target.exists() and not target.is_file():
-        # Renaming over /dev/stdout or /dev/null would replace the device itself.
-        with _write_errors(target), open(target, "w", encoding="utf-8", newline="\n") as device:
-            yield device
-        return
-    target = Path(os.path.realpath(target))  # a link keeps pointing to what it points to
-    temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.tmp")
     with _write_errors(target):
+        if target.is_dir():
+            raise InputError(f"{target}: is a directory; name a file to write")
+        if target.exists() and not target.is_file():
+            # Renaming over /dev/stdout or /dev/null would replace the device itself.
+            with open(target, "w", encoding="utf-8", newline="\n") as device:
+                yield device
+            return
+        target = Path(os.path.realpath(target))  # a link keeps pointing to what it points to
+        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}.tmp")
         try:
             with open(temporary, "x", encoding="utf-8", newline="\n") as handle:
                 yield handle
@@ -109,15 +111,6 @@ def atomic_writer(path: str | Path) -> Iterator[TextIO]:
             with suppress(OSError):
                 temporary.unlink()
             raise
-
-
-def atomic_write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 under `path`, whole or not at all.
-
-    Raises InputError where the folder is missing or not writable, or the disk is full.
-    """
-    with atomic_writer(path) as handle:
-        handle.write(text)
 
 
 @contextmanager
@@ -132,3 +125,12 @@ def _write_errors(target: Path) -> Iterator[None]:
         raise InputError(f"{target}: no permission to write in {target.parent}") from None
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror or error})") from None
+
+
+def atomic_write_text(path: str | Path, text: str) -> None:
+    """Write `text` as UTF-8 under `path`, whole or not at all.
+
+    Raises InputError where the folder is missing or not writable, or the disk is full.
+    """
+    with atomic_writer(path) as handle:
+        handle.write(text)

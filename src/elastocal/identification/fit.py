@@ -9,11 +9,16 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from elastocal.errors import ElastocalError
+from elastocal.identification.linear import solve_weighted
 from elastocal.identification.noise import Weights
-from elastocal.manipulator.model import Model
+from elastocal.manipulator.model import Model, Regression
 from elastocal.manipulator.observation import Observations
 
 Array = NDArray[np.float64]
+
+# Relative change of the cost at which the trust region stops; one exact Gauss–Newton step follows
+# and squares what error is left.
+TOLERANCE = 1e-10
 
 REASON = {
     -1: "the solver reported improper input",
@@ -96,11 +101,31 @@ def fit(problem: FitProblem, max_steps: int = 60) -> Fit:
         raise ElastocalError("the model has no finite prediction at the start values")
     found = least_squares(
         residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
-        ftol=1e-13, xtol=1e-13, gtol=1e-13, max_nfev=max_steps,
+        ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
     )  # fmt: skip
     x = values(found.x)
     final = model.regressor(table, x, columns, seen)
+    if problem.tie is None and not problem.bounded and found.status > 0:
+        x, final = _polished(problem, x, final)
     return Fit(
         x, final.residual, problem.weights.apply(final.residual), final.B,
         bool(found.status > 0), REASON[int(found.status)], int(found.nfev),
     )  # fmt: skip
+
+
+def _polished(problem: FitProblem, x: Array, at: Regression) -> tuple[Array, Regression]:
+    """One Gauss–Newton step with the exact linear solver, kept where it does not cost."""
+    weights, columns = problem.weights, problem.columns
+    before = weights.apply(at.residual)
+    step = solve_weighted(weights.apply(at.B), before, scale=problem.sizes[columns])
+    moved = x.copy()
+    moved[columns] += step.x
+    residual = problem.observations.value - problem.model.predict(
+        problem.observations.table, moved, problem.observations
+    )
+    after = weights.apply(residual)
+    if not np.isfinite(after).all() or after @ after > before @ before:
+        return x, at
+    return moved, problem.model.regressor(
+        problem.observations.table, moved, columns, problem.observations
+    )

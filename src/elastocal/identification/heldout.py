@@ -27,7 +27,7 @@ def held_out_residual(
     e = weights.apply(residual)
     rows_of = np.repeat(configuration, size)
     order = np.argsort(rows_of, kind="stable")
-    labels, starts, counts = np.unique(rows_of[order], return_index=True, return_counts=True)
+    _, starts, counts = np.unique(rows_of[order], return_index=True, return_counts=True)
     held = residual.copy()
     for count in np.unique(counts):
         groups = np.flatnonzero(counts == count)

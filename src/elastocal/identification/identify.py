@@ -61,12 +61,15 @@ def identify(
     x0 = start_values(model, table, options.seed)
     whole = _solution(model, seen, x0, options, progress)
 
-    def refit(good: NDArray[np.bool_]) -> Solution:
-        return _solution(model, subset(seen, good), x0, options, progress)
+    def refit(good: NDArray[np.bool_], final: bool = False) -> Solution:
+        silent = progress if final else _silent
+        return _solution(model, subset(seen, good), x0, options, silent, final)
 
     progress("looking for faulty readings")
     faulty, clean = find_faulty(whole, refit)
     found = describe(whole, clean, faulty)
+    if options.drop_outliers and faulty.any():
+        clean = refit(~faulty, final=True)
     progress("intervals and held-out residuals")
     if options.drop_outliers:
         result = summarise(model, clean, (), found)
@@ -75,19 +78,28 @@ def identify(
     return result if test is None else replace(result, test=_test_errors(model, result.x, test))
 
 
+def _silent(message: str) -> None:
+    """Refits of the search for faulty readings are not worth a line each."""
+
+
 def _solution(
-    model: Model, seen: Observations, x0: Array, options: Options, progress: Progress
+    model: Model,
+    seen: Observations,
+    x0: Array,
+    options: Options,
+    progress: Progress,
+    try_wider: bool = True,
 ) -> Solution:
     free = fixed_and_free(model, options.fixed)
     weights = weights_for(seen, model.cell.tracker, options.weights, options.covariance)
     problem = Problem(model, seen, weights, x0, free, options.bounded)
-    solution = solve(problem, progress)
+    solution = solve(problem, progress, try_wider)
     if seen.kind == "pose" and weights.kind == "none" and options.weights == "auto":
         # Without stated noise, metres and radians get their relative weight from a first fit.
         parts = solution.fit.residual.reshape(-1, 6)
         sigma = np.repeat([parts[:, :3].std(), parts[:, 3:].std()], 3)
         weights = scaled_by_component(seen, np.maximum(sigma, 1e-12))
-        solution = solve(replace(problem, weights=weights), progress)
+        solution = solve(replace(problem, weights=weights), progress, try_wider)
     return solution
 
 

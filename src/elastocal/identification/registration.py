@@ -128,7 +128,7 @@ def _linear_part(
     translation = x[:3] if problem.free_base else problem.base_translation
     found = fixed.copy()
     found[problem.free_markers] = x[3 if problem.free_base else 0 :].reshape(-1, 3)
-    return translation, found
+    return np.asarray(translation, dtype=float), found
 
 
 def _rotation_between(body: Array, points: Array, weight: Array) -> Array:

@@ -135,6 +135,26 @@ class IdentificationResult:
                 return c
         raise KeyError(f"no combination starts with '{first}'")
 
+    def __str__(self) -> str:
+        """Plain table in SI units: what is known with its 95 % interval, and what is not."""
+        lines = [
+            f"{self.method} of {len(self.observations.lead)} readings, {self.noise['description']}",
+            f"residual rms {self.residual_rms * 1e6:.1f} µm, held out {self.heldout_rms * 1e6:.1f} "
+            f"µm, {self.dof} degrees of freedom",
+        ]
+        for e in self.estimates:
+            if e.value is not None and e.ci95 is not None:
+                half = (e.ci95[1] - e.ci95[0]) / 2
+                lines.append(f"{e.name:32s} {e.value:13.6g} ± {half:.2g} {e.unit}")
+            else:
+                lines.append(f"{e.name:32s} {'–':>13s}   {e.note}")
+        lines += [
+            f"{c.expression} = {c.value:.6g} ± {(c.ci95[1] - c.ci95[0]) / 2:.2g} {c.unit}"
+            for c in self.combinations
+        ]
+        lines += [f"correlation {r:+.3f}: {a}, {b}" for a, b, r in self.correlations]
+        return "\n".join([*lines, *self.warnings])
+
     def residual_table(self) -> list[dict[str, Any]]:
         """One row per observation: line, configuration, repeat, marker, residuals in µm (µrad)."""
         seen = self.observations
@@ -173,6 +193,7 @@ class IdentificationResult:
             "covariance_of": list(self.determined),
             "correlations": [list(c) for c in self.correlations],
             "n_rows": len(self.residual),
+            "n_readings": len(self.observations.lead),
             "dof": self.dof,
             "residual_rms_um": _um(self.residual_rms),
             "heldout_rms_um": _um(self.heldout_rms),

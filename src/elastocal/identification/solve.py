@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.checks import check_enough
@@ -60,8 +61,13 @@ class Solution:
     nominal_rms: float
 
 
-def solve(problem: Problem, progress: Progress = lambda message: None) -> Solution:
-    """Solve `problem`; raises InsufficientDataError where the data determine nothing."""
+def solve(
+    problem: Problem, progress: Progress = lambda message: None, try_wider: bool = True
+) -> Solution:
+    """Solve `problem`; `try_wider` False skips the comparison with wider sets of parameters.
+
+    Raises InsufficientDataError where the data determine nothing.
+    """
     model, seen = problem.model, problem.observations
     start = model.regressor(seen.table, problem.x0, None, seen)
     sizes = model.sizes(start.B)
@@ -81,12 +87,11 @@ def solve(problem: Problem, progress: Progress = lambda message: None) -> Soluti
             break
         # The threshold is in units of the noise, and the noise is known only after the fit.
         x, sigma, kept = found.x, residual_sigma(found, len(reduction.kept)), reduction.kept
-    heldout = _heldout(problem, found)
-    progress("comparing with wider sets")
-    found, reduction, heldout = _prefer_wider(problem, sizes, found, reduction, heldout)
-    return Solution(
-        problem, found, reduction, sizes, heldout, rms_3d(nominal, seen.size)
-    )
+    heldout = _heldout(problem, found.B, found.residual)
+    if try_wider:
+        progress("comparing with wider sets")
+        found, reduction, heldout = _prefer_wider(problem, sizes, found, reduction, heldout)
+    return Solution(problem, found, reduction, sizes, heldout, rms_3d(nominal, seen.size))
 
 
 def residual_sigma(found: Fit, n_parameters: int) -> float:
@@ -113,10 +118,10 @@ def _tied_fit(problem: Problem, sizes: Array) -> Fit:
             return found
 
 
-def _reduced_fit(
+def _reduction(
     problem: Problem, sizes: Array, x: Array, sigma: float, threshold: float
-) -> tuple[Fit, Reduction]:
-    """Choose a minimal complete set at x and fit it, the others held at the start."""
+) -> Reduction:
+    """A minimal complete set at x, as indices into the model's parameters."""
     model, seen, free = problem.model, problem.observations, problem.free
     B = problem.weights.apply(model.regressor(seen.table, x, free, seen).B)
     parameters = tuple(model.parameters[c] for c in free)
@@ -126,21 +131,34 @@ def _reduced_fit(
             f"{seen.table.source}: the readings do not depend on any parameter of the model; "
             "measure other poses or loads, or choose other effects"
         )
-    kept, dropped = free[local.kept], free[local.dropped]
+    return Reduction(
+        free[local.kept], free[local.dropped], local.mixing, free[local.invisible]
+    )
+
+
+def _fit_of(problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_steps: int) -> Fit:
+    """Fit of the kept parameters, the others held at the start; their share moves over first."""
+    kept, dropped = chosen.kept, chosen.dropped
     start = x.copy()
-    start[kept] += local.mixing @ (x[dropped] - problem.x0[dropped])
+    start[kept] += chosen.mixing @ (x[dropped] - problem.x0[dropped])
     start[dropped] = problem.x0[dropped]
     final = FitProblem(
-        model, seen, problem.weights, start, kept, sizes, bounded=problem.bounded
-    )
-    return fit(final), Reduction(kept, dropped, local.mixing, free[local.invisible])
+        problem.model, problem.observations, problem.weights, start, kept, sizes,
+        bounded=problem.bounded,
+    )  # fmt: skip
+    return fit(final, max_steps)
 
 
-def _heldout(problem: Problem, found: Fit) -> Array:
+def _reduced_fit(
+    problem: Problem, sizes: Array, x: Array, sigma: float, threshold: float
+) -> tuple[Fit, Reduction]:
+    chosen = _reduction(problem, sizes, x, sigma, threshold)
+    return _fit_of(problem, sizes, x, chosen, max_steps=60), chosen
+
+
+def _heldout(problem: Problem, B: Array, residual: Array) -> Array:
     seen = problem.observations
-    return held_out_residual(
-        found.B, found.residual, problem.weights, seen.configuration, seen.size
-    )
+    return held_out_residual(B, residual, problem.weights, seen.configuration, seen.size)
 
 
 def _prefer_wider(
@@ -148,18 +166,32 @@ def _prefer_wider(
 ) -> tuple[Fit, Reduction, Array]:
     """A wider set, up to full rank, where it predicts held-out configurations better.
 
-    Typical sizes are prior knowledge and may be wrong for this arm; held-out data decide.
+    Typical sizes are prior knowledge and may be wrong for this arm; held-out data decide, first
+    on the linearised model, then on the refitted one.
     """
     size = problem.observations.size
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
+        wider = _reduction(problem, sizes, found.x, sigma, threshold)
+        if len(wider.kept) <= len(reduction.kept):
+            continue
+        if rms_3d(_linearised_heldout(problem, found.x, wider), size) >= rms_3d(heldout, size):
+            continue
         try:
-            wide, wider = _reduced_fit(problem, sizes, found.x, sigma, threshold)
+            wide = _fit_of(problem, sizes, found.x, wider, max_steps=30)
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             continue  # along an undetermined direction the wide set may leave every valid arm
-        if len(wider.kept) <= len(reduction.kept) or not wide.converged:
-            continue
-        wide_heldout = _heldout(problem, wide)
-        if rms_3d(wide_heldout, size) < rms_3d(heldout, size):
+        wide_heldout = _heldout(problem, wide.B, wide.residual)
+        if wide.converged and rms_3d(wide_heldout, size) < rms_3d(heldout, size):
             found, reduction, heldout = wide, wider, wide_heldout
     return found, reduction, heldout
+
+
+def _linearised_heldout(problem: Problem, x: Array, chosen: Reduction) -> Array:
+    """Held-out residuals after one Gauss–Newton step of the chosen set from x."""
+    seen, weights = problem.observations, problem.weights
+    at = problem.model.regressor(seen.table, x, chosen.kept, seen)
+    Q, _ = linalg.qr(weights.apply(at.B), mode="economic")
+    e = weights.apply(at.residual)
+    step = linalg.lstsq(weights.apply(at.B), Q @ (Q.T @ e), cond=1e-14)[0]
+    return _heldout(problem, at.B, at.residual - at.B @ step)

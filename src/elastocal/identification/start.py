@@ -68,7 +68,7 @@ def _target_rotations(
 ) -> dict[str, float]:
     measured = Rotation.from_rotvec(np.asarray(table.rotation))
     relative = Rotation.from_matrix(base @ T[:, :3, :3]).inv() * measured
-    values = {}
+    values: dict[str, float] = {}
     for c, name in enumerate(names):
         if (codes == c).any():
             vector = relative[codes == c].mean().as_rotvec()

@@ -49,7 +49,7 @@ class Observations:
         if self.kind != "deflection":
             return rows
         flat = self.combine @ rows.reshape(len(rows), -1)
-        return flat.reshape((len(self.lead),) + rows.shape[1:])
+        return flat.reshape((len(self.lead), *rows.shape[1:]))
 
 
 def observe(table: Measurements, kind: str) -> Observations:
@@ -72,7 +72,8 @@ def observe(table: Measurements, kind: str) -> Observations:
         if kind == "pose":
             _needed(table.rotation, table, "rx_deg, ry_deg, rz_deg or qw, qx, qy, qz", kind)
             value = np.hstack([value, np.zeros((n, 3))])
-    value = combine @ value if kind == "deflection" else value
+    if kind == "deflection":
+        value = np.asarray(combine @ value)
     return Observations(kind, value.ravel(), combine, lead, table)
 
 

@@ -99,9 +99,9 @@ def simulate(
     rng = np.random.default_rng(rng)
     n = len(rows)
     if model.observe == "distance":
-        exact = model.regressor(replace(rows, distance=np.ones(n)), x, np.zeros(0, int)).prediction
-        sigma = model.cell.tracker.distance_sigma if noise else None
-        return replace(rows, distance=exact + (sigma or 0.0) * rng.normal(size=n))
+        length = model.predict(replace(rows, distance=np.ones(n)), x)
+        sigma = (model.cell.tracker.distance_sigma or 0.0) if noise else 0.0
+        return replace(rows, distance=length + sigma * rng.normal(size=n))
     rotation, position = model.target_poses(rows, x)
     lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if len(lost):

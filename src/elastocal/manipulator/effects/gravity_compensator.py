@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 
 from elastocal.cell import Cell
@@ -11,7 +13,7 @@ from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
 from elastocal.manipulator.parameter import ParameterSpec
 
 # Rough geometry of a KR 270 compensator: an example to start from, to be identified.
-EXAMPLE = {
+EXAMPLE: dict[str, Any] = {
     "stiffness_N_per_m": 0.0,
     "anchor_m": (0.686, 0.120),
     "arm_m": 0.185,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import casadi as ca
+
 from elastocal.cell import Cell
 from elastocal.manipulator.arm import Arm, Spring, require
 from elastocal.manipulator.chain import Chain
@@ -52,7 +54,8 @@ class JointCompliance(Effect):
             k = p["compliance"]
         else:
             chosen = arm.input(f"level:{place}", len(levels))
-            k = sum(chosen[n] * p[f"compliance_level{n + 1}"] for n in range(len(levels)))
+            values = ca.vertcat(*[p[f"compliance_level{n + 1}"] for n in range(len(levels))])
+            k = ca.dot(chosen, values)
         if arm.cell.model.torque == "measured":
             # Known torque: the deflection is explicit, no equilibrium to solve.
             arm.q[i] += k * arm.input("torque", arm.chain.n_joints)[i]

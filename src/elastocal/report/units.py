@@ -1,0 +1,88 @@
+"""Numbers for people: the units they think in, and no more digits than are known."""
+
+from __future__ import annotations
+
+import math
+
+# SI unit → (factor, unit shown).
+SHOWN = {
+    "m": (1e3, "mm"),
+    "rad": (1e3, "mrad"),
+    "1": (1e6, "ppm"),
+    "rad/(N*m)": (1e6, "µrad/(N·m)"),
+    "m/N": (1e6, "µm/N"),
+    "N/m": (1e-3, "N/mm"),
+    "N*m/rad": (1e-3, "kN·m/rad"),
+    "N": (1.0, "N"),
+    "kg": (1.0, "kg"),
+    "m/s": (3.6e9, "µm/h"),
+    "rad/s": (3.6e9, "µrad/h"),
+    "1/K": (1e6, "ppm/K"),
+}
+MOST_DECIMALS = 9
+
+
+def display(value: float, unit: str) -> tuple[float, str]:
+    """`value` in SI `unit` as people read it: 2.87e-7, "rad/(N*m)" → 0.287, "µrad/(N·m)".
+
+    A unit that is not listed keeps its value, written with proper symbols.
+    """
+    if unit in SHOWN:
+        factor, text = SHOWN[unit]
+        return value * factor, text
+    return value, unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
+
+
+def with_uncertainty(value: float, half: float) -> tuple[str, str]:
+    """Value and ± half width with the digits the half width allows: "0.287", "0.003".
+
+    The half width gets two digits where it begins with 1 or 2, else one; hundreds and more
+    are rounded off as well.
+    """
+    if not (math.isfinite(value) and math.isfinite(half)) or half <= 0:
+        return plain(value), plain(half)
+    exponent = math.floor(math.log10(half))
+    digits = 2 if half / 10.0**exponent < 2.95 else 1
+    decimals = digits - 1 - exponent
+    if decimals > MOST_DECIMALS:
+        size = math.floor(math.log10(abs(value))) if value else exponent
+        return f"{value:.{min(max(size + decimals, 0), 15)}e}", f"{half:.{digits - 1}e}"
+    shown = max(decimals, 0)
+    return f"{_round(value, decimals):.{shown}f}", f"{_round(half, decimals):.{shown}f}"
+
+
+def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
+    """SI value and half width as text: value, ± half width, unit."""
+    shown, text = display(value, unit)
+    return *with_uncertainty(shown, display(half, unit)[0]), text
+
+
+def plain(value: float) -> str:
+    """A number without known uncertainty, such as a nominal value: at most six digits."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value + 0.0:.6g}"
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """A finite number rounded to `digits` digits, without an exponent where it is readable."""
+    if value == 0 or not 1e-5 < abs(value) < 1e7:
+        return f"{value:.{digits}g}"
+    decimals = digits - 1 - math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    return f"{_round(value, decimals):.{max(decimals, 0)}f}"
+
+
+def length(metres: float) -> str:
+    """A position error: µm below 1 mm, mm below 1 m, "none" where there is no number."""
+    if not math.isfinite(metres):
+        return "none"
+    if abs(metres) < 0.9995e-3:
+        return f"{significant(metres * 1e6)} µm"
+    if abs(metres) < 0.9995:
+        return f"{significant(metres * 1e3)} mm"
+    return f"{significant(metres)} m"
+
+
+def _round(value: float, decimals: int) -> float:
+    """Rounded, and never -0."""
+    return round(value, decimals) + 0.0

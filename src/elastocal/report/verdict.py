@@ -1,0 +1,166 @@
+"""The result in sentences: what was identified, how well it predicts, whether noise explains it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import stats
+
+from elastocal.identification.result import IdentificationResult
+from elastocal.report.units import length, significant
+from elastocal.report.words import (
+    ABSORBED,
+    ALONE,
+    FIXED,
+    INVISIBLE,
+    Truth,
+    coverage,
+    names_of,
+    printable,
+)
+
+MOST_CORRELATIONS = 8
+# Held-out errors this much above the fitted ones mean that the fit flatters itself.
+FLATTERS = 1.2
+METHODS = {"ols": "ordinary least squares", "wls": "weighted least squares"}
+READINGS = {
+    "position": "position readings",
+    "deflection": "deflections (loaded minus unloaded readings)",
+    "pose": "pose readings",
+    "distance": "distance readings",
+}
+
+
+def counted(n: int, one: str, many: str | None = None) -> str:
+    """ "1 pose", "2 poses"."""
+    return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+def what_was_identified(result: IdentificationResult) -> str:
+    alone, n = len(names_of(result, ALONE)), len(result.combinations)
+    text = f"{alone} of {counted(len(result.estimates), 'parameter')} known on their own"
+    if n:
+        absorbed = len(names_of(result, ABSORBED))
+        text += (
+            f", and {counted(n, 'combination')} of parameters that no reading tells apart "
+            f"({absorbed} held in exchange)"
+        )
+    if unseen := len(names_of(result, INVISIBLE)):
+        text += f"; {unseen} not visible in these data"
+    if fixed := len(names_of(result, FIXED)):
+        text += f"; {fixed} fixed by the user"
+    return text + "."
+
+
+def how_well_it_predicts(result: IdentificationResult) -> str:
+    """Held-out error beside the nominal one, and the error on test data."""
+    what = {"deflection": "deflection", "distance": "distance"}.get(
+        result.observations.kind, "position"
+    )
+    nominal, held = result.nominal_rms, result.heldout_rms
+    if math.isfinite(held):
+        text = f"In poses that were not fitted the {what} is predicted to {length(held)} rms"
+        if held > 0 and nominal > held:
+            text += (
+                f"; the nominal arm, with base and markers placed, is off by {length(nominal)} "
+                f"({significant(nominal / held, 2)} times as much)"
+            )
+        elif math.isfinite(nominal):
+            text += f", no better than the nominal arm ({length(nominal)})"
+        text += "."
+        if held > FLATTERS * result.residual_rms:
+            text += (
+                f" The fitted poses look better ({length(result.residual_rms)}) than unseen ones: "
+                "more poses would help."
+            )
+    else:
+        text = (
+            "How well unseen poses are predicted is not known: some configuration alone "
+            "determines a parameter, so none can be held out."
+        )
+    if result.test is not None:
+        t = result.test
+        text += (
+            f" On {counted(t.n, 'test reading')} never fitted: {length(t.rms)} rms, "
+            f"{length(t.mean)} mean, {length(t.maximum)} at most."
+        )
+    return text
+
+
+def does_noise_explain_it(result: IdentificationResult) -> str:
+    """Residual against stated noise, judged by the χ² distribution of its mean square."""
+    ratio = result.noise.get("ratio_to_stated")
+    if ratio is None:
+        sigma = result.noise.get("sigma_um")
+        size = "" if sigma is None or result.method != "ols" else (
+            f"; the residual amounts to {length(sigma * 1e-6)} per coordinate"
+        )  # fmt: skip
+        return f"No noise was stated, so nothing says how small the residual should be{size}."
+    low, high = np.sqrt(stats.chi2.ppf([0.025, 0.975], result.dof) / result.dof)
+    band = f"chance alone gives {low:.2f} to {high:.2f}"
+    size = f"{significant(ratio)} times the stated noise; {band}"
+    if ratio > high:
+        return (
+            f"The residual is larger than the stated noise explains ({size}): something is "
+            "unmodelled, or the noise is larger than stated."
+        )
+    if ratio < low:
+        return f"The residual is smaller than the stated noise ({size}): it was stated too large."
+    return f"The residual agrees with the stated noise ({size})."
+
+
+def rms_by_kind(result: IdentificationResult) -> list[tuple[str, float]]:
+    """What the errors are with the nominal arm, fitted, held out and on test data (3-D rms, m)."""
+    rows = [
+        ("nominal arm, base and markers placed", result.nominal_rms),
+        ("fitted poses", result.residual_rms),
+        ("held-out poses", result.heldout_rms),
+    ]
+    return rows if result.test is None else [*rows, ("test data", result.test.rms)]
+
+
+def readings(result: IdentificationResult) -> str:
+    seen = result.observations
+    poses = len(np.unique(seen.configuration))
+    markers = len(np.unique(seen.table.marker[seen.lead]))
+    return (
+        f"{len(seen.lead)} {READINGS[seen.kind]} in {counted(poses, 'configuration')}, "
+        f"{counted(markers, 'marker')} ({printable(seen.table.source)})"
+    )
+
+
+def method_and_weights(result: IdentificationResult) -> str:
+    name = METHODS.get(result.method, result.method)
+    return f"{name}, {printable(str(result.noise['description']))}"
+
+
+def correlation_lines(result: IdentificationResult, most: int = MOST_CORRELATIONS) -> list[str]:
+    lines = [
+        f"{printable(a)} and {printable(b)}: {r:+.3f}" for a, b, r in result.correlations[:most]
+    ]
+    more = len(result.correlations) - len(lines)
+    return [*lines, f"and {more} more"] if more else lines
+
+
+def coverage_line(result: IdentificationResult, truth: Truth) -> str:
+    hit, n = coverage(result, truth)
+    return f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
+
+
+def summary_lines(result: IdentificationResult, truth: Truth | None = None) -> list[str]:
+    """The result in words, one statement per line, warnings last."""
+    lines = [
+        f"Readings: {readings(result)}",
+        f"Method: {method_and_weights(result)}",
+        "Error (3-D rms): " + ", ".join(f"{name} {length(v)}" for name, v in rms_by_kind(result)),
+        f"Degrees of freedom: {result.dof}",
+        f"Identified: {what_was_identified(result)}",
+        f"Prediction: {how_well_it_predicts(result)}",
+        f"Noise: {does_noise_explain_it(result)}",
+    ]
+    if truth:
+        lines.append(f"Truth: {coverage_line(result, truth)}")
+    if pairs := correlation_lines(result):
+        lines.append("Correlated over 0.9: " + "; ".join(pairs))
+    return lines + [f"Warning: {printable(w)}" for w in result.warnings]

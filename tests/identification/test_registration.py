@@ -1,0 +1,188 @@
+"""The start from nothing: any attitude of the base, unknown tools, wrong readings among them."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.calibration import cell_of, random_chain, table_at
+from support.cells import kr270_chain, random_poses
+from support.robots import packaged_urdf
+
+from elastocal.identification.registration import RegistrationProblem, register
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.urdf import read_urdf
+
+SIGMA = 5e-5
+POSES = 60
+
+HALF_TURNS = {f"180° about {k}": Rotation.from_rotvec(np.pi * np.eye(3)[i]) for i, k in
+              enumerate("xyz")}  # fmt: skip
+ATTITUDES = {
+    "none": Rotation.identity(),
+    **HALF_TURNS,
+    "90° about z": Rotation.from_euler("z", 90, degrees=True),
+    "upside down, oblique": Rotation.from_euler("xyz", [175, 20, -130], degrees=True),
+    **{f"random {s}": Rotation.random(random_state=s) for s in range(6)},
+}
+
+
+def flange_poses(chain, seed, n=POSES):
+    model = Model(chain, cell_of(()))
+    return model.flange_poses(table_at(random_poses(chain, n, seed)))
+
+
+def case(
+    chain, turn, seed, markers=1, wrong=0.0, free_base=True, free_markers=None, sigma=SIGMA,
+    hint=False,
+):  # fmt: skip
+    """A registration problem, the true marker positions and where they would be read exactly."""
+    rng = np.random.default_rng(seed)
+    T = np.repeat(flange_poses(chain, seed), markers, axis=0)
+    code = np.tile(np.arange(markers), POSES)
+    true = rng.uniform(-0.25, 0.25, (markers, 3))
+    t = rng.uniform(-3, 3, 3)
+    R = turn.as_matrix()
+    exact = (np.einsum("nij,nj->ni", T[:, :3, :3], true[code]) + T[:, :3, 3]) @ R.T + t
+    points = exact + sigma * rng.normal(size=exact.shape)
+    bad = rng.permutation(len(points))[: round(wrong * len(points))]
+    points[bad] += rng.uniform(-0.4, 0.4, (len(bad), 3))
+    free = np.ones(markers, bool) if free_markers is None else np.asarray(free_markers)
+    start = np.where(free[:, None], 0.0, true)
+    problem = RegistrationProblem(
+        T[:, :3, :3], T[:, :3, 3], points, code, start, free, free_base,
+        R if not free_base or hint else np.eye(3), t if not free_base or hint else np.zeros(3),
+    )  # fmt: skip
+    return problem, true, exact, bad
+
+
+def predicted(problem, found):
+    turned = np.einsum("nij,nj->ni", problem.flange_rotation, found.markers[problem.marker])
+    return (turned + problem.flange_position) @ found.rotation.T + found.translation
+
+
+def assert_registered(problem, exact, found, sigma=SIGMA):
+    """At most 15 unknowns against 180 coordinates or more of which 80 % are good: least squares
+    would miss the exact points by σ·√(3·15/144) < 0.6 σ in length, the reweighted (L1) fit by
+    at most √2 more (its efficiency in three dimensions is over one half): 1 σ rms.
+    """
+    assert np.allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+    miss = np.linalg.norm(predicted(problem, found) - exact, axis=1)
+    assert np.sqrt(np.mean(miss**2)) < sigma
+
+
+@pytest.mark.parametrize("name", ATTITUDES)
+def test_any_attitude_with_an_unknown_tool(name):
+    problem, true, exact, _ = case(kr270_chain(), ATTITUDES[name], seed=1)
+    found = register(problem)
+    assert_registered(problem, exact, found)
+    turned = Rotation.from_matrix(found.rotation) * ATTITUDES[name].inv()
+    # 0.05 mm of noise on a cloud of points about 1 m wide, 60 of them
+    assert turned.magnitude() < 1e-4
+    np.testing.assert_allclose(found.markers, true, atol=2e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", HALF_TURNS)
+def test_half_turns_with_wrong_readings_and_several_markers(name, seed):
+    problem, _, exact, _ = case(
+        random_chain(seed), HALF_TURNS[name], seed, markers=3, wrong=0.2
+    )
+    assert_registered(problem, exact, register(problem))
+
+
+@pytest.mark.parametrize("n", [6, 7])
+@pytest.mark.parametrize("seed", range(6))
+def test_random_chains_with_a_fifth_of_the_readings_wrong(seed, n):
+    turn = Rotation.random(random_state=seed + 50)
+    problem, _, exact, bad = case(random_chain(seed, n), turn, seed, wrong=0.2)
+    found = register(problem, seed)
+    assert_registered(problem, exact, found)
+    miss = np.linalg.norm(predicted(problem, found) - problem.points, axis=1)
+    good = np.setdiff1d(np.arange(POSES), bad)
+    assert miss[bad].min() > miss[good].max()
+
+
+@pytest.mark.parametrize("name", HALF_TURNS)
+def test_iiwa14(name):
+    path, flange = packaged_urdf("iiwa14")
+    chain = read_urdf(path, flange=flange)
+    problem, _, exact, _ = case(chain, HALF_TURNS[name], seed=7, wrong=0.2)
+    assert_registered(problem, exact, register(problem))
+
+
+def test_a_known_base_is_kept_and_the_tool_found():
+    turn = Rotation.random(random_state=3)
+    problem, true, exact, _ = case(kr270_chain(), turn, seed=3, markers=2, wrong=0.2,
+                                   free_base=False)  # fmt: skip
+    found = register(problem)
+    assert np.array_equal(found.rotation, problem.base_rotation)
+    assert np.array_equal(found.translation, problem.base_translation)
+    assert_registered(problem, exact, found)
+    # the base is exact, so each marker is a mean over 48 good turned readings
+    np.testing.assert_allclose(found.markers, true, atol=5 * SIGMA)
+
+
+def test_known_markers_are_kept_and_the_base_found():
+    turn = HALF_TURNS["180° about x"]
+    problem, true, exact, _ = case(kr270_chain(), turn, seed=4, markers=2, wrong=0.2,
+                                   free_markers=[False, False])  # fmt: skip
+    found = register(problem)
+    assert np.array_equal(found.markers, true)
+    assert_registered(problem, exact, found)
+
+
+def test_one_marker_known_and_one_not():
+    turn = Rotation.random(random_state=5)
+    problem, true, exact, _ = case(kr270_chain(), turn, seed=5, markers=2,
+                                   free_markers=[False, True])  # fmt: skip
+    found = register(problem)
+    assert np.array_equal(found.markers[0], true[0])
+    assert_registered(problem, exact, found)
+
+
+def test_all_known_returns_what_is_known():
+    problem, true, exact, _ = case(kr270_chain(), Rotation.random(random_state=6), seed=6,
+                                   free_base=False, free_markers=[False])  # fmt: skip
+    found = register(problem)
+    assert np.array_equal(found.rotation, problem.base_rotation)
+    assert np.array_equal(found.markers, true)
+    # median distance of normal noise in three dimensions: 1.54 σ, ± 0.1 σ over 60 readings
+    assert found.error == pytest.approx(1.54 * SIGMA, abs=0.5 * SIGMA)
+
+
+def test_exact_readings_are_met_to_rounding():
+    turn = HALF_TURNS["180° about y"]
+    problem, true, exact, _ = case(random_chain(8), turn, 8, markers=2, sigma=0.0)
+    found = register(problem)
+    np.testing.assert_allclose(predicted(problem, found), exact, atol=1e-8)
+    np.testing.assert_allclose(found.markers, true, atol=1e-8)
+
+
+def test_the_result_moves_with_the_tracker():
+    problem, true, _, _ = case(kr270_chain(), Rotation.random(random_state=9), 9, wrong=0.1)
+    moved = Rotation.random(random_state=10)
+    shift = np.array([1.0, -2.0, 0.5])
+    other = RegistrationProblem(
+        problem.flange_rotation, problem.flange_position, moved.apply(problem.points) + shift,
+        problem.marker, problem.start_markers, problem.free_markers, True, np.eye(3), np.zeros(3),
+    )  # fmt: skip
+    a, b = register(problem), register(other)
+    # both stop when the median no longer changes by 1e-6 of itself
+    np.testing.assert_allclose(b.rotation, moved.as_matrix() @ a.rotation, atol=2e-5)
+    np.testing.assert_allclose(b.translation, moved.apply(a.translation) + shift, atol=5e-5)
+    np.testing.assert_allclose(b.markers, a.markers, atol=5e-5)
+
+
+def test_more_readings_than_the_sample_change_nothing_but_the_precision():
+    rng = np.random.default_rng(11)
+    T = flange_poses(kr270_chain(), 11, n=1500)
+    turn = HALF_TURNS["180° about z"]
+    true = np.array([[0.1, -0.2, 0.15]])
+    exact = turn.apply(np.einsum("nij,j->ni", T[:, :3, :3], true[0]) + T[:, :3, 3]) + [1, 2, 3]
+    problem = RegistrationProblem(
+        T[:, :3, :3], T[:, :3, 3], exact + SIGMA * rng.normal(size=exact.shape),
+        np.zeros(1500, int), np.zeros((1, 3)), np.array([True]), True, np.eye(3), np.zeros(3),
+    )  # fmt: skip
+    a, b = register(problem, seed=0), register(problem, seed=0)
+    assert np.array_equal(a.rotation, b.rotation) and np.array_equal(a.markers, b.markers)
+    assert_registered(problem, exact, a)

@@ -1,0 +1,186 @@
+"""Starting values: base, markers, target orientation and cable found from the data alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.calibration import (
+    BASE,
+    SPRINGS,
+    cell_of,
+    measured,
+    random_chain,
+    table_at,
+    true_values,
+    with_values,
+)
+from support.cells import COMPLIANCE, kr270_chain, random_poses
+
+from elastocal.cell import Nominal, Tracker
+from elastocal.identification.start import start_values
+from elastocal.manipulator.model import Model
+from elastocal.simulation.simulate import simulate
+
+SIGMA = 5e-5
+
+
+def rms(difference):
+    return np.sqrt(np.mean(np.sum(difference.reshape(-1, 3) ** 2, axis=1)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_position_start_is_as_near_as_the_nominal_geometry_allows(seed):
+    """1 mm and 1 mrad of error per link parameter move a 6-axis arm's marker by some mm; the
+    start, which fits base and marker to the nominal arm, must not miss by more than the truth
+    with its own geometry undone (1.5: median instead of squares, 2 · 30 poses)."""
+    chain = random_chain(seed)
+    model = Model(chain, cell_of(("base_frame", "joint_offset", "link_geometry",
+                                  "marker_position")))  # fmt: skip
+    rng = np.random.default_rng(seed)
+    truth = true_values(model, rng)
+    table = measured(model, table_at(random_poses(chain, 30, seed)), truth, SIGMA, rng)
+    x = start_values(model, table)
+    without_errors = truth.copy()
+    for i, p in enumerate(model.parameters):
+        if p.effect in ("joint_offset", "link_geometry"):
+            without_errors[i] = 0.0
+            assert x[i] == 0.0
+    miss = rms(table.position.ravel() - model.predict(table, x))
+    assert miss < 1.5 * rms(table.position.ravel() - model.predict(table, without_errors))
+
+
+def test_only_active_parameters_move():
+    chain, rng = kr270_chain(), np.random.default_rng(0)
+    nominal = Nominal(joint_compliance=COMPLIANCE)
+    full = Model(chain, cell_of(SPRINGS, nominal=nominal))
+    truth = true_values(full, rng)
+    table = measured(full, table_at(random_poses(chain, 20, 0)), truth, SIGMA, rng)
+    x = start_values(full, table)
+    moved = {p.effect for p, a, b in zip(full.parameters, x, full.nominal, strict=True) if a != b}
+    assert moved == {"base_frame", "marker_position"}
+    for effects, expected in (
+        (("marker_position", "joint_offset"), {"marker_position"}),
+        (("base_frame", "joint_offset"), {"base_frame"}),
+        (("joint_offset", "link_geometry"), set()),
+    ):
+        model = Model(chain, cell_of(effects, nominal=nominal))
+        x = start_values(model, table)
+        assert x.shape == model.nominal.shape
+        found = {p.effect for p, a, b in zip(model.parameters, x, model.nominal, strict=True)
+                 if a != b}  # fmt: skip
+        assert found == expected
+
+
+def test_one_marker_may_be_free_while_another_is_given():
+    chain, rng = kr270_chain(), np.random.default_rng(1)
+    markers = {"M1": np.array([0.1, 0.0, 0.1]), "M2": np.zeros(3)}
+    effects = ("base_frame", "marker_position:marker:M2")
+    model = Model(chain, cell_of(effects, markers))
+    assert not any(name.startswith("marker:M1") for name in model.names)
+    truth = with_values(model, {"marker:M2.x": 0.2, "marker:M2.z": -0.1, "base.x": 2.0})
+    table = table_at(random_poses(chain, 20, 1), markers=("M1", "M2"))
+    x = start_values(model, measured(model, table, truth, SIGMA, rng))
+    # 20 readings of each marker, a rigid arm: a few standard errors of the mean
+    np.testing.assert_allclose(x, truth, atol=2e-4)
+
+
+def test_unloaded_readings_serve_alone_where_they_suffice():
+    """0.1 rad of deflection under load would pull the start; unloaded rows must keep it exact."""
+    chain = kr270_chain()
+    stiff = Model(chain, cell_of(("base_frame", "marker_position", "joint_compliance"),
+                                 nominal=Nominal(joint_compliance=(2e-5,) * 6)))  # fmt: skip
+    truth = with_values(stiff, {"base.x": 1.0, "base.rz": 2.0, "marker:M1.x": 0.1})
+    forces = [[0, 0, 0], [0, 0, -1500.0]]
+    exact = simulate(stiff, table_at(random_poses(chain, 15, 2), forces), truth, 0, noise=False)
+    np.testing.assert_allclose(start_values(stiff, exact), truth, atol=1e-6)
+    loaded = exact.take(exact.force[:, 2] != 0)
+    assert np.abs(start_values(stiff, loaded) - truth).max() > 1e-3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_pose_start_finds_the_orientation_of_the_target(seed):
+    chain, rng = random_chain(seed), np.random.default_rng(seed)
+    effects = ("base_frame", "marker_position", "marker_orientation")
+    markers = {"M1": np.zeros(3), "M2": np.zeros(3)}
+    tracker = Tracker(rotation_sigma=1e-4)
+    model = Model(chain, cell_of(effects, markers, tracker, observe="pose"))
+    truth = true_values(model, rng)
+    for name in ("M1", "M2"):
+        rows = [model.names.index(f"marker:{name}.r{k}") for k in "xyz"]
+        # any turn of the target, half turns among them
+        vector = np.pi * np.eye(3)[seed % 3] if name == "M1" else None
+        turn = Rotation.random(random_state=rng) if vector is None else Rotation.from_rotvec(vector)
+        truth[rows] = turn.as_rotvec()
+    plan = table_at(random_poses(chain, 30, seed), markers=("M1", "M2"))
+    table = simulate(model, replace(plan, rotation=np.zeros((len(plan), 3))), truth, rng)
+    x = start_values(model, table)
+    for name in ("M1", "M2"):
+        rows = [model.names.index(f"marker:{name}.r{k}") for k in "xyz"]
+        turn = Rotation.from_rotvec(x[rows]) * Rotation.from_rotvec(truth[rows]).inv()
+        # 1e-4 rad about each of 3 axes, a mean over 30: 3.2e-5 rms; four times that
+        assert turn.magnitude() < 1.3e-4
+    base = [model.names.index(name) for name in BASE[3:]]
+    turn = Rotation.from_rotvec(x[base]) * Rotation.from_rotvec(truth[base]).inv()
+    assert turn.magnitude() < 1e-7  # positions are exact here
+
+
+def distance_case(seed, direction, wrong, rows=80):
+    chain, rng = random_chain(seed, 4), np.random.default_rng(seed)
+    model = Model(chain, cell_of(("distance_sensor", "marker_position"), observe="distance"))
+    anchor = direction / np.linalg.norm(direction) * rng.uniform(0.8, 2.5) + [0, 0, 0.4]
+    values = dict(zip((f"tracker.anchor_{k}" for k in "xyz"), anchor, strict=True))
+    values |= {"tracker.length_offset": rng.uniform(-0.2, 0.2)}
+    values |= {f"marker:M1.{k}": rng.uniform(-0.15, 0.15) for k in "xyz"}
+    truth = with_values(model, values)
+    table = measured(model, table_at(random_poses(chain, rows, seed)), truth, 2e-4, rng)
+    bad = rng.permutation(rows)[: round(wrong * rows)]
+    distance = table.distance.copy()
+    distance[bad] += rng.choice([-1, 1], len(bad)) * rng.uniform(0.02, 0.3, len(bad))
+    return model, replace(table, distance=distance), truth
+
+
+DIRECTIONS = np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(5).normal(size=(14, 3))])
+ALWAYS = [(0, 0.0), (2, 0.1), (3, 0.1), (7, 0.1), (8, 0.1)]
+ALL = [(k, wrong) for k in range(len(DIRECTIONS)) for wrong in (0.0, 0.1)]
+
+
+@pytest.mark.parametrize(
+    ("k", "wrong"),
+    [*ALWAYS, *(pytest.param(*c, marks=pytest.mark.long) for c in ALL if c not in ALWAYS)],
+)
+def test_distance_start_finds_an_anchor_anywhere(k, wrong):
+    """7 unknowns from 80 distances, 0.2 mm of noise, a tenth of them wrong by 20 to 300 mm.
+
+    soft_l1 at 2 mm bounds the pull of a wrong reading to 2 mm: 8 of 80 with random signs pull
+    by 2 mm · √8/72 ≈ 0.08 mm in the data; 0.5 mm of it at the median is ample."""
+    model, table, truth = distance_case(k, DIRECTIONS[k], wrong)
+    x = start_values(model, table)
+    exact = simulate(model, table, truth, 0, noise=False).distance
+    miss = np.abs(model.predict(table, x) - exact)
+    assert np.median(miss) < 5e-4
+    # The right anchor, not a mirror image decimetres away; range and offset trade off a little.
+    np.testing.assert_allclose(x, truth, atol=0.05)
+
+
+def test_a_given_anchor_is_tried_first_and_kept_where_it_is_not_fitted():
+    chain = random_chain(3)
+    tracker = Tracker(anchor=np.array([1.5, -1.0, 0.2]))
+    model = Model(chain, cell_of(("marker_position",), tracker=tracker, observe="distance"))
+    truth = with_values(model, {"marker:M1.x": 0.1, "marker:M1.y": -0.05})
+    table = simulate(model, table_at(random_poses(chain, 40, 3)), truth, 0, noise=False)
+    np.testing.assert_allclose(start_values(model, table), truth, atol=1e-6)
+
+
+def test_nothing_to_place_leaves_the_nominal_values():
+    chain = random_chain(4)
+    model = Model(chain, cell_of(("joint_offset",), observe="distance"))
+    table = table_at(random_poses(chain, 10, 4))
+    table = simulate(model, table, model.nominal, 0)
+    assert np.array_equal(start_values(model, table), model.nominal)
+
+
+def test_the_same_seed_gives_the_same_start(monkeypatch):
+    monkeypatch.setattr("elastocal.identification.start.DISTANCE_STARTS", 8)
+    model, table, _ = distance_case(2, DIRECTIONS[7], 0.1, rows=310)
+    assert np.array_equal(start_values(model, table, 4), start_values(model, table, 4))

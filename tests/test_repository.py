@@ -1,0 +1,245 @@
+"""The repository itself: what its files may mention, how long they are, what imports what."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import os
+import re
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "elastocal"
+
+# Lowest first.  A layer imports from those below it, and within itself one way only.  A module
+# or package that no layer names (cell, measurements, errors, files, units, ...) is at the bottom
+# of all, so it imports from its like alone; what needs more is named here.
+LAYERS = (
+    {"manipulator"},
+    {"simulation", "identification"},
+    {"design", "diagnosis", "compensation", "export"},
+    {"report"},
+    {"demo", "study"},
+    {"cli", "__main__"},
+)
+
+MOST_LINES = 300
+
+# In two halves, so that this file does not mention them either.
+NEVER_MENTIONED = tuple(
+    "".join(halves)
+    for halves in (
+        ("/wo", "rk/"),
+        ("py", "pi"),
+        ("files.python", "hosted"),
+        ("index", "-url"),
+        ("find", "-links"),
+    )
+)
+DATASETS_FOLDER = "../" + "shared"  # .ci/run alone may know it
+
+# Measurements that others made and published; tests read them where they lie.
+DATASET_TABLES = {
+    "ur5_grid.csv",
+    "ur5_random.csv",
+    "wam_grid.csv",
+    "wam_random.csv",
+    "nominal_dh_ur5.csv",
+    "nominal_dh_wam.csv",
+    "load_0kg.csv",
+    "load_1p25kg.csv",
+    "load_2p5kg.csv",
+    "link_masses_from_repo_iiwa7_m.csv",
+}
+DATASET_FOLDERS = {"ur5_wam_tsinghua", "iiwa7_payload_torque", "robotcali_irb120_cable"}
+
+GENERATED = {"__pycache__", "build", "dist", "demo_out", "node_modules"}
+
+
+def repository_files() -> list[Path]:
+    """What is, or would be, committed; every file that is not generated where git cannot tell."""
+    if (ROOT / ".git").exists():
+        command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+        try:
+            listed = subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout
+        except (OSError, subprocess.CalledProcessError):
+            pass  # no git, or a tree that belongs to somebody else
+        else:
+            names = os.fsdecode(listed).split("\0")
+            return [path for name in names if name and (path := ROOT / name).is_file()]
+    return list(_walk(ROOT))
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    for path in sorted(folder.iterdir()):
+        if path.is_dir():
+            hidden = path.name.startswith(".") and path.name != ".ci"
+            if not (hidden or path.name in GENERATED or path.suffix == ".egg-info"):
+                yield from _walk(path)
+        elif path.is_file():
+            yield path
+
+
+FILES = repository_files()
+NAMES = {path: path.relative_to(ROOT).as_posix() for path in FILES}
+
+
+def test_walk_without_git_finds_the_same_kinds_of_files() -> None:
+    walked = {path.relative_to(ROOT).as_posix() for path in _walk(ROOT)}
+    assert {"pyproject.toml", ".ci/run", "src/elastocal/cell.py"} <= walked
+    assert not any("/__pycache__/" in name or name.startswith(".git/") for name in walked)
+
+
+def test_no_file_mentions_the_workplace_or_a_registry() -> None:
+    found = []
+    for path in FILES:
+        text = path.read_bytes().decode("utf-8", errors="replace")
+        unwanted = [word for word in NEVER_MENTIONED if word in text]
+        if DATASETS_FOLDER in text and NAMES[path] != ".ci/run":
+            unwanted.append(DATASETS_FOLDER)
+        found += [f"{NAMES[path]}: {word}" for word in unwanted]
+    assert not found
+
+
+def test_no_dataset_of_others_is_part_of_the_repository() -> None:
+    tables = [path for path in FILES if path.suffix.lower() in {".csv", ".parquet"}]
+    copied = [NAMES[path] for path in tables if path.name in DATASET_TABLES]
+    copied += [NAMES[path] for path in tables if DATASET_FOLDERS & set(path.parts)]
+    assert not copied
+
+
+def test_no_table_equals_one_of_the_datasets() -> None:
+    folder = os.environ.get("ELASTOCAL_DATASETS")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("ELASTOCAL_DATASETS names no folder")
+    theirs = {_digest(path) for path in Path(folder).rglob("*.csv")}
+    assert theirs
+    assert not [name for path, name in NAMES.items() if _digest(path) in theirs]
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_constraints_are_exact_versions_and_nothing_else() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    exact = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*==[0-9][A-Za-z0-9.!]*")
+    assert not [line for line in lines if not exact.fullmatch(line)]
+    names = [_canonical(line) for line in lines]
+    assert len(set(names)) == len(names)
+
+
+def test_constraints_cover_every_requirement() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = list(project["dependencies"])
+    for extra in project["optional-dependencies"].values():
+        required += extra
+    constrained = {_canonical(line) for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    assert {_canonical(line) for line in required} - constrained <= {"elastocal"}
+
+
+def _canonical(requirement: str) -> str:
+    name = re.match(r"[A-Za-z0-9._-]+", requirement)
+    assert name, requirement
+    return re.sub(r"[-_.]+", "-", name.group()).lower()
+
+
+def test_ci_run_is_executable() -> None:
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+
+
+def test_source_files_are_short() -> None:
+    lengths = {str(p.relative_to(ROOT)): len(p.read_text().splitlines()) for p in MODULES.values()}
+    assert {name: n for name, n in lengths.items() if n > MOST_LINES} == {}
+
+
+# Imports
+
+
+def module_name(path: Path) -> str:
+    """`manipulator.effects` for manipulator/effects/__init__.py; the root package is empty."""
+    parts = path.relative_to(SOURCE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): path for path in SOURCE.rglob("*.py")}
+
+
+def imported(module: str, path: Path) -> set[str]:
+    """The modules of elastocal that `module` imports, at its top or inside a function."""
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    full: list[str] = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            full += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                here = ["elastocal", *filter(None, package.split("."))]
+                base = ".".join([*here[: len(here) - node.level + 1], *filter(None, [base])])
+            full += [f"{base}.{alias.name}" for alias in node.names]
+    names = {name.removeprefix("elastocal.") for name in full if name.startswith("elastocal.")}
+    return {found for name in names if (found := _module_of(name)) not in ("", module)}
+
+
+def _module_of(name: str) -> str:
+    """`manipulator.model` for the name `manipulator.model.Model`."""
+    while name and name not in MODULES:
+        name = name.rpartition(".")[0]
+    return name
+
+
+IMPORTS = {module: imported(module, path) for module, path in MODULES.items()}
+
+
+def unit(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def rank(module: str) -> int:
+    """0 at the bottom; the root package, whose version everybody may read, imports nothing."""
+    return next((k for k, layer in enumerate(LAYERS, 1) if unit(module) in layer), 0)
+
+
+def test_imports_point_down_the_layers() -> None:
+    up = [
+        f"{module} imports {target}"
+        for module, targets in IMPORTS.items()
+        for target in sorted(targets)
+        if rank(target) > rank(module)
+    ]
+    assert not up
+
+
+def test_no_circle_of_packages() -> None:
+    units: dict[str, set[str]] = {}
+    for module, targets in IMPORTS.items():
+        others = {unit(target) for target in targets} - {unit(module)}
+        units.setdefault(unit(module), set()).update(others)
+    assert _circle(units) == []
+
+
+def test_no_circle_of_modules() -> None:
+    assert _circle(IMPORTS) == []
+
+
+def _circle(graph: dict[str, set[str]]) -> list[str]:
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_imports_are_recognised() -> None:
+    """Guard of the guard: absolute, relative and function-level imports are all seen."""
+    assert "errors" in IMPORTS["files"]
+    assert {"cell", "errors", "measurements"} <= IMPORTS["manipulator.model"]
+    assert rank("manipulator.model") < rank("identification.solve") < rank("cli.identify")
+    assert rank("cell") == rank("measurements") == rank("errors") == rank("files") == 0
