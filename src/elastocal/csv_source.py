@@ -40,10 +40,7 @@ def read_csv(path: str | Path, choose: ChooseLayout) -> RawTable:
             raise _bad_cell(source, handle, dialect, layout, "not finite")
     if len(frame) != len(rows):
         raise InputError(f"{source}: changed while it was read; try again")
-    labels = {
-        name: in_order(frame[name].cat.codes.to_numpy(), list(frame[name].cat.categories))
-        for name in layout.labels
-    }
+    labels = {name: in_order(*frame[name].factorize()) for name in layout.labels}
     table = RawTable(source, "line", rows, layout, numbers, labels)
     table.check_labels()
     return table
@@ -55,7 +52,9 @@ def _parse(source: str, handle: BinaryIO, dialect: Dialect, layout: Layout) -> p
     options: dict[str, Any] = {}
     if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
         options["float_precision"] = "round_trip"  # from 3.1 on exact anyway, and deprecated
-    types = {name: np.float64 for name in layout.numbers} | dict.fromkeys(layout.labels, "category")
+    # Not "category": pandas would take the labels 00 and 01 for the numbers 0 and 1.
+    types: dict[str, Any] = dict.fromkeys(layout.numbers, np.float64)
+    types |= dict.fromkeys(layout.labels, object)
     for decimal in "." if dialect.delimiter == "," else ".,":
         handle.seek(dialect.start)
         try:

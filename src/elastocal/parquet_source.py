@@ -66,6 +66,4 @@ def _labels(source: str, name: str, column) -> Labels:  # type: ignore[no-untype
         raise InputError(
             f"{source}, row {i + 1}, column {name}: empty cell; write a name or number"
         )
-    texts = column.astype(str)
-    codes, names = texts.factorize()
-    return in_order(codes, [str(n) for n in names])
+    return in_order(*column.astype(str).factorize())

@@ -213,12 +213,14 @@ def test_no_dropped_column_is_worth_keeping(threshold, seed):
 def test_units_do_not_matter(chain, effects):
     """Millimetres or microradians: B and sizes change together, nothing else does."""
     model, B, sizes = regression(chain, effects)
-    unit = 10.0 ** np.random.default_rng(1).integers(-6, 7, len(sizes))
+    # Powers of two, so that exact ties between like columns are not broken by rounding.
+    unit = 2.0 ** np.random.default_rng(1).integers(-20, 21, len(sizes))
     a = reduce(B, sizes, model.parameters, 1.0, 0.0)
     b = reduce(B / unit, sizes * unit, model.parameters, 1.0, 0.0)
     assert np.array_equal(a.kept, b.kept)
+    assert np.array_equal(a.invisible, b.invisible)
     expected = a.mixing * unit[a.kept][:, None] / unit[a.dropped][None, :]
-    np.testing.assert_allclose(b.mixing, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(b.mixing, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("effects", CHOICES[1:4], ids="+".join)
@@ -307,13 +309,13 @@ def test_every_member_of_a_combination_names_the_others():
     ).terms
 
 
-SEEDS = 40
+SEEDS = 30
 
 
 def test_combinations_cover_the_true_combination():
-    """Over 40 arms: each parameter's 95 % interval, and the joint 95 % ellipsoid of all.
+    """Over 30 arms: each parameter's 95 % interval, and the joint 95 % ellipsoid of all.
 
-    Counts per seed are independent, so the ellipsoid's count is Binomial(40, 0.95); per name the
+    Counts per seed are independent, so the ellipsoid's count is Binomial(30, 0.95); per name the
     limit is Bonferroni's over the names.  Dropped parameters may bias by 0.1 std each at most.
     """
     inside, hits = 0, {}

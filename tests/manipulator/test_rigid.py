@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -36,24 +36,28 @@ angles = st.floats(0, np.pi - 0.01) | st.sampled_from(NEAR_ZERO)
 
 
 @given(axis=axes, angle=st.floats(-2 * np.pi, 2 * np.pi) | st.sampled_from(NEAR_ZERO))
+@settings(deadline=None)
 def test_exp_is_scipys(axis: np.ndarray, angle: float) -> None:
     expected = Rotation.from_rotvec(angle * axis).as_matrix()
     np.testing.assert_allclose(exp(angle * axis), expected, rtol=0, atol=2e-15)
 
 
 @given(axis=axes, angle=angles)
+@settings(deadline=None)
 def test_log_is_scipys(axis: np.ndarray, angle: float) -> None:
     R = Rotation.from_rotvec(angle * axis).as_matrix()
     np.testing.assert_allclose(log(R), angle * axis, rtol=0, atol=1e-12)
 
 
 @given(axis=axes, angle=angles)
+@settings(deadline=None)
 def test_round_trip(axis: np.ndarray, angle: float) -> None:
     """To 1e-12 rad up to π − 0.01."""
     np.testing.assert_allclose(log(exp(angle * axis)), angle * axis, rtol=0, atol=1e-12)
 
 
 @given(axis=axes, angle=st.floats(0, np.pi))
+@settings(deadline=None)
 def test_exp_is_a_rotation(axis: np.ndarray, angle: float) -> None:
     R = exp(angle * axis)
     np.testing.assert_allclose(R.T @ R, np.eye(3), rtol=0, atol=2e-15)
@@ -62,6 +66,7 @@ def test_exp_is_a_rotation(axis: np.ndarray, angle: float) -> None:
 
 @pytest.mark.parametrize("angle", NEAR_ZERO)
 @given(axis=axes)
+@settings(deadline=None)
 def test_near_zero_no_digit_is_lost(angle: float, axis: np.ndarray) -> None:
     """A tiny rotation vector comes back to 1e-15 of its size, and exactly at zero.
 
@@ -73,6 +78,7 @@ def test_near_zero_no_digit_is_lost(angle: float, axis: np.ndarray) -> None:
 
 @pytest.mark.parametrize("angle", NEAR_ZERO)
 @given(axis=axes)
+@settings(deadline=None)
 def test_derivatives_are_regular_near_zero(angle: float, axis: np.ndarray) -> None:
     """∂exp(r)/∂r is the three generators, the round trip's is the identity."""
     generators = np.array([np.cross(np.eye(3)[k], np.eye(3)).T for k in range(3)])
@@ -84,6 +90,7 @@ def test_derivatives_are_regular_near_zero(angle: float, axis: np.ndarray) -> No
 
 @pytest.mark.parametrize("short_of_pi", NEAR_PI)
 @given(axis=axes)
+@settings(deadline=None)
 def test_near_pi_digits_go_as_the_inverse_distance(short_of_pi: float, axis: np.ndarray) -> None:
     """At π − δ the matrix determines the vector to ε/δ: tolerance 10 ε/δ, 2e-9 rad at 1e-6."""
     r = (np.pi - short_of_pi) * axis
@@ -92,6 +99,7 @@ def test_near_pi_digits_go_as_the_inverse_distance(short_of_pi: float, axis: np.
 
 
 @given(axis=axes, angle=st.floats(-10, 10))
+@settings(deadline=None)
 def test_rotation_about_an_axis_is_scipys(axis: np.ndarray, angle: float) -> None:
     R = np.array(ca.evalf(rigid.rotation_about(axis, ca.SX(angle))))
     expected = Rotation.from_rotvec(angle * axis).as_matrix()
@@ -99,6 +107,7 @@ def test_rotation_about_an_axis_is_scipys(axis: np.ndarray, angle: float) -> Non
 
 
 @given(v=st.tuples(*[st.floats(-5, 5)] * 3), w=st.tuples(*[st.floats(-5, 5)] * 3))
+@settings(deadline=None)
 def test_skew_is_the_cross_product(v: tuple, w: tuple) -> None:
     product = np.array(ca.evalf(rigid.skew(np.array(v)))) @ np.array(w)
     np.testing.assert_allclose(product, np.cross(v, w), rtol=0, atol=1e-14)

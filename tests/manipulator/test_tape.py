@@ -80,16 +80,15 @@ def test_the_operations_above_are_all_that_the_tape_knows() -> None:
     for expression in [*UNARY.values(), *BINARY.values()]:
         f = ca.Function("f", [X, Y], [expression])
         used |= {f.instruction_id(k) for k in range(f.n_instructions())}
-    spare = {ca.OP_ASSIGN, ca.OP_CONSTPOW}  # written by other CasADi versions for x and x**c
+    # The first two are written by other CasADi versions for x and x**c; if_else has its own test.
+    spare = {ca.OP_ASSIGN, ca.OP_CONSTPOW, ca.OP_NOT}
     assert set(tape_module.UNARY) | set(tape_module.BINARY) <= used | spare
 
 
-@pytest.mark.xfail(raises=NotImplementedError, reason="OP_NOT has no entry in tape.UNARY")
 def test_if_else_with_two_branches() -> None:
     assert_replays([X, Y], BRANCHES, POINTS[:, :1], POINTS[:, 1:])
 
 
-@pytest.mark.xfail(reason="0 · NaN in _if_else_zero, where CasADi gives 0")
 def test_a_branch_not_taken_may_be_undefined() -> None:
     guarded = ca.if_else(X > 0, ca.log(X), 0)
     assert_replays([X], guarded, POINTS[:, :1])
@@ -108,8 +107,9 @@ smooth = ("sin", "cos", "tanh", "atan", "fabs", "sign", "neg", "sq", "floor")
 paired = ("add", "sub", "mul", "fmin", "fmax", "atan2", "if_else_zero", "hypot")
 expressions = st.recursive(
     leaves,
-    lambda inner: st.tuples(st.sampled_from(smooth), inner)
-    | st.tuples(st.sampled_from(paired), inner, inner),
+    lambda inner: (
+        st.tuples(st.sampled_from(smooth), inner) | st.tuples(st.sampled_from(paired), inner, inner)
+    ),
     max_leaves=25,
 )
 
@@ -229,7 +229,6 @@ def test_outputs_that_do_not_depend_on_the_inputs() -> None:
     np.testing.assert_array_equal(same[:, 0, 0], [0, 1, 2])
 
 
-@pytest.mark.xfail(raises=ValueError, reason="range() with the step min(chunk, 0) = 0")
 def test_a_table_without_rows_gives_no_rows() -> None:
     found = Tape(*three_outputs())(np.zeros((0, 3)), np.ones(2))
     assert [f.shape for f in found] == [(0, 2, 2), (0, 3, 2), (0, 1, 1)]
@@ -241,7 +240,8 @@ ANALYTIC = ("neg", "exp", "log", "sqrt", "sq", "sin", "cos", "tan", "asin", "aco
             "sinh", "cosh", "tanh", "inv", "log1p", "expm1", "twice", "identity",
             "power 3", "power 2.5")  # fmt: skip
 REAL_ONLY = {"floor": UNARY["floor"], "ceil": UNARY["ceil"], "atan2": ca.atan2(X, 2),
-             "hypot": ca.hypot(X, 2), "fmod": ca.fmod(X, 2), "copysign": ca.copysign(X, 2)}  # fmt: skip
+             "hypot": ca.hypot(X, 2), "fmod": ca.fmod(X, 2),
+             "copysign": ca.copysign(X, 2)}  # fmt: skip
 PIECEWISE = {"fmax": ca.fmax(X, 1.0), "fmin": ca.fmin(X, 1.0), "lt": (X < 1) * X,
              "if_else_zero": ca.if_else(X > 1, X * X, 0)}  # fmt: skip
 
@@ -251,7 +251,7 @@ def assert_complex_step(expression: ca.SX, at: np.ndarray) -> None:
     found = Tape([X], [expression])(at + 1j * step)[0]
     np.testing.assert_allclose(found.real, casadi_values([X], expression, at), rtol=4e-15)
     slope = casadi_values([X], ca.jacobian(expression, X), at)
-    np.testing.assert_allclose(found.imag / step, slope, rtol=4e-15, atol=1e-300)
+    np.testing.assert_allclose(found.imag / step, slope, rtol=4e-14)  # 1 − tanh² cancels
 
 
 @pytest.mark.parametrize("name", [*ANALYTIC, *PIECEWISE])
@@ -263,7 +263,7 @@ def test_complex_step_is_the_derivative(name: str) -> None:
 def test_complex_scalars_with_real_rows() -> None:
     rng = np.random.default_rng(3)
     q, p = rng.normal(size=(4, 3)), rng.normal(size=2)
-    dense, sparse, squares = Tape(*three_outputs())(q, p + [1e-30j, 0])
+    dense, sparse, squares = Tape(*three_outputs())(q, p + np.array([1e-30j, 0]))
     np.testing.assert_allclose(dense[:, 0, 0].imag / 1e-30, q[:, 0], rtol=1e-15)
     np.testing.assert_array_equal(sparse[:, 0, 1].imag, np.full(4, 1e-30))
     np.testing.assert_array_equal(squares.imag, np.zeros_like(squares.real))
@@ -275,7 +275,6 @@ def test_what_numpy_has_for_real_numbers_only_is_refused_not_wrong(name: str) ->
         Tape([X], [REAL_ONLY[name]])(np.array([[0.3 + 1e-30j]]))
 
 
-@pytest.mark.xfail(reason="numpy's |z| and sign z of complex z are not analytic continuations")
 @pytest.mark.parametrize("name", ["fabs", "sign"])
 def test_complex_step_of_kinks(name: str) -> None:
     assert_complex_step(UNARY[name], np.array([[-1.3], [0.9]]))

@@ -66,7 +66,7 @@ def kr270_chain() -> Chain:
     return read_urdf(KR270)
 
 
-def kr270_cell(effects: Sequence[str] = (), observe: str = "position", **model: Any) -> Cell:
+def kr270_cell(effects: Sequence[str] = (), observe: Any = "position", **model: Any) -> Cell:
     """A cell of the KR 270-2; `effects` as in a cell file ("name" or "name:place").
 
     `model` goes to ModelSpec; the nominal compliances are Table 3's unless `nominal` is given.
@@ -78,7 +78,7 @@ def kr270_cell(effects: Sequence[str] = (), observe: str = "position", **model: 
         robot=Robot(urdf=KR270),
         tool=Tool(LOAD_POINT, dict(MARKERS)),
         tracker=Tracker(anchor=ANCHOR),
-        model=ModelSpec(observe=observe, effects=choices(effects), **model),  # type: ignore[arg-type]
+        model=ModelSpec(observe=observe, effects=choices(effects), **model),
     )
 
 

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.outliers import blocks
+from elastocal.identification.result import IdentificationResult, Outlier
 from elastocal.identification.solve import Solution
 
 FEW_DOF_PER_PARAMETER = 1.0
 ILL_CONDITIONED = 1e4
 FAR_ABOVE_STATED = 2.0
+MANY = 0.05
 
 
 def warnings_for(result: IdentificationResult, solution: Solution) -> IdentificationResult:
@@ -98,18 +100,31 @@ def _bounds(result: IdentificationResult, solution: Solution) -> list[str]:
     return found
 
 
+def _lines(readings: tuple[Outlier, ...]) -> str:
+    """ "lines 142–507, 610 …": runs of lines, the first eight."""
+    runs = blocks([o.line for o in readings])
+    shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in runs[:8])
+    return f"lines {shown}{' …' if len(runs) > 8 else ''}"
+
+
 def _outliers(result: IdentificationResult) -> list[str]:
     found = []
     if result.outliers:
-        lines = ", ".join(str(o.line) for o in result.outliers[:8])
-        more = " …" if len(result.outliers) > 8 else ""
+        lines = _lines(result.outliers)
         found.append(
-            f"{len(result.outliers)} readings lie beyond what the noise explains (lines {lines}"
-            f"{more}). Check them; --drop-outliers leaves them out and says so."
+            f"{len(result.outliers)} readings lie beyond what the noise explains ({lines}). "
+            "Check them; --drop-outliers leaves them out and says so."
         )
+        if len(result.outliers) > MANY * len(result.observations.lead):
+            found.append(
+                "That is too large a share for reading errors: a shifted block of readings, or an "
+                "effect that the model lacks in some load state, marker or region. Look at where "
+                "they lie before leaving any out."
+            )
     if result.excluded:
+        lines = _lines(result.excluded)
         found.append(
-            f"{len(result.excluded)} readings were left out as faulty; they are listed in the "
-            "result under 'excluded'."
+            f"{len(result.excluded)} readings were left out as faulty ({lines}); all "
+            "are listed in the result under 'excluded'."
         )
     return found

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
+from elastocal.errors import ElastocalError
 from elastocal.identification.result import Outlier
 from elastocal.identification.solve import PLACED_EFFECTS, Solution
 from elastocal.identification.trimmed import majority, median_scale
@@ -30,8 +31,11 @@ def find_faulty(solution: Solution, refit: Callable[[Mask], Solution]) -> tuple[
     good = ~_suspects(solution)
     visited: list[tuple[float, Mask, Solution]] = []
     for _ in range(ROUNDS):
-        current = solution if good.all() else refit(good)
-        beyond, cost = _judge(solution, current, good)
+        try:
+            current = solution if good.all() else refit(good)
+            beyond, cost = _judge(solution, current, good)
+        except ElastocalError:
+            break  # that subset does not determine a valid arm: it cannot judge the others
         visited.append((cost, good, current))
         if beyond.sum() >= len(beyond) // 2:
             break  # no majority to go by
@@ -39,6 +43,8 @@ def find_faulty(solution: Solution, refit: Callable[[Mask], Solution]) -> tuple[
             good = ~beyond
             break
         good = ~beyond
+    if not visited:
+        return np.zeros(len(good), dtype=bool), solution
     final = next((v for v in reversed(visited) if np.array_equal(v[1], good)), visited[-1])
     best = min(visited, key=lambda v: v[0])
     half = len(good) // 2

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.checks import check_enough
 from elastocal.identification.fit import Fit, FitProblem, fit
 from elastocal.identification.heldout import held_out_residual, rms_3d
+from elastocal.identification.linear import solve_weighted
 from elastocal.identification.noise import Weights
 from elastocal.identification.reduction import Reduction, reduce
 from elastocal.manipulator.model import Model
@@ -140,8 +140,15 @@ def _fit_of(problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_ste
     """Fit of the kept parameters, the others held at the start; their share moves over first."""
     kept, dropped = chosen.kept, chosen.dropped
     start = x.copy()
-    start[kept] += chosen.mixing @ (x[dropped] - problem.x0[dropped])
     start[dropped] = problem.x0[dropped]
+    shifted = start.copy()
+    shifted[kept] += chosen.mixing @ (x[dropped] - problem.x0[dropped])
+    seen = problem.observations
+    # The share is a linear estimate: a soft arm may have no equilibrium so far out.
+    for trial in (shifted, start, problem.x0):
+        start = trial
+        if np.isfinite(problem.model.predict(seen.table, trial, seen)).all():
+            break
     final = FitProblem(
         problem.model, problem.observations, problem.weights, start, kept, sizes,
         bounded=problem.bounded,
@@ -175,10 +182,11 @@ def _prefer_wider(
         wider = _reduction(problem, sizes, found.x, sigma, threshold)
         if len(wider.kept) <= len(reduction.kept):
             continue
-        if rms_3d(_linearised_heldout(problem, found.x, wider), size) >= rms_3d(heldout, size):
+        x, linear_heldout = _linear_step(problem, found.x, wider)
+        if rms_3d(linear_heldout, size) >= rms_3d(heldout, size):
             continue
         try:
-            wide = _fit_of(problem, sizes, found.x, wider, max_steps=30)
+            wide = _fit_of(problem, sizes, x, wider, max_steps=30)
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             continue  # along an undetermined direction the wide set may leave every valid arm
         wide_heldout = _heldout(problem, wide.B, wide.residual)
@@ -187,11 +195,11 @@ def _prefer_wider(
     return found, reduction, heldout
 
 
-def _linearised_heldout(problem: Problem, x: Array, chosen: Reduction) -> Array:
-    """Held-out residuals after one Gauss–Newton step of the chosen set from x."""
+def _linear_step(problem: Problem, x: Array, chosen: Reduction) -> tuple[Array, Array]:
+    """x after one Gauss–Newton step of the chosen set, and the linear model's held-out residual."""
     seen, weights = problem.observations, problem.weights
     at = problem.model.regressor(seen.table, x, chosen.kept, seen)
-    Q, _ = linalg.qr(weights.apply(at.B), mode="economic")
-    e = weights.apply(at.residual)
-    step = linalg.lstsq(weights.apply(at.B), Q @ (Q.T @ e), cond=1e-14)[0]
-    return _heldout(problem, at.B, at.residual - at.B @ step)
+    step = solve_weighted(weights.apply(at.B), weights.apply(at.residual)).x
+    moved = x.copy()
+    moved[chosen.kept] += step
+    return moved, _heldout(problem, at.B, at.residual - at.B @ step)

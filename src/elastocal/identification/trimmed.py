@@ -24,6 +24,8 @@ def least_trimmed_squares(
     smallest possible random subsets, concentration steps, the best few run to the end.
     """
     n, p = len(e) // size, B.shape[1]
+    if p == 0:
+        return np.zeros(0)
     B3, e2 = B.reshape(n, size, p), e.reshape(n, size)
     rng = np.random.default_rng(seed)
     search = np.arange(n) if n <= SEARCH_ROWS else rng.choice(n, SEARCH_ROWS, replace=False)
@@ -61,6 +63,8 @@ def _concentrate(B: Array, e: Array, shift: Array) -> tuple[Array, float]:
 
 
 def _solve(B: Array, e: Array) -> Array:
+    if B.shape[2] == 0:
+        return np.zeros(0)
     return linalg.lstsq(B.reshape(-1, B.shape[2]), e.ravel(), cond=1e-10, check_finite=False)[0]
 
 

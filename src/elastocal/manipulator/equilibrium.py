@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from elastocal.manipulator.tape import Tape
 
 MAX_STEPS = 30
+LARGEST = 0.5  # rad or m
 TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
 
 
 class Equilibrium:
     """Deflections θ with F(θ) = θ − law(τ(θ)) = 0, τ = −∂V/∂θ at the deflected pose.
 
-    Written with compliances, so a rigid joint (k = 0) needs no special case.
+    Written with compliances, so a rigid joint (k = 0) needs no special case.  Only a stable
+    equilibrium with deflections below LARGEST counts: beyond that no arm is elastic any more.
     """
 
     def __init__(self, inputs: Sequence[ca.SX], p: ca.SX, theta: ca.SX, residual: ca.SX) -> None:
@@ -28,6 +30,24 @@ class Equilibrium:
     def solve(self, inputs: Sequence[NDArray], p: NDArray) -> NDArray:
         """θ (n, size) by Newton's method on all rows; rows that do not settle become NaN."""
         n = len(inputs[0])
+        theta = self._stationary(inputs, p, n)
+        return self._accepted(inputs, p, theta)
+
+    def _accepted(self, inputs: Sequence[NDArray], p: NDArray, theta: NDArray) -> NDArray:
+        real = theta.real
+        with np.errstate(invalid="ignore"):
+            theta[(np.abs(real) > LARGEST).any(axis=1)] = np.nan
+        # F_θ = 1 − C·H with the potential's Hessian H: stable while its eigenvalues are positive,
+        # which they are wherever C·H is small; only soft poses need the eigenvalues themselves.
+        F_theta = self._tape(*inputs, p, theta)[1].real
+        soft = np.abs(F_theta - np.eye(self.size)).sum(axis=2).max(axis=1) >= 1
+        rows = np.flatnonzero(soft & np.isfinite(F_theta).all(axis=(1, 2)))
+        if len(rows):
+            unstable = np.linalg.eigvals(F_theta[rows]).real.min(axis=1) <= 0
+            theta[rows[unstable]] = np.nan
+        return theta
+
+    def _stationary(self, inputs: Sequence[NDArray], p: NDArray, n: int) -> NDArray:
         theta = np.zeros((n, self.size), dtype=np.result_type(np.float64, p, *inputs))
         active = np.arange(n)
         step = np.zeros(0)

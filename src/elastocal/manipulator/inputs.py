@@ -27,12 +27,13 @@ def row_inputs(arm: Arm, table: Measurements) -> list[NDArray]:
 
     Raises InputError where the table lacks a column, or a row lies at none of a joint's levels.
     """
-    return [_one(arm, table, name) for name in arm.inputs]
+    codes = _marker_codes(arm, table)
+    return [_one(arm, table, name, codes) for name in arm.inputs]
 
 
-def _one(arm: Arm, table: Measurements, name: str) -> NDArray:
+def _one(arm: Arm, table: Measurements, name: str, marker: NDArray) -> NDArray:
     if name == "marker":
-        return _one_hot(_marker_codes(arm, table), len(arm.markers))
+        return _one_hot(marker, len(arm.markers))
     if name.startswith("level:"):
         return _levels(arm, table, name.removeprefix("level:"))
     value = getattr(table, name)

@@ -75,12 +75,19 @@ class Model:
     def sizes(self, B: Array) -> Array:
         """Typical deviation (parameters,) of each parameter, in its unit.
 
-        Where none is known beforehand, the deviation that moves the readings behind `B` by 1 mm.
+        Where none is known beforehand, one size for all parameters of that effect: ten times the
+        deviation that moves the readings behind `B` by 1 mm at the place they show most (a
+        wrist is about ten times as soft as a shoulder).
         """
         largest = np.abs(B).max(axis=0, initial=0.0)
-        moved = np.divide(1e-3, largest, out=np.ones(len(largest)), where=largest > 0)
-        given = [p.typical for p in self.parameters]
-        return np.array([m if s is None else s for s, m in zip(given, moved, strict=True)])
+        moved = np.divide(1e-3, largest, out=np.full(len(largest), np.inf), where=largest > 0)
+        common: dict[tuple[str, str], float] = {}
+        for p, m in zip(self.parameters, moved, strict=True):
+            common[p.effect, p.unit] = min(common.get((p.effect, p.unit), np.inf), 10 * m)
+        common = {key: size if np.isfinite(size) else 1.0 for key, size in common.items()}
+        return np.array(
+            [common[p.effect, p.unit] if p.typical is None else p.typical for p in self.parameters]
+        )
 
     def deflection(self, table: Measurements, x: Array | None = None) -> NDArray:
         """Elastic deflections θ (n_rows, springs) at equilibrium; NaN where none is found."""

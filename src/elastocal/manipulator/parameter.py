@@ -14,7 +14,7 @@ class ParameterSpec:
     `typical` is the size one expects of the deviation from nominal; columns of B
     are scaled by it before any rank is judged, so that metres and rad/(N m) compare.
     None means that no size is known beforehand (a compliance without a nominal value):
-    it is then the deviation that would move the readings by 1 mm.
+    `Model.sizes` then finds one from what moves the readings.
     """
 
     key: str

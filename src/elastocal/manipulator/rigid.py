@@ -47,12 +47,25 @@ def rotation_from_vector(r: Any) -> ca.SX:
 
 
 def vector_from_rotation(R: Any) -> ca.SX:
-    """Rotation vector of R, smooth at R = I and valid for angles below π."""
+    """Rotation vector of R, smooth at R = I, for angles up to and including π."""
     R = ca.SX(R)
-    w = ca.sqrt(ca.fmax(1 + ca.trace(R), TINY)) / 2
-    v = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]) / (4 * w)
-    s = ca.sqrt(ca.sumsqr(v) + TINY)
-    return 2 * ca.atan2(s, w) / s * v
+    trace = ca.trace(R)
+    # Quaternion (w, x, y, z) times 4 times its largest member (Shepperd 1978): no case divides
+    # by a small number.
+    skewed = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    best, largest = ca.vertcat(1 + trace, skewed), trace
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        members = [skewed[i], 0, 0, 0]
+        members[1 + i] = 1 + 2 * R[i, i] - trace
+        members[1 + j] = R[i, j] + R[j, i]
+        members[1 + k] = R[i, k] + R[k, i]
+        larger = R[i, i] > largest
+        best = ca.if_else(larger, ca.vertcat(*members), best)
+        largest = ca.fmax(largest, R[i, i])
+    unit = best / ca.sqrt(ca.sumsqr(best))
+    unit = ca.if_else(unit[0] < 0, -unit, unit)
+    s = ca.sqrt(ca.sumsqr(unit[1:]) + TINY)
+    return 2 * ca.atan2(s, unit[0]) / s * unit[1:]
 
 
 def transform(rotation: Any = None, translation: Any = None) -> ca.SX:

@@ -22,7 +22,27 @@ def _twice(x: Any, out: Any = None) -> Any:
 
 
 def _if_else_zero(condition: Any, value: Any, out: Any = None) -> Any:
-    return np.multiply(np.not_equal(condition, 0), value, out=out)
+    # np.where and not a product: the branch not taken may be infinite or NaN.
+    chosen = np.where(np.not_equal(condition, 0), value, 0.0)
+    if out is None:
+        return chosen[()]
+    out[:] = chosen
+    return out
+
+
+def _abs(x: Any, out: Any = None) -> Any:
+    # On complex numbers the analytic continuation, so that complex steps stay derivatives.
+    if np.iscomplexobj(x):
+        return np.multiply(x, np.where(np.real(x) < 0, -1.0, 1.0), out=out)
+    return np.abs(x, out=out)
+
+
+def _sign(x: Any, out: Any = None) -> Any:
+    return np.multiply(np.sign(np.real(x)), 1.0, out=out)
+
+
+def _not(x: Any, out: Any = None) -> Any:
+    return np.multiply(np.logical_not(x), 1.0, out=out)
 
 
 def _as_number(compare: Callable) -> Callable:
@@ -35,11 +55,11 @@ def _as_number(compare: Callable) -> Callable:
 UNARY: dict[int, Any] = {
     ca.OP_NEG: np.negative, ca.OP_EXP: np.exp, ca.OP_LOG: np.log, ca.OP_SQRT: np.sqrt,
     ca.OP_SQ: np.square, ca.OP_SIN: np.sin, ca.OP_COS: np.cos, ca.OP_TAN: np.tan,
-    ca.OP_ASIN: np.arcsin, ca.OP_ACOS: np.arccos, ca.OP_ATAN: np.arctan, ca.OP_FABS: np.abs,
-    ca.OP_SIGN: np.sign, ca.OP_SINH: np.sinh, ca.OP_COSH: np.cosh, ca.OP_TANH: np.tanh,
+    ca.OP_ASIN: np.arcsin, ca.OP_ACOS: np.arccos, ca.OP_ATAN: np.arctan, ca.OP_FABS: _abs,
+    ca.OP_SIGN: _sign, ca.OP_SINH: np.sinh, ca.OP_COSH: np.cosh, ca.OP_TANH: np.tanh,
     ca.OP_INV: np.reciprocal, ca.OP_LOG1P: np.log1p, ca.OP_EXPM1: np.expm1,
     ca.OP_FLOOR: np.floor, ca.OP_CEIL: np.ceil, ca.OP_ASSIGN: np.positive,
-    ca.OP_TWICE: _twice,
+    ca.OP_TWICE: _twice, ca.OP_NOT: _not,
 }  # fmt: skip
 BINARY: dict[int, Any] = {
     ca.OP_ADD: np.add, ca.OP_SUB: np.subtract, ca.OP_MUL: np.multiply, ca.OP_DIV: np.divide,
@@ -76,7 +96,7 @@ class Tape:
         n = max((len(a) for a in arrays if a.ndim == 2), default=1)
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
-        size = min(chunk, n)
+        size = max(min(chunk, n), 1)
         buffer = np.empty((self.n_registers, size), dtype=dtype)
         stage = [np.zeros((r * c, size), dtype=dtype) for r, c in self.shapes]
         for start in range(0, n, size):

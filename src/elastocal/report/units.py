@@ -57,6 +57,11 @@ def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
     return *with_uncertainty(shown, display(half, unit)[0]), text
 
 
+def rounded_alike(value: float, half: float) -> str:
+    """`value` with the digits that `half` allows: a true value beside its estimate."""
+    return with_uncertainty(value, half)[0]
+
+
 def plain(value: float) -> str:
     """A number without known uncertainty, such as a nominal value: at most six digits."""
     if not math.isfinite(value):

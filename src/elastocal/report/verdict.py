@@ -23,7 +23,6 @@ from elastocal.report.words import (
 MOST_CORRELATIONS = 8
 # Held-out errors this much above the fitted ones mean that the fit flatters itself.
 FLATTERS = 1.2
-METHODS = {"ols": "ordinary least squares", "wls": "weighted least squares"}
 READINGS = {
     "position": "position readings",
     "deflection": "deflections (loaded minus unloaded readings)",
@@ -63,8 +62,8 @@ def how_well_it_predicts(result: IdentificationResult) -> str:
         text = f"In poses that were not fitted the {what} is predicted to {length(held)} rms"
         if held > 0 and nominal > held:
             text += (
-                f"; the nominal arm, with base and markers placed, is off by {length(nominal)} "
-                f"({significant(nominal / held, 2)} times as much)"
+                f"; the {nominal_arm(result)} is off by {length(nominal)}, "
+                f"{significant(nominal / held, 2)} times as much"
             )
         elif math.isfinite(nominal):
             text += f", no better than the nominal arm ({length(nominal)})"
@@ -110,14 +109,37 @@ def does_noise_explain_it(result: IdentificationResult) -> str:
     return f"The residual agrees with the stated noise ({size})."
 
 
+def nominal_arm(result: IdentificationResult) -> str:
+    placed = any(p.effect in ("base_frame", "marker_position") for p in result.model.parameters)
+    return "nominal arm (base and markers placed)" if placed else "nominal arm"
+
+
 def rms_by_kind(result: IdentificationResult) -> list[tuple[str, float]]:
     """What the errors are with the nominal arm, fitted, held out and on test data (3-D rms, m)."""
     rows = [
-        ("nominal arm, base and markers placed", result.nominal_rms),
+        (nominal_arm(result), result.nominal_rms),
         ("fitted poses", result.residual_rms),
         ("held-out poses", result.heldout_rms),
     ]
     return rows if result.test is None else [*rows, ("test data", result.test.rms)]
+
+
+def rotation_rms(result: IdentificationResult) -> tuple[float, float] | None:
+    """Fitted and held-out rms length of the rotation error in rad; None where none was read."""
+    if result.observations.kind != "pose":
+        return None
+    parts = [r.reshape(-1, 6)[:, 3:] for r in (result.residual, result.held_out)]
+    fitted, held = (float(np.sqrt((p**2).sum(axis=1).mean())) for p in parts)
+    return fitted, held
+
+
+def error_line(result: IdentificationResult) -> str:
+    """All rms errors in one line."""
+    text = ", ".join(f"{name} {length(value)}" for name, value in rms_by_kind(result))
+    if (turns := rotation_rms(result)) is not None:
+        fitted, held = (significant(v * 1e6) if math.isfinite(v) else "none" for v in turns)
+        text += f"; rotations {fitted} µrad fitted, {held} µrad held out"
+    return text
 
 
 def readings(result: IdentificationResult) -> str:
@@ -131,14 +153,16 @@ def readings(result: IdentificationResult) -> str:
 
 
 def method_and_weights(result: IdentificationResult) -> str:
-    name = METHODS.get(result.method, result.method)
-    return f"{name}, {printable(str(result.noise['description']))}"
+    if result.noise["kind"] == "none":
+        return "ordinary least squares, all readings weighted alike"
+    return f"weighted least squares, {printable(str(result.noise['description']))}"
 
 
 def correlation_lines(result: IdentificationResult, most: int = MOST_CORRELATIONS) -> list[str]:
-    lines = [
-        f"{printable(a)} and {printable(b)}: {r:+.3f}" for a, b, r in result.correlations[:most]
-    ]
+    lines = []
+    for a, b, r in result.correlations[:most]:
+        number = f"{r:+.3f}" if abs(r) < 0.9995 else f"{r:+.6f}"
+        lines.append(f"{printable(a)} and {printable(b)}: {number}")
     more = len(result.correlations) - len(lines)
     return [*lines, f"and {more} more"] if more else lines
 
@@ -153,7 +177,7 @@ def summary_lines(result: IdentificationResult, truth: Truth | None = None) -> l
     lines = [
         f"Readings: {readings(result)}",
         f"Method: {method_and_weights(result)}",
-        "Error (3-D rms): " + ", ".join(f"{name} {length(v)}" for name, v in rms_by_kind(result)),
+        f"Error (rms): {error_line(result)}",
         f"Degrees of freedom: {result.dof}",
         f"Identified: {what_was_identified(result)}",
         f"Prediction: {how_well_it_predicts(result)}",

@@ -65,9 +65,9 @@ def short_note(result: IdentificationResult, e: Estimate) -> str:
 
 
 def held_where(result: IdentificationResult, names: list[str]) -> str:
-    """ "held at nominal" where that is so for all of `names`, else "held at the start"."""
+    """Where all of `names` are held: at nominal, or at a start value that is none."""
     chosen = [e for e in result.estimates if printable(e.name) in names]
-    at_nominal = all(e.held == e.nominal for e in chosen)
+    at_nominal = all(e.held == e.nominal and nominal_known(result, e.name) for e in chosen)
     return "held at nominal" if at_nominal else "held at the start value"
 
 
@@ -102,3 +102,17 @@ def nominal_known(result: IdentificationResult, name: str) -> bool:
     """False for a zero that only stands for "no nominal value stated", as of a compliance."""
     parameter = result.model.parameters[result.model.names.index(name)]
     return parameter.nominal != 0 or parameter.typical is not None
+
+
+def undetermined_lines(result: IdentificationResult) -> list[str]:
+    """Which parameters have no number of their own, and why, one line per reason."""
+    lines = []
+    if names := names_of(result, INVISIBLE):
+        where = held_where(result, names)
+        lines.append(f"{where} (not visible in these data): {', '.join(names)}")
+    if names := names_of(result, ABSORBED):
+        where = held_where(result, names)
+        lines.append(f"{where}, absorbed in a combination: {', '.join(names)}")
+    if names := names_of(result, FIXED):
+        lines.append(f"fixed by the user: {', '.join(names)}")
+    return lines

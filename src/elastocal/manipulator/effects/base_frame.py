@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Cell
 from elastocal.manipulator import rigid
@@ -32,7 +33,7 @@ class BaseFrame(Effect):
         nominal = cell.model.nominal
         position = np.zeros(3) if nominal.base_position is None else nominal.base_position
         rotation = np.eye(3) if nominal.base_rotation is None else nominal.base_rotation
-        vector = np.asarray(ca.evalf(rigid.vector_from_rotation(rotation))).ravel()
+        vector = Rotation.from_matrix(rotation).as_rotvec()
         values = [*position, *vector]
         sizes = [3e-3] * 3 + [3e-3] * 3
         units = ["m"] * 3 + ["rad"] * 3

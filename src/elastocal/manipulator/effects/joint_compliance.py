@@ -11,6 +11,17 @@ from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
 from elastocal.manipulator.parameter import ParameterSpec
 
 
+def nominal_compliance(chain: Chain, cell: Cell) -> tuple[float, ...] | None:
+    """The cell's nominal compliances, one per joint; InputError where their number is another."""
+    given = cell.model.nominal.joint_compliance
+    require(
+        given is None or len(given) == chain.n_joints,
+        f"[model.nominal] joint_compliance has {len(given or ())} values, "
+        f"but the arm has {chain.n_joints} joints; give one per joint",
+    )
+    return given
+
+
 class JointCompliance(Effect):
     """δq_j = k_j τ_j, k_j in rad/(N m) (m/N for a prismatic joint).
 
@@ -31,12 +42,7 @@ class JointCompliance(Effect):
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         i = index(place)
         unit = "rad/(N*m)" if chain.kinds[i] == "revolute" else "m/N"
-        given = cell.model.nominal.joint_compliance
-        require(
-            given is None or len(given) == chain.n_joints,
-            f"[model.nominal] joint_compliance has {len(given or ())} values, "
-            f"but the arm has {chain.n_joints} joints; give one per joint",
-        )
+        given = nominal_compliance(chain, cell)
         nominal = 0.0 if given is None else float(given[i])
         typical = abs(nominal) or None
         levels = cell.model.compliance_levels.get(place)

@@ -8,6 +8,7 @@ from elastocal.cell import Cell
 from elastocal.manipulator.arm import Arm, Spring
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
+from elastocal.manipulator.effects.joint_compliance import nominal_compliance
 from elastocal.manipulator.parameter import ParameterSpec
 
 
@@ -36,7 +37,7 @@ class OffAxisCompliance(Effect):
         return joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        given = cell.model.nominal.joint_compliance
+        given = nominal_compliance(chain, cell)
         typical = 0.2 * given[index(place)] if given else None
         return tuple(
             ParameterSpec(f"off_axis_compliance_{a}", "rad/(N*m)", 0.0, typical, lower=0.0)

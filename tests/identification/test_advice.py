@@ -1,0 +1,212 @@
+"""Warnings: each appears when its cause is there, and none on a clean, adequate case."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.calibration import (
+    GEOMETRY,
+    PLACED,
+    cell_of,
+    measured,
+    planar_chain,
+    table_at,
+    true_values,
+    with_values,
+)
+from support.cells import random_poses
+
+from elastocal.cell import CartesianNoise, Nominal, Tracker
+from elastocal.identification import fit as fit_module
+from elastocal.identification.identify import Options, identify
+from elastocal.manipulator.model import Model
+
+SIGMA = 5e-5
+SENTENCES = {
+    "not converged": "The fit did not converge: ",
+    "few": "degrees of freedom for",
+    "alone": "Some configuration alone determines a parameter",
+    "ill": "Ill-conditioned (condition number",
+    "noise": "times the stated noise (",
+    "at bound": "stands at its bound",
+    "beyond bound": "lies beyond its physical bound",
+    "outliers": "lie beyond what the noise explains",
+    "excluded": "were left out as faulty",
+    "share": "too large a share for reading errors",
+}
+
+
+def kinds(result):
+    """Which of the SENTENCES the warnings are; every warning must be one of them."""
+    found = set()
+    for warning in result.warnings:
+        mine = {kind for kind, text in SENTENCES.items() if text in warning}
+        assert len(mine) == 1, warning
+        assert warning.endswith(".")
+        found |= mine
+    return found
+
+
+def identified(model, seed=0, poses=30, sigma=SIGMA, options=None, truth=None, q=None, forces=None,
+               change=lambda table: table):  # fmt: skip
+    rng = np.random.default_rng(seed)
+    truth = true_values(model, rng) if truth is None else truth
+    q = random_poses(model.chain, poses, seed) if q is None else q
+    plan = table_at(q, [[0, 0, 0]] if forces is None else forces)
+    return identify(model, change(measured(model, plan, truth, sigma, rng)), options)
+
+
+def text_of(result, kind):
+    (warning,) = [w for w in result.warnings if SENTENCES[kind] in w]
+    return warning
+
+
+@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("effects", [PLACED, GEOMETRY], ids="+".join)
+@pytest.mark.parametrize("seed", range(2))
+def test_a_clean_adequate_case_has_no_warning(effects, stated, seed):
+    noise = CartesianNoise(np.full(3, SIGMA)) if stated else None
+    model = Model(planar_chain(), cell_of(effects, tracker=Tracker(noise=noise)))
+    assert identified(model, seed=seed, poses=40).warnings == ()
+
+
+def test_loaded_clean_case_has_no_warning():
+    nominal = Nominal(joint_compliance=(2e-5,) * 3)
+    model = Model(planar_chain(), cell_of((*PLACED, "joint_compliance"), nominal=nominal))
+    assert identified(model, forces=[[0, 0, 0], [200, 0, -400]]).warnings == ()
+
+
+def test_few_poses():
+    """9 parameters from 5 poses: 6 degrees of freedom."""
+    result = identified(Model(planar_chain(), cell_of(PLACED)), poses=5)
+    assert "few" in kinds(result)
+    warning = text_of(result, "few")
+    assert warning.startswith(f"Only {result.dof} degrees of freedom for {len(result.determined)}")
+    assert warning.endswith("Measure more poses.")
+    enough = identified(Model(planar_chain(), cell_of(PLACED)), poses=6)  # 9 for 9
+    assert "few" not in kinds(enough)
+
+
+def test_a_configuration_that_alone_determines_a_parameter():
+    """Two markers, one of them read in a single configuration."""
+    markers = {"M1": np.zeros(3), "M2": np.array([0.1, 0.1, 0.0])}
+    model = Model(planar_chain(), cell_of(PLACED, markers))
+    rng = np.random.default_rng(0)
+    truth = true_values(model, rng)
+    plan = table_at(random_poses(model.chain, 20, 0), markers=("M1", "M2"))
+    plan = plan.take((plan.marker == 0) | (plan.configuration == 4))
+    result = identify(model, measured(model, plan, truth, SIGMA, rng))
+    assert kinds(result) == {"alone"}
+    assert "Measure more configurations" in text_of(result, "alone")
+
+
+def test_ill_conditioned():
+    """Joint 2 moves by ±0.02°: its compliance's levels cannot tell offset from base tilt, …"""
+    model = Model(planar_chain(), cell_of(("base_frame", "link_geometry", "marker_position")))
+    q = random_poses(model.chain, 60, 0)
+    q[:, 2] = 0.5 + 2e-4 * q[:, 2]
+    # low noise, so that even the barely visible directions are worth a column
+    result = identified(model, q=q, sigma=1e-10)
+    assert "ill" in kinds(result)
+    warning = text_of(result, "ill")
+    assert "the data barely separate" in warning
+    assert "Measure poses in which these joints differ more, or fix one of them" in warning
+    named = warning.split("barely separate ")[1].split(". Measure")[0].split(", ")
+    assert len(named) == 3 and set(named) <= set(result.determined)
+
+
+def test_residual_far_above_the_stated_noise():
+    stated = Tracker(noise=CartesianNoise(np.full(3, SIGMA / 5)))
+    model = Model(planar_chain(), cell_of(PLACED, tracker=stated))
+    result = identified(model, poses=40)
+    assert kinds(result) == {"noise"}
+    warning = text_of(result, "noise")
+    # s² · dof ~ χ²(111): s within 25 % of 5
+    assert float(warning.split(" times")[0].split()[-1]) == pytest.approx(5.0, rel=0.25)
+    assert "something is unmodelled or the stated noise is too small" in warning
+    assert "add effects or run diagnose" in warning
+
+
+def test_an_unmodelled_effect_shows_against_the_stated_noise():
+    stated = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
+    full = Model(planar_chain(), cell_of(GEOMETRY, tracker=stated))
+    rng = np.random.default_rng(1)
+    truth = true_values(full, rng)
+    table = measured(full, table_at(random_poses(full.chain, 40, 1)), truth, SIGMA, rng)
+    assert "noise" in kinds(identify(Model(full.chain, cell_of(PLACED, tracker=stated)), table))
+    assert not kinds(identify(full, table))
+
+
+def springs():
+    nominal = Nominal(joint_compliance=(2e-5,) * 3)
+    return Model(planar_chain(), cell_of(("base_frame", "joint_compliance"), nominal=nominal))
+
+
+STATES = [[0, 0, 0], [200, 0, -400]]
+
+
+def test_a_parameter_beyond_its_bound():
+    model = springs()
+    truth = with_values(model, {"joint3.compliance": -1e-5})
+    result = identified(model, truth=truth, forces=STATES)
+    assert kinds(result) == {"beyond bound"}
+    assert text_of(result, "beyond bound").startswith("joint3.compliance = -1")
+    assert "check load direction and torque signs" in text_of(result, "beyond bound")
+    assert "fit with bounds" in text_of(result, "beyond bound")
+
+
+def test_a_parameter_at_its_bound():
+    model = springs()
+    truth = with_values(model, {"joint3.compliance": -1e-5})
+    result = identified(model, truth=truth, forces=STATES, options=Options(bounded=True))
+    warning = text_of(result, "at bound")
+    assert warning.startswith("joint3.compliance stands at its bound 0 rad/(N*m)")
+    assert "its interval does not hold" in warning
+    assert "beyond bound" not in kinds(result)
+    assert result.estimate("joint3.compliance").held >= 0.0
+
+
+def test_within_bounds_bounded_says_nothing():
+    assert identified(springs(), forces=STATES, options=Options(bounded=True)).warnings == ()
+
+
+def test_not_converged(monkeypatch):
+    """Two steps are too few for any fit."""
+    original = fit_module.least_squares
+
+    def impatient(*args, **options):
+        return original(*args, **(options | {"max_nfev": 1}))
+
+    monkeypatch.setattr(fit_module, "least_squares", impatient)
+    result = identified(Model(planar_chain(), cell_of(GEOMETRY)), poses=40)
+    assert not result.converged
+    warning = text_of(result, "not converged")
+    assert "the step limit was reached" in warning
+    assert "Give start hints in [model.nominal], fit fewer effects, or measure more poses" in warning
+
+
+def spoil(rows):
+    def change(table):
+        position = table.position.copy()
+        position[rows] += 0.01
+        return replace(table, position=position)
+
+    return change
+
+
+def test_outliers():
+    model = Model(planar_chain(), cell_of(PLACED))
+    result = identified(model, poses=50, change=spoil([3, 20]))
+    assert kinds(result) == {"outliers"}
+    warning = text_of(result, "outliers")
+    assert warning.startswith("2 readings lie beyond what the noise explains (lines 5, 22)")
+    dropped = identified(model, poses=50, change=spoil([3, 20]), options=Options(drop_outliers=True))
+    assert kinds(dropped) == {"excluded"}
+    assert "'excluded'" in text_of(dropped, "excluded")
+
+
+def test_too_many_outliers_are_no_reading_errors():
+    model = Model(planar_chain(), cell_of(PLACED))
+    result = identified(model, poses=50, change=spoil(np.arange(10, 16)))
+    assert kinds(result) == {"outliers", "share"}
+    assert "(lines 12–17)" in text_of(result, "outliers")

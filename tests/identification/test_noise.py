@@ -1,0 +1,314 @@
+"""Weights: W Σ Wᵀ = I for every way of stating the noise, and what weighting gains."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import linalg, stats
+from support.calibration import (
+    cell_of,
+    measured,
+    planar_chain,
+    table_at,
+    true_values,
+)
+from support.cells import random_poses
+
+from elastocal.cell import CartesianNoise, PolarNoise, Tracker
+from elastocal.errors import InputError
+from elastocal.identification.identify import Options, identify
+from elastocal.identification.noise import scaled_by_component, weights_for
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import observe, subset
+from elastocal.simulation.simulate import simulate
+
+POLAR = Tracker(np.array([0.3, -0.2, 0.1]), PolarNoise(2e-6, 3e-6, 5e-6, 2e-5))
+AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 3e-5])))
+
+
+def some_table(n=12, states=1, seed=0):
+    rng = np.random.default_rng(seed)
+    forces = [[0.0, 0.0, -100.0 * s] for s in range(states)]
+    table = table_at(rng.normal(size=(n, 3)), forces)
+    position = rng.normal(size=(len(table), 3)) + [2.0, 1.0, 0.5]
+    return replace(table, position=position)
+
+
+def reading_covariance(table, tracker):
+    """Σ (3 n, 3 n) written out reading by reading, from the definition of the polar directions."""
+    blocks = []
+    for i, p in enumerate(table.position):
+        if table.sigma is not None:
+            sigma, polar = table.sigma[i], table.sigma_frame == "polar"
+        elif isinstance(tracker.noise, PolarNoise):
+            noise, reach = tracker.noise, np.linalg.norm(p - tracker.position)
+            across = noise.transverse + noise.transverse_per_m * reach
+            sigma = np.array([noise.range + noise.range_per_m * reach, across, across])
+            polar = True
+        else:
+            sigma, polar = tracker.noise.sigma, False
+        axes = np.eye(3)
+        if polar:
+            ray = (p - tracker.position) / np.linalg.norm(p - tracker.position)
+            side = np.cross([0, 0, 1], ray)
+            side /= np.linalg.norm(side)
+            axes = np.array([ray, side, np.cross(ray, side)])
+        blocks.append(axes.T @ np.diag(sigma**2) @ axes)
+    return linalg.block_diag(*blocks)
+
+
+def assert_whitens(weights, covariance):
+    W = weights.whiten.toarray()
+    np.testing.assert_allclose(W @ covariance @ W.T, np.eye(len(W)), atol=1e-9)
+
+
+def with_sigma(table, frame, seed=1):
+    rng = np.random.default_rng(seed)
+    sigma = 10.0 ** rng.uniform(-6, -3, (len(table), 3))
+    return replace(table, sigma=sigma, sigma_frame=frame)
+
+
+@pytest.mark.parametrize("kind", ["position", "deflection"])
+@pytest.mark.parametrize("case", ["axis", "polar", "rows cartesian", "rows polar"])
+def test_whitens_positions_and_deflections(case, kind):
+    tracker = POLAR if "polar" in case else AXIS
+    table = some_table(states=1 if kind == "position" else 2)
+    if case.startswith("rows"):
+        table = with_sigma(table, case.split()[1])
+    seen = observe(table, kind)
+    weights = weights_for(seen, tracker)
+    assert weights.kind == case.split()[0] and weights.absolute
+    mix = np.kron(seen.combine.toarray(), np.eye(3))
+    assert_whitens(weights, mix @ reading_covariance(table, tracker) @ mix.T)
+
+
+def test_deflections_that_share_an_unloaded_reading_are_correlated():
+    """Three loads against one unloaded reading: Σ = σ² (I + 1 1ᵀ), whitened together."""
+    table = some_table(n=4, states=4)
+    seen = observe(table, "deflection")
+    weights = weights_for(seen, AXIS)
+    covariance = np.kron(np.kron(np.eye(4), np.eye(3) + np.ones((3, 3))),
+                         np.diag(AXIS.noise.sigma**2))  # fmt: skip
+    assert_whitens(weights, covariance)
+    # and not across configurations
+    W = weights.whiten.toarray().reshape(4, 9, 4, 9)
+    for c in range(4):
+        assert not W[c][:, np.arange(4) != c].any()
+
+
+def test_deflections_against_the_mean_of_unloaded_repeats():
+    """Loaded once, unloaded twice: the difference has variance σ² (1 + 1/2)."""
+    table = some_table(n=3, states=3)
+    force = table.force.copy()
+    force[:, 2] = np.tile([0.0, 0.0, -100.0], 3)
+    table = replace(table, force=force, repeat=np.tile([0, 1, 5], 3))
+    seen = observe(table, "deflection")
+    assert_whitens(weights_for(seen, AXIS), np.kron(np.eye(3), 1.5 * np.diag(AXIS.noise.sigma**2)))
+
+
+def test_whitens_poses_and_distances():
+    rng = np.random.default_rng(2)
+    table = some_table(n=5)
+    table = replace(table, rotation=rng.normal(size=(5, 3)), distance=rng.uniform(1, 2, 5))
+    tracker = replace(AXIS, rotation_sigma=2e-5, distance_sigma=4e-5)
+    block = np.diag([1e-5, 2e-5, 3e-5, 2e-5, 2e-5, 2e-5]) ** 2
+    assert_whitens(weights_for(observe(table, "pose"), tracker), np.kron(np.eye(5), block))
+    assert_whitens(weights_for(observe(table, "distance"), tracker), 16e-10 * np.eye(5))
+
+
+def test_a_given_covariance_is_whitened_and_wins():
+    seen = observe(some_table(n=4), "position")
+    A = np.random.default_rng(3).normal(size=(12, 12))
+    covariance = A @ A.T + 0.1 * np.eye(12)
+    covariance[:3, 3:] = covariance[3:, :3] = 0.0  # a group of its own
+    weights = weights_for(seen, AXIS, "auto", covariance)
+    assert weights.kind == "covariance" and weights.absolute
+    assert_whitens(weights, covariance)
+
+
+def test_component_weights():
+    table = replace(some_table(n=2), rotation=np.zeros((2, 3)))
+    weights = scaled_by_component(observe(table, "pose"), np.arange(1.0, 7.0))
+    assert not weights.absolute
+    np.testing.assert_allclose(weights.apply(np.tile(np.arange(1.0, 7.0), 2)), np.ones(12))
+
+
+@pytest.mark.parametrize(
+    ("sigma", "tracker", "kind"),
+    [
+        (True, AXIS, "rows"),
+        (True, POLAR, "rows"),
+        (True, Tracker(), "rows"),
+        (False, AXIS, "axis"),
+        (False, POLAR, "polar"),
+        (False, Tracker(), "none"),
+    ],
+)
+def test_auto_takes_the_tables_sigmas_then_the_cells_then_none(sigma, tracker, kind):
+    table = with_sigma(some_table(), "cartesian") if sigma else some_table()
+    weights = weights_for(observe(table, "position"), tracker)
+    assert weights.kind == kind
+    assert weights.absolute == (kind != "none")
+    rows = np.ones(36)
+    if kind == "none":
+        assert weights.whiten is None and weights.apply(rows) is rows
+
+
+def test_auto_for_distances_and_poses():
+    table = replace(some_table(), distance=np.ones(12), rotation=np.zeros((12, 3)))
+    distance, pose = observe(table, "distance"), observe(table, "pose")
+    assert weights_for(distance, AXIS).kind == "none"
+    assert weights_for(distance, replace(AXIS, distance_sigma=1e-4)).kind == "axis"
+    assert weights_for(pose, AXIS).kind == "none"
+    assert weights_for(pose, replace(AXIS, rotation_sigma=1e-4)).kind == "axis"
+
+
+@pytest.mark.parametrize(
+    ("kind", "tracker", "message"),
+    [
+        ("rows", AXIS, r"cannot be formed: table\.csv has no sigma_… columns"),
+        ("axis", POLAR, r"the cell has no \[tracker\] sigma_um"),
+        ("axis", Tracker(), r"the cell has no \[tracker\] sigma_um"),
+        ("polar", AXIS, r"no \[tracker\] range_um, range_ppm, transverse_um, transverse_ppm"),
+        ("covariance", AXIS, r"'covariance' need a matrix \(--covariance FILE\)"),
+    ],
+)
+def test_noise_that_is_not_stated_is_refused(kind, tracker, message):
+    with pytest.raises(InputError, match=message):
+        weights_for(observe(some_table(), "position"), tracker, kind)
+
+
+def test_distances_and_poses_need_their_own_sigma():
+    table = replace(some_table(), distance=np.ones(12), rotation=np.zeros((12, 3)))
+    with pytest.raises(InputError, match=r"distances need \[tracker\] distance_um"):
+        weights_for(observe(table, "distance"), AXIS, "axis")
+    with pytest.raises(InputError, match=r"poses need \[tracker\] rotation_urad"):
+        weights_for(observe(table, "pose"), AXIS, "axis")
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.eye(35), r"the covariance is \(35, 35\), but there are 36 rows"),
+        (np.eye(36) + np.eye(36, k=1), "must be finite and symmetric"),
+        (np.diag([np.nan, *np.ones(35)]), "must be finite and symmetric"),
+        (np.diag([-1.0, *np.ones(35)]), "not positive definite; check sigmas and covariance"),
+        (np.ones((36, 36)), "not positive definite"),
+    ],
+)
+def test_a_wrong_covariance_is_refused(matrix, message):
+    with pytest.raises(InputError, match=message):
+        weights_for(observe(some_table(), "position"), AXIS, "covariance", matrix)
+
+
+def test_a_zero_sigma_is_refused():
+    table = with_sigma(some_table(), "cartesian")
+    table.sigma[3, 1] = 0.0
+    with pytest.raises(InputError, match="not positive definite; check sigmas"):
+        weights_for(observe(table, "position"), AXIS)
+
+
+# --- what weighting gains -------------------------------------------------------------------
+
+DRAWS = 200
+
+
+def heterogeneous(chain):
+    """A rigid arm whose readings have sigmas from 5 µm to 500 µm, every axis its own."""
+    plan = table_at(random_poses(chain, 25, 4))
+    sigma = 5e-6 * 10 ** np.random.default_rng(4).uniform(0, 2, (len(plan), 3))
+    return replace(plan, sigma=sigma)
+
+
+def chi2_band(dof, level=1e-3):
+    return stats.chi2.ppf(level / 2, dof), stats.chi2.isf(level / 2, dof)
+
+
+def test_wls_has_the_variance_it_states_and_beats_ols():
+    """Linear in the parameters over these errors, so with W Σ Wᵀ = I the estimates scatter with
+    exactly (BᵀW²B)⁻¹: Σ zᵀz over 200 draws of 7 parameters is χ²(1400), each parameter's χ²(200).
+    """
+    chain = planar_chain()
+    effects = ("base_frame", "joint_offset:joint2", "joint_offset:joint3", "link_geometry:link2")
+    model = Model(chain, cell_of(effects))
+    plan, rng = heterogeneous(chain), np.random.default_rng(5)
+    truth = true_values(model, rng)
+    seen = observe(replace(plan, position=np.zeros((25, 3))), "position")
+    W = weights_for(seen, model.cell.tracker)
+    kept = [model.names.index(n) for n in (
+        "base.x", "base.y", "base.z", "joint2.offset", "joint3.offset", "link2.dx", "link2.rx"
+    )]  # fmt: skip
+    B = model.regressor(plan, truth, np.array(kept)).B
+    size = model.sizes(model.regressor(plan, truth).B)[kept]
+    Bw = W.apply(B * size)
+    stated = np.linalg.inv(Bw.T @ Bw)
+    factor = np.linalg.cholesky(stated)
+    weighted, ordinary = np.zeros((DRAWS, len(kept))), np.zeros((DRAWS, len(kept)))
+    for i in range(DRAWS):
+        table = simulate(model, plan, truth, rng)
+        y = table.position.ravel() - model.predict(plan, truth, seen)
+        weighted[i] = np.linalg.lstsq(Bw, W.apply(y), rcond=None)[0]
+        ordinary[i] = np.linalg.lstsq(B * size, y, rcond=None)[0]
+    z = linalg.solve_triangular(factor, weighted.T, lower=True)
+    low, high = chi2_band(z.size)
+    assert low < (z**2).sum() < high
+    low, high = chi2_band(DRAWS, 1e-3 / len(kept))
+    assert ((weighted**2).sum(axis=0) / np.diag(stated) > low).all()
+    assert ((weighted**2).sum(axis=0) / np.diag(stated) < high).all()
+    # Gauss–Markov: OLS is worse in every parameter; by its own covariance, at least twice here.
+    P = np.linalg.pinv(B * size)
+    ols = np.einsum("ij,j,ij->i", P, plan.sigma.ravel() ** 2, P)
+    assert (ols > 4 * np.diag(stated)).all()
+    assert ((ordinary**2).sum(axis=0) > 2 * (weighted**2).sum(axis=0)).all()
+
+
+def test_identify_states_the_covariance_that_its_estimates_have():
+    """The whole path, 25 draws of 9 parameters: dᵀ cov⁻¹ d is 9·F(9, 66), of mean 9·66/64 and
+    less than 1.3 times the standard deviation √18 of χ²(9); 4 standard errors of the mean."""
+    model = Model(planar_chain(), cell_of(("base_frame", "marker_position")))
+    plan, rng = heterogeneous(model.chain), np.random.default_rng(6)
+    truth = true_values(model, rng)
+    squared = []
+    for _ in range(25):
+        result = identify(model, simulate(model, plan, truth, rng))
+        assert result.method == "wls" and len(result.determined) == len(truth)
+        d = result.x - truth
+        squared.append(d @ np.linalg.solve(result.covariance, d))
+    p, dof = len(truth), result.dof
+    assert abs(np.mean(squared) - p * dof / (dof - 2)) < 4 * 1.3 * np.sqrt(2 * p / 25)
+
+
+def test_unit_weights_are_ols_and_worse():
+    model = Model(planar_chain(), cell_of(("base_frame", "marker_position")))
+    plan = heterogeneous(model.chain)
+    rng = np.random.default_rng(6)
+    truth = true_values(model, rng)
+    table = simulate(model, plan, truth, rng)
+    weighted, unit = identify(model, table), identify(model, table, Options(weights="none"))
+    assert unit.method == "ols" and unit.noise["kind"] == "none"
+    assert np.trace(unit.covariance) > 4 * np.trace(weighted.covariance)
+
+
+def test_weights_follow_a_subset_of_the_observations():
+    table = with_sigma(some_table(n=10, states=2), "cartesian")
+    seen = observe(table, "deflection")
+    part = subset(seen, np.arange(10) % 3 > 0)
+    mix = np.kron(part.combine.toarray(), np.eye(3))
+    assert_whitens(weights_for(part, AXIS), mix @ reading_covariance(part.table, AXIS) @ mix.T)
+
+
+def test_ratio_to_stated_noise():
+    """The stated sigma is true: s² · dof is χ²(dof)."""
+    tracker = Tracker(noise=CartesianNoise(np.array([2e-5, 2e-5, 5e-5])))
+    model = Model(planar_chain(), cell_of(("base_frame", "marker_position"), tracker=tracker))
+    rng = np.random.default_rng(7)
+    truth = true_values(model, rng)
+    plan = table_at(random_poses(model.chain, 30, 7))
+    result = identify(model, simulate(model, plan, truth, rng))
+    low, high = chi2_band(result.dof)
+    assert low < result.noise["ratio_to_stated"] ** 2 * result.dof < high
+    assert result.noise["sigma_um"] is None
+    unit = identify(model, measured(model, plan, truth, 5e-5, rng), Options(weights="none"))
+    assert unit.noise["ratio_to_stated"] is None
+    low, high = chi2_band(unit.dof)
+    assert low < (unit.noise["sigma_um"] / 50) ** 2 * unit.dof < high

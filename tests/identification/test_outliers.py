@@ -1,0 +1,257 @@
+"""Faulty readings: none invented, the gross ones found, nothing dropped in silence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from support.calibration import (
+    GEOMETRY,
+    PLACED,
+    cell_of,
+    measured,
+    planar_chain,
+    random_chain,
+    table_at,
+    true_values,
+    with_values,
+)
+from support.cells import random_poses
+
+from elastocal.identification.identify import Options, identify
+from elastocal.identification.outliers import FALSE_ALARM, blocks
+from elastocal.identification.trimmed import least_trimmed_squares, majority, median_scale
+from elastocal.manipulator.model import Model
+
+SIGMA = 5e-5
+
+
+def clean_table(model, seed, poses):
+    rng = np.random.default_rng(seed)
+    truth = true_values(model, rng)
+    plan = table_at(random_poses(model.chain, poses, seed))
+    return measured(model, plan, truth, SIGMA, rng), truth, rng
+
+
+def with_gross_errors(table, rng, share, low=1e-3, high=0.1):
+    """Every component of a share of the readings is off by `low` to `high` (m)."""
+    n = len(table)
+    bad = np.sort(rng.permutation(n)[: round(share * n)])
+    position = table.position.copy()
+    size = rng.uniform(low, high, (len(bad), 3))
+    position[bad] += rng.choice([-1.0, 1.0], (len(bad), 3)) * size
+    return replace(table, position=position), bad
+
+
+def rows_of(outliers):
+    return np.sort(np.array([o.line - 2 for o in outliers], dtype=int))
+
+
+# --- false alarms ---------------------------------------------------------------------------
+
+
+def false_alarms(model, tables, poses):
+    return sum(
+        bool(identify(model, clean_table(model, seed, poses)[0]).outliers)
+        for seed in range(tables)
+    )
+
+
+def test_clean_tables_hardly_ever_raise_an_alarm():
+    """At a rate of 1 % more than 6 alarms in 100 tables have a probability below 1e-4."""
+    limit = stats.binom.isf(1e-4, 100, FALSE_ALARM)
+    model = Model(planar_chain(), cell_of(("base_frame",)))
+    assert false_alarms(model, 100, 15) <= limit
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("effects", [PLACED, GEOMETRY], ids="+".join)
+def test_clean_tables_hardly_ever_raise_an_alarm_however_many_parameters(effects):
+    limit = stats.binom.isf(1e-4, 200, FALSE_ALARM)
+    assert false_alarms(Model(random_chain(1, 4), cell_of(effects)), 200, 25) <= limit
+
+
+# --- gross errors ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_tenth_of_gross_errors_is_found_and_little_else(seed):
+    """20 σ and more are far beyond any limit.  A good reading is accused in one table of a
+    hundred, so not one of 4 · 54 with a probability of 96 %; one per table is allowed."""
+    model = Model(planar_chain(), cell_of(GEOMETRY))
+    table, _, rng = clean_table(model, seed, 60)
+    wrong, bad = with_gross_errors(table, rng, 0.1)
+    found = rows_of(identify(model, wrong).outliers)
+    assert set(bad) <= set(found)
+    assert len(found) <= len(bad) + 1
+
+
+def test_errors_among_several_load_states_and_markers():
+    markers = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}
+    model = Model(planar_chain(), cell_of(PLACED, markers))
+    rng = np.random.default_rng(3)
+    truth = true_values(model, rng)
+    plan = table_at(random_poses(model.chain, 15, 3), markers=("M1", "M2"))
+    table, bad = with_gross_errors(measured(model, plan, truth, SIGMA, rng), rng, 0.1)
+    result = identify(model, table)
+    assert np.array_equal(rows_of(result.outliers), bad)
+    for o in result.outliers:
+        i = o.line - 2
+        assert o.marker == ("M1", "M2")[table.marker[i]]
+        assert o.configuration == str(table.configuration[i] + 1)
+
+
+def test_error_and_ratio_of_a_faulty_reading():
+    """8 mm on one reading: so it is reported, in m and in multiples of the noise (√3 per σ)."""
+    model = Model(planar_chain(), cell_of(PLACED))
+    table, truth, _ = clean_table(model, 5, 30)
+    table.position[11] += [0.0, 8e-3, 0.0]
+    (outlier,) = identify(model, table).outliers
+    assert outlier.line == 13
+    assert outlier.residual == pytest.approx(8e-3, abs=5 * SIGMA)
+    # scale from a median over 29 readings of 3 components: within a third
+    assert outlier.ratio == pytest.approx(8e-3 / SIGMA, rel=0.34)
+
+
+def distance_block(seed, share, shift):
+    model = Model(
+        planar_chain(4), cell_of(("distance_sensor", "marker_position"), observe="distance")
+    )
+    rng = np.random.default_rng(seed)
+    truth = with_values(model, {
+        "tracker.anchor_x": 1.6, "tracker.anchor_y": -1.2, "tracker.anchor_z": 0.3,
+        "tracker.length_offset": 0.1, "marker:M1.x": 0.05, "marker:M1.z": 0.1,
+    })  # fmt: skip
+    table = measured(model, table_at(random_poses(model.chain, 120, seed)), truth, 2e-4, rng)
+    start = int(rng.integers(0, round(120 * (1 - share))))
+    block = np.arange(start, start + round(120 * share))
+    distance = table.distance.copy()
+    distance[block] += shift
+    return model, replace(table, distance=distance), block, truth
+
+
+@pytest.mark.parametrize(
+    ("seed", "shift"),
+    [(0, 0.03), *(pytest.param(s, d, marks=pytest.mark.long) for s in (1, 2) for d in (-0.1, 0.02))],
+)
+def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
+    """The cable slipped for 48 of 120 rows, by 100 σ and more: all of them, at most one other."""
+    model, table, block, truth = distance_block(seed, 0.4, shift)
+    result = identify(model, table, Options(drop_outliers=True))
+    found = rows_of(result.excluded)
+    assert set(block) <= set(found) and len(found) <= len(block) + 1
+    assert blocks([o.line for o in result.excluded])[0] == (block[0] + 2, block[-1] + 2)
+    offset = result.estimate("tracker.length_offset").held
+    assert abs(offset - truth[model.names.index("tracker.length_offset")]) < abs(shift) / 4
+
+
+# --- leaving them out -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_dropping_equals_never_having_had_them(seed):
+    model = Model(planar_chain(), cell_of(PLACED))
+    table, _, rng = clean_table(model, seed, 40)
+    wrong, bad = with_gross_errors(table, rng, 0.15)
+    dropped = identify(model, wrong, Options(drop_outliers=True))
+    good = np.setdiff1d(np.arange(40), bad)
+    never = identify(model, table.take(good))
+    assert np.array_equal(rows_of(dropped.excluded), bad)
+    assert dropped.determined == never.determined and dropped.dof == never.dof
+    std = np.sqrt(np.diag(never.covariance))
+    assert (np.abs(dropped.x - never.x) < 1e-3 * std).all()
+    np.testing.assert_allclose(dropped.covariance, never.covariance, rtol=1e-4,
+                               atol=1e-6 * np.outer(std, std).max())  # fmt: skip
+    assert dropped.heldout_rms == pytest.approx(never.heldout_rms, rel=1e-4)
+
+
+def test_nothing_is_left_out_in_silence():
+    model = Model(planar_chain(), cell_of(PLACED))
+    table, _, rng = clean_table(model, 7, 40)
+    wrong, bad = with_gross_errors(table, rng, 0.05)
+    kept = identify(model, wrong)
+    assert np.array_equal(rows_of(kept.outliers), bad) and kept.excluded == ()
+    assert len(kept.residual) == 120 and len(kept.residual_table()) == 40
+    assert any(w.startswith("2 readings lie beyond what the noise explains") for w in kept.warnings)
+    assert any("--drop-outliers leaves them out and says so" in w for w in kept.warnings)
+    dropped = identify(model, wrong, Options(drop_outliers=True))
+    assert np.array_equal(rows_of(dropped.excluded), bad) and dropped.outliers == ()
+    assert len(dropped.residual) == 114
+    assert not {row["line"] - 2 for row in dropped.residual_table()} & set(bad)
+    assert any(w.startswith("2 readings were left out as faulty") for w in dropped.warnings)
+    listed = dropped.to_json()["excluded"]
+    assert [o["line"] - 2 for o in listed] == list(bad)
+    assert all(o["residual"] > 1e-3 and o["ratio"] > 10 for o in listed)
+
+
+def test_a_clean_table_is_used_whole_with_and_without_dropping():
+    model = Model(planar_chain(), cell_of(PLACED))
+    table, _, _ = clean_table(model, 8, 30)
+    a, b = identify(model, table), identify(model, table, Options(drop_outliers=True))
+    assert a.excluded == b.excluded == a.outliers == b.outliers == ()
+    assert a.dof == b.dof
+    np.testing.assert_allclose(a.x, b.x, rtol=1e-9, atol=1e-12)
+
+
+def test_stated_sigmas_count():
+    """A reading of sigma 2 mm that is off by 3 mm is no outlier; one of sigma 20 µm off by 1 mm
+    is."""
+    model = Model(planar_chain(), cell_of(PLACED))
+    rng = np.random.default_rng(9)
+    truth = true_values(model, rng)
+    plan = table_at(random_poses(model.chain, 30, 9))
+    sigma = np.full((30, 3), 2e-5)
+    sigma[:10] = 2e-3
+    exact = measured(model, plan, truth, 0.0, rng)
+    position = exact.position + sigma * rng.normal(size=(30, 3))
+    position[3] = exact.position[3] + [3e-3, 0, 0]
+    position[20] = exact.position[20] + [1e-3, 0, 0]
+    result = identify(model, replace(plan, sigma=sigma, position=position))
+    assert rows_of(result.outliers).tolist() == [20]
+
+
+def test_outliers_are_found_under_a_given_covariance_too():
+    model = Model(planar_chain(), cell_of(PLACED))
+    table, _, _ = clean_table(model, 10, 30)
+    table.position[4] += 0.02
+    options = Options(weights="covariance", covariance=SIGMA**2 * np.eye(90))
+    assert rows_of(identify(model, table, options).outliers).tolist() == [4]
+
+
+# --- the trimmed fit ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_least_trimmed_squares_ignores_almost_half(seed, size):
+    """45 % of the observations agree on another answer; the majority's is exact and found."""
+    rng = np.random.default_rng(seed)
+    n, p = 60, 4
+    B = rng.normal(size=(n * size, p))
+    truth, other = rng.normal(size=p), rng.normal(size=p) + 5
+    e = B @ truth
+    bad = np.repeat(np.arange(n) < 0.45 * n, size)
+    e[bad] = (B @ other)[bad]
+    np.testing.assert_allclose(least_trimmed_squares(B, e, size, seed), truth, atol=1e-9)
+
+
+def test_majority_leaves_one_in_a_hundred_clean_observations_out():
+    """Reweighted at the 99 % limit over 2000 observations: 1 % ± 4 standard deviations."""
+    rng = np.random.default_rng(0)
+    good = majority(rng.normal(size=(6000, 3)), rng.normal(size=6000), 3)
+    assert abs((~good).mean() - 0.01) < 4 * np.sqrt(0.01 * 0.99 / 2000)
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_median_scale_is_consistent(size):
+    """20 000 observations; the median's relative standard error is below 2/√n."""
+    squared = 4.0 * np.random.default_rng(size).chisquare(size, 20_000)
+    assert median_scale(squared, size) == pytest.approx(2.0, rel=4 * 2 / np.sqrt(20_000))
+
+
+def test_blocks_of_lines():
+    assert blocks([]) == []
+    assert blocks([7]) == [(7, 7)]
+    assert blocks([9, 2, 3, 4, 20, 23]) == [(2, 4), (9, 9), (20, 23)]
+    assert blocks([2, 6], gap=3) == [(2, 2), (6, 6)]
+    assert blocks([2, 5, 8], gap=3) == [(2, 8)]

@@ -1,0 +1,256 @@
+"""Synthetic measurements: the model's own readings, noise of the stated size, a seed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+from support.calibration import GEOMETRY, cell_of, planar_chain, table_at, true_values, with_values
+from support.cells import COMPLIANCE, kr270_chain, random_poses
+
+from elastocal.cell import CartesianNoise, Nominal, PolarNoise, Tracker
+from elastocal.errors import InputError
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import observe
+from elastocal.simulation.simulate import draw_errors, expand_plan, simulate, values_from
+from elastocal.tracker_noise import position_covariance
+
+AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 5e-5])))
+POLAR = Tracker(np.array([3.0, 0.5, 1.0]), PolarNoise(2e-6, 5e-6, 1e-5, 3e-5))
+
+
+def model_with(tracker=None, effects=GEOMETRY, **cell):
+    return Model(planar_chain(), cell_of(effects, tracker=tracker, **cell))
+
+
+def plan_of(model, n=20, forces=((0, 0, 0),), markers=("M1",)):
+    return table_at(random_poses(model.chain, n, 1), forces, markers)
+
+
+def chi2_band(dof, level=1e-3):
+    return stats.chi2.ppf(level / 2, dof), stats.chi2.isf(level / 2, dof)
+
+
+# --- readings -------------------------------------------------------------------------------
+
+
+def test_without_noise_the_readings_are_the_models_prediction():
+    model = model_with()
+    plan, truth = plan_of(model), true_values(model_with(), np.random.default_rng(0))
+    table = simulate(model, plan, truth, 0, noise=False)
+    np.testing.assert_allclose(table.position.ravel(), model.predict(plan, truth), atol=1e-14)
+    # a cell that states no noise makes exact readings, too
+    assert np.array_equal(simulate(model, plan, truth, 0).position, table.position)
+    exact = simulate(model_with(AXIS), plan, truth, 0, noise=False)
+    assert np.array_equal(exact.position, table.position)
+
+
+def test_the_plan_is_kept_and_not_changed():
+    model = model_with(AXIS)
+    plan = plan_of(model)
+    before = plan.position.copy()
+    table = simulate(model, plan, model.nominal, 1)
+    assert np.array_equal(plan.position, before)
+    for name in ("q", "row", "configuration", "force", "marker", "repeat"):
+        assert np.array_equal(getattr(table, name), getattr(plan, name))
+    assert table.configuration_labels == plan.configuration_labels
+
+
+def test_the_same_seed_gives_the_same_readings():
+    model = model_with(AXIS)
+    plan = plan_of(model)
+    a, b, c = (simulate(model, plan, model.nominal, s) for s in (5, 5, 6))
+    assert np.array_equal(a.position, b.position)
+    assert not np.array_equal(a.position, c.position)
+    generator = simulate(model, plan, model.nominal, np.random.default_rng(5))
+    assert np.array_equal(a.position, generator.position)
+    # one generator goes on
+    rng = np.random.default_rng(5)
+    first, second = (simulate(model, plan, model.nominal, rng).position for _ in range(2))
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("tracker", [AXIS, POLAR], ids=["axis", "polar"])
+@pytest.mark.parametrize("rows", [None, "cartesian", "polar"])
+def test_noise_has_the_stated_covariance(tracker, rows):
+    """Whitened by the stated covariance, 900 errors are χ²(900), each component's 300 χ²(300)."""
+    model = model_with(tracker)
+    plan = plan_of(model, 300)
+    if rows:
+        sigma = 10.0 ** np.random.default_rng(2).uniform(-6, -4, (300, 3))
+        plan = replace(plan, sigma=sigma, sigma_frame=rows)
+    exact = simulate(model, plan, model.nominal, 0, noise=False)
+    noisy = simulate(model, plan, model.nominal, 3)
+    kind = "rows" if rows else ("axis" if tracker is AXIS else "polar")
+    covariance, _ = position_covariance(exact, tracker, kind)
+    error = noisy.position - exact.position
+    z = np.linalg.solve(np.linalg.cholesky(covariance), error[..., None])[..., 0]
+    low, high = chi2_band(900)
+    assert low < (z**2).sum() < high
+    low, high = chi2_band(300, 1e-3 / 3)
+    assert ((z**2).sum(axis=0) > low).all() and ((z**2).sum(axis=0) < high).all()
+    assert abs(z.mean()) < 4 / np.sqrt(900)
+
+
+def test_distances():
+    tracker = Tracker(anchor=np.array([1.0, -1.0, 0.2]), distance_sigma=3e-4)
+    effects = ("distance_sensor", "marker_position")
+    model = model_with(tracker, effects, observe="distance")
+    truth = with_values(model, {"tracker.length_offset": 0.1, "marker:M1.x": 0.05})
+    plan = replace(plan_of(model, 200), position=None)
+    exact = simulate(model, plan, truth, 0, noise=False)
+    marker = model_with(None, ("marker_position",))
+    at = marker.predict(plan_of(marker, 200), with_values(marker, {"marker:M1.x": 0.05}))
+    length = np.linalg.norm(at.reshape(-1, 3) - tracker.anchor, axis=1) + 0.1
+    np.testing.assert_allclose(exact.distance, length, atol=1e-12)
+    low, high = chi2_band(200)
+    error = simulate(model, plan, truth, 1).distance - exact.distance
+    assert low < ((error / 3e-4) ** 2).sum() < high
+
+
+def pose_case():
+    tracker = replace(AXIS, rotation_sigma=2e-4)
+    effects = ("base_frame", "marker_position", "marker_orientation")
+    model = model_with(tracker, effects, observe="pose")
+    truth = true_values(model, np.random.default_rng(4))
+    truth[model.names.index("marker:M1.rx")] = 0.7
+    return model, truth
+
+
+def test_poses():
+    model, truth = pose_case()
+    plan = plan_of(model, 100)
+    plan = replace(plan, rotation=np.zeros((100, 3)))
+    exact, noisy = (simulate(model, plan, truth, 2, noise=n) for n in (False, True))
+    # observed relative to its own rotation, the model's prediction is the position and no turn
+    at = model.predict(exact, truth).reshape(-1, 6)
+    np.testing.assert_allclose(at[:, :3], exact.position, atol=1e-12)
+    np.testing.assert_allclose(at[:, 3:], 0.0, atol=1e-9)
+    turn = Rotation.from_rotvec(exact.rotation).inv() * Rotation.from_rotvec(noisy.rotation)
+    low, high = chi2_band(300)
+    assert low < (turn.as_rotvec() ** 2).sum() / 2e-4**2 < high
+    assert low < (((noisy.position - exact.position) / AXIS.noise.sigma) ** 2).sum() < high
+
+
+@pytest.mark.xfail(strict=True, reason="simulate asks a plan for the rotations it is to make")
+def test_poses_from_a_plan_without_rotations():
+    model, truth = pose_case()
+    plan = replace(plan_of(model), position=None)
+    assert simulate(model, plan, truth, 0).rotation.shape == (20, 3)
+
+
+def test_deflections_are_loaded_minus_unloaded_readings():
+    nominal = Nominal(joint_compliance=COMPLIANCE)
+    cell = cell_of(("joint_compliance",), observe="deflection", nominal=nominal)
+    model = Model(kr270_chain(), cell)
+    plan = table_at(random_poses(model.chain, 10, 3), [[0, 0, 0], [500, 0, -2600]])
+    table = simulate(model, plan, model.nominal, 0)
+    seen = observe(table, "deflection")
+    difference = table.position[1::2] - table.position[::2]
+    np.testing.assert_allclose(seen.value, difference.ravel(), atol=1e-15)
+    np.testing.assert_allclose(seen.value, model.predict(plan, model.nominal), atol=1e-13)
+    assert 1e-4 < np.linalg.norm(difference, axis=1).max() < 5e-2
+
+
+# --- values ---------------------------------------------------------------------------------
+
+
+def test_chosen_values_replace_nominal_ones():
+    model = model_with()
+    x = values_from(model, {"link2.dx": 1e-3, "base.x": 2.0})
+    changed = dict(zip(model.names, x - model.nominal, strict=True))
+    assert {k: v for k, v in changed.items() if v} == {"link2.dx": 1e-3, "base.x": 2.0}
+    assert np.array_equal(values_from(model, {}), model.nominal)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ({"link2.dxx": 1.0}, r"no parameter 'link2\.dxx' \(did you mean 'link2\.dx'\?\)"),
+        ({"joint2.ofset": 1.0}, r"no parameter 'joint2\.ofset' \(did you mean 'joint2\.offset'"),
+        ({"zzzzzzzzz": 1.0}, r"no parameter 'zzzzzzzzz'; it has: base\.x, base\.y, .*marker:M1\.z"),
+        ({"base.x": float("nan")}, r"'base\.x' must be a finite number, found nan"),
+        ({"base.x": float("inf")}, r"'base\.x' must be a finite number, found inf"),
+    ],
+)
+def test_wrong_values_are_refused(chosen, message):
+    with pytest.raises(InputError, match=message):
+        values_from(model_with(), chosen)
+
+
+def test_drawn_errors_have_the_typical_sizes():
+    nominal = Nominal(joint_compliance=(1e-6, 2e-6, 3e-6))
+    model = model_with(effects=(*GEOMETRY, "joint_compliance"), nominal=nominal)
+    rng = np.random.default_rng(0)
+    draws = [draw_errors(model, 2.0, rng) for _ in range(300)]
+    assert list(draws[0]) == list(model.names)
+    low, high = chi2_band(300, 1e-3 / len(model.names))
+    for p in model.parameters:
+        size = 0.2 * p.nominal if p.effect == "joint_compliance" else p.typical
+        z = np.array([d[p.name] - p.nominal for d in draws]) / (2.0 * size)
+        assert low < (z**2).sum() < high, p.name
+    again = draw_errors(model, 2.0, np.random.default_rng(0))
+    assert again == draws[0]
+    assert draw_errors(model, 0.0, rng) == dict(zip(model.names, model.nominal, strict=True))
+
+
+# --- plans ----------------------------------------------------------------------------------
+
+
+def test_expand_plan_orders_rows_as_one_would_measure():
+    plan = table_at(np.arange(6.0).reshape(2, 3))
+    rows = expand_plan(plan, ("A", "B"), repeats=2, load=np.array([0.0, 0.0, -100.0]))
+    assert len(rows) == 2 * 2 * 2 * 2
+    labels = list(
+        zip(rows.configuration, rows.repeat, rows.force[:, 2], rows.marker, strict=True)
+    )
+    expected = [
+        (c, r, f, m) for c in (0, 1) for r in (0, 1) for f in (0.0, -100.0) for m in (0, 1)
+    ]
+    assert labels == expected
+    assert rows.marker_names == ("A", "B")
+    assert np.array_equal(rows.row, np.arange(16) + 2)
+    assert np.array_equal(rows.q, plan.q[rows.configuration])
+    assert np.array_equal(plan.force, np.zeros((2, 3)))  # the plan itself is left alone
+
+
+def test_expand_plan_without_load_keeps_the_plans_forces_and_repeats():
+    plan = table_at(np.zeros((2, 3)), [[0, 0, 0], [0, 0, -50.0]])
+    rows = expand_plan(plan, ("M1",))
+    assert np.array_equal(rows.force, plan.force)
+    repeated = replace(plan, repeat=np.array([0, 0, 1, 1]))
+    rows = expand_plan(repeated, ("M1",), repeats=3)
+    # every repeat of the plan becomes three of its own
+    assert rows.repeat.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]
+
+
+def test_a_load_on_top_of_the_plans_own_forces_is_refused():
+    plan = table_at(np.zeros((2, 3)), [[0, 0, -50.0]])
+    with pytest.raises(InputError, match=r"table\.csv: the plan has forces of its own"):
+        expand_plan(plan, ("M1",), load=np.array([0.0, 0.0, -100.0]))
+
+
+def test_an_arm_that_buckles_is_refused_with_its_line():
+    nominal = Nominal(joint_compliance=(1e-3,) * 6)
+    model = Model(kr270_chain(), cell_of(("joint_compliance",), nominal=nominal))
+    plan = table_at(random_poses(model.chain, 8, 0), [[0, 0, 0], [0, 0, -20000.0]])
+    with pytest.raises(InputError, match=r"table\.csv, line \d+: no static equilibrium under this"):
+        simulate(model, plan, model.nominal, 0)
+
+
+@pytest.mark.xfail(strict=True, reason="simulate returns NaN distances without a word")
+def test_distances_without_equilibrium_are_refused_with_their_line():
+    nominal = Nominal(joint_compliance=(1e-3,) * 6)
+    cell = cell_of(("joint_compliance",), observe="distance", nominal=nominal)
+    model = Model(kr270_chain(), cell)
+    plan = table_at(random_poses(model.chain, 8, 0), [[0, 0, 0], [0, 0, -20000.0]])
+    with pytest.raises(Exception, match=r"table\.csv, line \d+: no static equilibrium") as caught:
+        simulate(model, plan, model.nominal, 0)
+    assert caught.value.exit_code == 2
+
+
+def test_an_unknown_marker_is_refused():
+    model = model_with(effects=("marker_position",), markers={"A": np.zeros(3), "B": np.ones(3)})
+    with pytest.raises(InputError, match=r"marker 'C' is not one of the cell's markers: A, B"):
+        simulate(model, plan_of(model, 3, markers=("A", "C")), model.nominal, 0)

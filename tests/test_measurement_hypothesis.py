@@ -1,0 +1,179 @@
+"""Properties of the measurement table that hold for any content."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from elastocal.errors import InputError
+from elastocal.labels import is_label
+from elastocal.measurement_columns import families
+from elastocal.measurement_reader import read_measurements
+from elastocal.measurement_writer import write_measurements
+from elastocal.measurements import Measurements
+
+SETTINGS = settings(
+    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+KINDS = ("revolute", "revolute")
+HEADER = "q1_rad,q2_rad,x_m,y_m,z_m\n"
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+POSITIVE = st.floats(min_value=1e-300, max_value=1e300)
+LABEL = st.text(max_size=8).filter(is_label)
+COLUMNS = [c for f in families(KINDS).values() for stem in f.units for c in f.columns(stem)]
+
+
+def read_or_refuse(path: Path, data: bytes) -> Measurements | None:
+    path.write_bytes(data)
+    try:
+        return read_measurements(path, joint_kinds=KINDS)
+    except InputError as error:
+        assert path.name in str(error)
+        return None
+
+
+def check_valid(table: Measurements) -> None:
+    assert table.q.shape == (len(table), 2)
+    for values in (table.q, table.position, table.force):
+        assert np.isfinite(values).all()
+    assert len(table.row) and (np.diff(table.row) > 0).all()
+    assert table.configuration.max() < len(table.configuration_labels)
+    assert table.marker.max() < len(table.marker_names)
+
+
+@SETTINGS
+@given(st.binary(max_size=300), st.sampled_from([b"", HEADER.encode(), b"\xef\xbb\xbfq1_rad;"]))
+def test_bytes_give_a_valid_table_or_an_input_error(tmp_path, data, start):
+    table = read_or_refuse(tmp_path / "data.csv", start + data)
+    if table is not None:
+        check_valid(table)
+
+
+CELL = st.one_of(
+    FINITE.map(repr),
+    st.integers(-(10**25), 10**25).map(str),
+    st.sampled_from(["", " ", "nan", "inf", "1e999", "True", "1,5", '"1', '"2"', "0x1", "1_0", "-"]),
+    st.text(max_size=3),
+)
+
+
+@SETTINGS
+@given(
+    st.lists(st.lists(CELL, min_size=5, max_size=5), min_size=1, max_size=4),
+    st.sampled_from(",;\t"),
+    st.sampled_from(["\n", "\r\n"]),
+)
+def test_cells_give_a_valid_table_or_an_input_error(tmp_path, rows, delimiter, end):
+    lines = [HEADER.strip().replace(",", delimiter), *(delimiter.join(row) for row in rows)]
+    table = read_or_refuse(tmp_path / "data.csv", end.join(lines).encode("utf-8", "replace"))
+    if table is not None:
+        check_valid(table)
+
+
+@SETTINGS
+@given(st.lists(st.sampled_from(COLUMNS) | st.text(max_size=4), max_size=12), st.data())
+def test_headers_give_a_valid_table_or_an_input_error(tmp_path, extra, data):
+    names = data.draw(st.permutations(HEADER.strip().split(",") + extra))
+    row = data.draw(st.lists(CELL, min_size=len(names), max_size=len(names)))
+    text = ",".join(names) + "\n" + ",".join(row) + "\n"
+    table = read_or_refuse(tmp_path / "data.csv", text.encode("utf-8", "replace"))
+    if table is not None:
+        check_valid(table)
+
+
+DIGITS = st.text("0123456789", min_size=1, max_size=30)
+NUMBER = st.builds(
+    lambda sign, whole, rest, exponent: f"{sign}{whole}{rest}{exponent}",
+    st.sampled_from(["", "+", "-"]),
+    DIGITS,
+    st.just("") | DIGITS.map(".{}".format) | st.just("."),
+    st.just("") | st.integers(-320, 270).map("e{}".format) | st.integers(0, 9).map("E+0{}".format),
+)
+
+
+@SETTINGS
+@given(st.lists(NUMBER, min_size=5, max_size=5), st.sampled_from([".", ","]))
+def test_every_decimal_number_is_read_to_the_nearest_float(tmp_path, numbers, mark):
+    expected = [float(text) for text in numbers]
+    assert all(map(math.isfinite, expected))
+    text = HEADER.replace(",", ";") + ";".join(numbers).replace(".", mark)
+    table = read_or_refuse(tmp_path / "data.csv", text.encode())
+    assert table is not None
+    assert [*table.q[0], *table.position[0]] == expected
+
+
+@SETTINGS
+@given(FINITE, st.sampled_from(["mm", "m", "um"]), st.sampled_from(["deg", "rad"]))
+def test_units_scale_and_nothing_else(tmp_path, value, length, angle):
+    text = f"q1_{angle},q2_{angle},x_{length},y_{length},z_{length}\n" + ",".join([repr(value)] * 5)
+    table = read_or_refuse(tmp_path / "data.csv", text.encode())
+    assert table is not None
+    factor = {"mm": 1e-3, "m": 1.0, "um": 1e-6}[length]
+    assert table.position[0, 0] == pytest.approx(value * factor, rel=1e-15, abs=5e-324)
+    turn = {"deg": math.pi / 180, "rad": 1.0}[angle]
+    assert table.q[0, 0] == pytest.approx(value * turn, rel=1e-15, abs=5e-324)
+
+
+@st.composite
+def tables(draw):
+    """Any table that can exist, with labels in order of first appearance."""
+    n, joints = draw(st.integers(1, 5)), draw(st.integers(0, 3))
+
+    def block(columns, elements=FINITE):
+        shape = n if columns is None else (n, columns)
+        return draw(arrays(np.float64, shape, elements=elements))
+
+    def maybe(columns, elements=FINITE):
+        return block(columns, elements) if draw(st.booleans()) else None
+
+    configurations = tuple(draw(st.lists(LABEL, min_size=n, max_size=n, unique=True)))
+    markers = tuple(draw(st.lists(LABEL, min_size=1, max_size=3, unique=True)))
+    return Measurements(
+        source="",
+        row=np.arange(2, n + 2),
+        q=block(joints),
+        configuration=np.arange(n),
+        configuration_labels=configurations,
+        repeat=draw(arrays(np.int64, n, elements=st.integers(-(2**53), 2**53))),
+        marker=draw(arrays(np.int64, n, elements=st.integers(0, len(markers) - 1))),
+        marker_names=markers,
+        force=block(3),
+        position=block(3),
+        rotation=maybe(3),
+        distance=maybe(None, POSITIVE),
+        torque=maybe(joints) if joints else None,
+        sigma=(sigma := maybe(3, POSITIVE)),
+        sigma_frame=draw(st.sampled_from(["cartesian", "polar"])) if sigma is not None
+        else "cartesian",
+        time=maybe(None),
+        approach=maybe(joints, st.sampled_from([-1.0, 0.0, 1.0])) if joints else None,
+        temperature=maybe(None),
+    )  # fmt: skip
+
+
+@SETTINGS
+@given(tables(), st.data())
+def test_what_is_written_reads_back_bit_for_bit(tmp_path, table, data):
+    joints = table.q.shape[1]
+    kinds = tuple(
+        data.draw(
+            st.lists(
+                st.sampled_from(["revolute", "prismatic"]), min_size=joints, max_size=joints
+            )
+        )
+    )
+    path = tmp_path / "data.csv"
+    write_measurements(table, path, joint_kinds=kinds)
+    again = read_measurements(path, joint_kinds=kinds, marker_names=table.marker_names)
+    for name in vars(table):
+        before, after = getattr(table, name), getattr(again, name)
+        if isinstance(before, np.ndarray):
+            assert before.tobytes() == after.tobytes(), name
+        elif name != "source":
+            assert before == after, name

@@ -1,0 +1,496 @@
+"""The measurement table: what it says arrives in SI units, and what is wrong with it is told."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+import pytest
+
+from elastocal.errors import InputError
+from elastocal.measurement_reader import read_measurements
+from elastocal.measurement_writer import write_measurements
+
+HEADER = "q1_deg,q2_deg,x_mm,y_mm,z_mm"
+ROW = "1,2,3,4,5"
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text, joint_kinds=("revolute", "revolute"), **options):
+        data = text if isinstance(text, bytes) else text.encode()
+        (tmp_path / "data.csv").write_bytes(data)
+        return read_measurements(tmp_path / "data.csv", joint_kinds=joint_kinds, **options)
+
+    return read
+
+
+@pytest.fixture
+def refusal(read):
+    """The message with which a table is refused; it must name the file."""
+
+    def refusal(text, **options):
+        with pytest.raises(InputError) as caught:
+            read(text, **options)
+        message = str(caught.value)
+        assert "data.csv" in message
+        assert "\n" not in message
+        assert len(message) < 700
+        return message
+
+    return refusal
+
+
+def table(*rows, header=HEADER):
+    return "\n".join([header, *rows]) + "\n"
+
+
+def extended(columns, values):
+    """The smallest table with further columns."""
+    return table(f"{ROW},{values}", header=f"{HEADER},{columns}")
+
+
+# --- what is read ---
+
+
+def test_the_smallest_table_has_defaults_for_all_the_rest(read):
+    got = read(table(ROW, "6,7,8,9,10"))
+    assert len(got) == 2
+    assert got.row.tolist() == [2, 3]
+    assert np.allclose(got.q, np.radians([[1, 2], [6, 7]]), rtol=1e-15)
+    assert got.position.tolist() == [[0.003, 0.004, 0.005], [0.008, 0.009, 0.01]]
+    assert got.configuration.tolist() == [0, 1]
+    assert got.repeat.tolist() == [0, 0]
+    assert (got.marker.tolist(), got.marker_names) == ([0, 0], ("M1",))
+    assert (got.force == 0).all()
+    for absent in (got.rotation, got.distance, got.torque, got.sigma, got.time, got.approach):
+        assert absent is None
+
+
+def test_every_column_arrives_in_si_units(read):
+    columns = {
+        "configuration": "home", "repeat": "3", "marker": "ball",
+        "q1_rad": "0.5", "q2_mm": "250",
+        "x_um": "1e6", "y_um": "2", "z_um": "3",
+        "force_x_N": "1", "force_y_N": "2", "force_z_N": "-3",
+        "rx_deg": "0", "ry_deg": "0", "rz_deg": "90",
+        "distance_mm": "750", "torque_1_Nm": "7", "torque_2_N": "8",
+        "sigma_range_um": "10", "sigma_azimuth_um": "20", "sigma_elevation_um": "30",
+        "time_min": "1.5", "approach_1": "1", "approach_2": "-1", "temperature_C": "21.5",
+    }  # fmt: skip
+    got = read(
+        table(",".join(columns.values()), header=",".join(columns)), ("revolute", "prismatic")
+    )
+    assert got.q.tolist() == [[0.5, 0.25]]
+    assert got.position.tolist() == [[1.0, 2e-6, 3e-6]]
+    assert got.force.tolist() == [[1.0, 2.0, -3.0]]
+    assert np.allclose(got.rotation, [[0, 0, np.pi / 2]])
+    assert got.distance.tolist() == [0.75]
+    assert got.torque.tolist() == [[7.0, 8.0]]
+    assert (got.sigma.tolist(), got.sigma_frame) == ([[1e-5, 2e-5, 3e-5]], "polar")
+    assert got.time.tolist() == [90.0]
+    assert got.approach.tolist() == [[1.0, -1.0]]
+    assert got.temperature.tolist() == [21.5]
+    assert (got.configuration_labels, got.marker_names) == (("home",), ("ball",))
+    assert got.repeat.tolist() == [3]
+
+
+@pytest.mark.parametrize("unit", ["um", "mm", "m"])
+def test_cartesian_sigmas_in_any_length_unit(read, unit):
+    names = ",".join(f"sigma_{axis}_{unit}" for axis in "xyz")
+    got = read(extended(names, "1,2,3"))
+    assert got.sigma_frame == "cartesian"
+    assert np.allclose(got.sigma, np.array([[1, 2, 3]]) * {"um": 1e-6, "mm": 1e-3, "m": 1}[unit])
+
+
+def test_labels_are_text_coded_in_order_of_first_appearance(read):
+    rows = ["b,1," + ROW, "a,01," + ROW, "b,01," + ROW]
+    got = read(table(*rows, header="configuration,marker," + HEADER))
+    assert got.configuration.tolist() == [0, 1, 0]
+    assert got.configuration_labels == ("b", "a")
+    assert got.marker.tolist() == [0, 1, 1]
+    assert got.marker_names == ("1", "01")
+
+
+def test_labels_that_look_like_numbers_stay_as_written(read):
+    labels = ("00", "0", "01", "1.0", "1e3")
+    got = read(table(*(f"{label},{ROW}" for label in labels), header="configuration," + HEADER))
+    assert got.configuration_labels == labels
+
+
+def test_markers_are_coded_in_the_cells_order_and_all_named(read):
+    got = read(
+        table("C," + ROW, "A," + ROW, header="marker," + HEADER), marker_names=("A", "B", "C")
+    )
+    assert got.marker_names == ("A", "B", "C")
+    assert got.marker.tolist() == [2, 0]
+
+
+def test_the_only_marker_of_the_cell_is_the_default(read):
+    assert read(table(ROW), marker_names=("ball",)).marker_names == ("ball",)
+
+
+def test_several_markers_need_a_marker_column(refusal):
+    message = refusal(table(ROW), marker_names=("A", "B"))
+    assert "A, B" in message
+    assert "add a column marker" in message
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "vector"),
+    [
+        ("1,0,0,0", [0, 0, 0]),
+        ("-1,0,0,0", [0, 0, 0]),
+        ("0,1,0,0", [np.pi, 0, 0]),
+        ("0.7071067811865476,0,0.7071067811865476,0", [0, np.pi / 2, 0]),
+        ("-0.7071067811865476,0,0,0.7071067811865476", [0, 0, -np.pi / 2]),
+        ("1,0,0,1e-200", [0, 0, 2e-200]),
+        ("1.0005,0,0,0", [0, 0, 0]),
+    ],
+)
+def test_quaternions_become_rotation_vectors(read, quaternion, vector):
+    got = read(extended("qw,qx,qy,qz", quaternion), observe="pose")
+    assert np.allclose(got.rotation, [vector], rtol=1e-12, atol=1e-300)
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+@pytest.mark.parametrize("mark", [".", ","])
+def test_semicolon_and_tab_tables_may_use_decimal_commas(read, delimiter, mark):
+    text = table("1,2,3.25,4,5").replace(",", delimiter).replace(".", mark)
+    assert read(text).position.tolist() == [[0.00325, 0.004, 0.005]]
+
+
+def test_byte_order_mark_windows_line_ends_blank_lines_and_blanks_are_understood(read):
+    text = "\ufeff" + table("a , 1 , 2, 3 ,4,5", "", "  ", "b,1,2,3,4,5", header="marker," + HEADER)
+    got = read(text.replace("\n", "\r\n").encode() + b"\r\n\r\n")
+    assert got.marker_names == ("a", "b")
+    assert got.row.tolist() == [2, 5]
+
+
+def test_quoted_labels_may_hold_the_delimiter(read):
+    assert read(table('"a, ""b""",' + ROW, header="marker," + HEADER)).marker_names == ('a, "b"',)
+
+
+@pytest.mark.parametrize("name", ["# remark", "_x", "note", "notes of the day"])
+def test_remarks_are_ignored(read, name):
+    assert len(read(extended(name, "any text")))
+
+
+def test_loads_and_repeats_tell_rows_of_one_configuration_apart(read):
+    header = "configuration,repeat,force_x_N,force_y_N,force_z_N," + HEADER
+    rows = [f"1,{r},0,0,{f},{ROW}" for r in (0, 1) for f in ("0.000", "-100")]
+    assert len(read(table(*rows, header=header))) == 4
+
+
+# --- the header ---
+
+
+@pytest.mark.parametrize(
+    ("header", "told"),
+    [
+        (HEADER.replace("q2_deg", "q2_rad"), ["q1_deg", "q2_rad", "mix units"]),
+        (HEADER.replace("y_mm", "y_m"), ["x_mm", "y_m", "mix units"]),
+        (HEADER + ",x_m", ["x_mm", "x_m", "mix units"]),
+        (HEADER.replace("x_mm", "x"), ["'x' has no unit", "x_mm or x_m or x_um"]),
+        (HEADER.replace("q1_deg", "q1"), ["'q1' has no unit", "q1_deg or q1_rad"]),
+        (HEADER + ",distance", ["'distance' has no unit", "distance_mm or distance_m"]),
+        (HEADER + ",force_x", ["'force_x' has no unit", "force_x_N"]),
+        (HEADER.replace("x_mm", "x_cm"), ["'x_cm'", "cm is not taken", "x_mm or x_m"]),
+        (HEADER.replace("q1_deg", "q1_mm"), ["'q1_mm'", "q1_deg or q1_rad"]),
+        (HEADER + ",temprature_C", ["'temprature_C'", "did you mean 'temperature_C'"]),
+        (HEADER.replace("x_mm", "X_mm"), ["'X_mm'", "did you mean 'x_mm'"]),
+        (HEADER + ",", ["column 6 of 6 has no name"]),
+        (HEADER + ",x_mm", ["'x_mm' appears 2 times"]),
+        ("q1_deg,x_mm,y_mm,z_mm", ["1 joint columns", "robot has 2 joints", "add q2_deg"]),
+        (HEADER + ",q3_deg", ["3 joint columns", "robot has 2 joints"]),
+        ("x_mm,y_mm,z_mm", ["0 joint columns", "robot has 2 joints"]),
+        (HEADER + ",torque_3_Nm", ["'torque_3_Nm'", "robot has 2 joints"]),
+        (HEADER + ",torque_1_Nm", ["torque_1_Nm without torque_2_Nm"]),
+        (HEADER + ",approach_2", ["approach_2 without approach_1"]),
+        (HEADER + ",force_x_N", ["force_x_N without force_y_N, force_z_N"]),
+        (HEADER + ",sigma_x_um", ["sigma_x_um without sigma_y_um, sigma_z_um"]),
+        (HEADER + ",qw,qx,qy", ["without qz"]),
+        ("q1_deg,q2_deg,x_mm,y_mm", ["x_mm, y_mm without z_mm"]),
+        ("q1_deg,q2_deg", ["x_mm,y_mm,z_mm are missing", '"position"', "found q1_deg, q2_deg"]),
+        (HEADER + ",rx_deg,ry_deg,rz_deg,qw,qx,qy,qz", ["rx_deg", "qw", "keep one"]),
+        (
+            HEADER + ",sigma_x_um,sigma_y_um,sigma_z_um,"
+            "sigma_range_um,sigma_azimuth_um,sigma_elevation_um",
+            ["sigma_x_um", "sigma_range_um", "keep one"],
+        ),
+        ("q1_deg q2_deg x_mm", ["unknown column"]),
+    ],
+)
+def test_wrong_header_is_told_before_any_row_is_looked_at(refusal, header, told):
+    message = refusal(header + "\nno,row\n")
+    assert all(part in message for part in told), message
+
+
+@pytest.mark.parametrize(
+    ("observe", "needed"),
+    [("deflection", "x_mm,y_mm,z_mm"), ("pose", "rx_deg,ry_deg,rz_deg or qw"),
+     ("distance", "distance_mm")],
+)  # fmt: skip
+def test_what_is_observed_decides_the_columns_needed(refusal, observe, needed):
+    header = HEADER if observe != "deflection" else "q1_deg,q2_deg"
+    assert needed in refusal(header + "\n", observe=observe)
+
+
+def test_distances_need_no_positions(read):
+    got = read("q1_rad,q2_rad,distance_m\n0,0,0.5\n", observe="distance")
+    assert got.distance.tolist() == [0.5]
+    assert got.position is None
+
+
+def test_prismatic_joints_take_lengths_only(refusal):
+    message = refusal(table(ROW), joint_kinds=("revolute", "prismatic"))
+    assert "q2_m" in message
+
+
+# --- the rows ---
+
+
+@pytest.mark.parametrize(
+    ("cell", "told"),
+    [
+        ("nan", "not a finite number"),
+        ("NaN", "not a finite number"),
+        ("NA", "not a finite number"),
+        ("-inf", "not a finite number"),
+        ("1e999", "too large"),
+        ("", "empty cell"),
+        ("   ", "empty cell"),
+        ("12abc", "not a number"),
+        ("True", "not a number"),
+        ("1_000", "not a number"),
+        ("0x10", "not a number"),
+        ("１", "not a number"),
+        ("--1", "not a number"),
+        ('"1,5"', "decimal comma"),
+        ('"1.234,5"', "thousands separators"),
+    ],
+)
+def test_bad_cell_is_told_with_line_column_and_text(refusal, cell, told):
+    message = refusal(table(ROW, ROW.replace("3", "7"), f"1,2,3,{cell},5"))
+    assert f"line 4, column y_mm: {'' if told == 'empty cell' else repr(cell.strip(chr(34)))}" in (
+        message.replace("   ", "")
+    )
+    assert told in message
+
+
+def test_a_column_of_truth_values_is_not_read_as_ones(refusal):
+    assert "'True' is not a number" in refusal(table("1,2,3,4,True"))
+    assert "line 3, column x_mm: 'FALSE'" in refusal(table(ROW, "1,2,FALSE,4,5"))
+
+
+def test_the_line_told_counts_blank_lines(refusal):
+    assert "line 5, column z_mm" in refusal(table(ROW, "", "", "1,2,3,4,x"))
+
+
+@pytest.mark.parametrize("row", ["1,5;2;3;4;1.5", "1.234,5;2;3;4;5", "1,234.5;2;3;4;5"])
+def test_mixed_decimal_marks_and_thousands_separators_are_never_guessed(refusal, row):
+    assert "line 2" in refusal(table(row, header=HEADER.replace(",", ";")))
+
+
+def test_decimal_marks_must_agree_throughout_the_file(refusal):
+    header = HEADER.replace(",", ";")
+    message = refusal(table("1;2;3;4;5,5", "1;2;3;4;6.5", header=header))
+    assert "line 2, column z_mm: '5,5'" in message
+    assert "line 3, column z_mm: '6.5'" in message
+
+
+def test_wrong_number_of_fields_is_told_for_decimal_commas_too(refusal):
+    message = refusal(table(ROW, "1,2,3,4,5,6,7"))
+    assert "line 3 has 7 fields, header has 5" in message
+    assert "';'" in message
+    assert "line 2 has 4 fields, header has 5" in refusal(table("1,2,3,4"))
+    assert "line 2 has 4 fields" in refusal(table('1,2,3,"4,5"'))
+
+
+@pytest.mark.parametrize(
+    ("columns", "values", "told"),
+    [
+        ("repeat", "1.5", ["column repeat", "whole number", "1.5"]),
+        ("repeat", "1e300", ["column repeat"]),
+        ("approach_1,approach_2", "1,2", ["column approach_2", "-1, 0 or 1", "found 2"]),
+        ("sigma_x_um,sigma_y_um,sigma_z_um", "1,0,1", ["column sigma_y_um", "positive"]),
+        ("sigma_x_um,sigma_y_um,sigma_z_um", "1,1,1e-320", ["column sigma_z_um", "positive"]),
+        ("distance_mm", "-1", ["column distance_mm", "positive", "found -1"]),
+        ("qw,qx,qy,qz", "1,0,0,0.1", ["quaternion", "1.00499"]),
+        ("qw,qx,qy,qz", "0,0,0,0", ["quaternion"]),
+        ("qw,qx,qy,qz", "1e300,0,0,1e300", ["quaternion"]),
+        ("time_min", "1e308", ["column time_min", "too large"]),
+        ("marker", " ", ["column marker", "empty cell"]),
+        ("marker", "a\x07", ["column marker", "control characters"]),
+        ("configuration", '""', ["column configuration", "empty cell"]),
+        ("marker", '"a', ["quotation marks"]),
+    ],
+)
+def test_value_that_breaks_a_rule_is_told_with_line_and_column(refusal, columns, values, told):
+    message = refusal(extended(columns, values))
+    assert all(part in message for part in ["line 2", *told]), message
+
+
+def test_unknown_marker_is_told_with_the_nearest_one(refusal):
+    text = table("ball_1," + ROW, "bal_2," + ROW, header="marker," + HEADER)
+    message = refusal(text, marker_names=("ball_1", "ball_2"))
+    assert "line 3, column marker: 'bal_2'" in message
+    assert "did you mean 'ball_2'" in message
+
+
+def test_a_repeated_key_is_told_with_both_lines(refusal):
+    header = "configuration,marker,force_x_N,force_y_N,force_z_N," + HEADER
+    rows = ["p,A,0,0,0," + ROW, "p,B,0,0,0," + ROW, "p,A,0,-0.0,0,9,9,9,9,9"]
+    message = refusal(table(*rows, header=header))
+    assert "lines 2 and 4" in message
+    assert "`repeat` column" in message
+
+
+def test_without_configurations_only_identical_rows_are_duplicates(read, refusal):
+    assert len(read(table(ROW, ROW.replace("5", "6"), ROW.replace("5", "7")))) == 3
+    assert "lines 3 and 5" in refusal(table("0,0,0,0,0", ROW, "9,9,9,9,9", ROW))
+    header = HEADER + ",repeat"
+    assert len(read(table(ROW + ",0", ROW + ",1", header=header))) == 2
+
+
+# --- the file ---
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"", "empty file"),
+        (b"\xef\xbb\xbf", "blank"),
+        (b"\n\n", "blank"),
+        (HEADER.encode(), "no rows"),
+        (HEADER.encode() + b"\n\n\n", "no rows"),
+        (table(ROW).encode("utf-16"), "UTF-16"),
+        (table(ROW).encode("utf-16-le"), "NUL"),
+        (b"PK\x03\x04\0\0\0", "export the sheet"),
+        (extended("note", "\xb5").encode("latin-1"), "line 2: not UTF-8 text (byte 0xb5)"),
+        (table(ROW).replace("\n", "\r").encode(), "carriage return"),
+        (b"a" * 70_000, "longer than 64 KiB"),
+        (HEADER.encode() + b"\n" + b"1" * 70_000, "line 2: longer than 64 KiB"),
+        (HEADER.encode() + b"\n1,2,3,4,\0005\n", "line 2: NUL"),
+        (HEADER.encode() + b"\n" * 20_000, "blank lines"),
+    ],
+)
+def test_a_file_that_is_no_text_table_is_refused(refusal, data, told):
+    assert told in refusal(data)
+
+
+@pytest.mark.parametrize("name", ["absent.csv", "", "a\0b.csv", "x" * 5000, "absent.parquet"])
+def test_absent_files_and_directories_are_refused(tmp_path, name):
+    with pytest.raises(InputError):
+        read_measurements(tmp_path / name, joint_kinds=())
+
+
+@pytest.mark.parametrize("start", [b"", HEADER.encode() + b"\n", HEADER.encode() + b"\n1,2,"])
+def test_a_gigabyte_of_nothing_is_refused_at_once(tmp_path, start):
+    path = tmp_path / "huge.csv"
+    path.write_bytes(start)
+    os.truncate(path, 10**9)  # a sparse file: NUL bytes that take no disk space
+    began = time.perf_counter()
+    with pytest.raises(InputError, match="NUL"):
+        read_measurements(path, joint_kinds=("revolute", "revolute"))
+    assert time.perf_counter() - began < 1.0
+
+
+def test_a_table_of_many_rows_reads_in_seconds(tmp_path):
+    n = 100_000
+    row = "{0},M1," + ",".join(["0.123456789"] * 10) + ",{0}.5,0.25,1e-3\n"
+    names = [f"q{i}_rad" for i in range(1, 11)]
+    header = ",".join(["configuration", "marker", *names, "x_m", "y_m", "z_m"]) + "\n"
+    path = tmp_path / "many.csv"
+    path.write_text(header + "".join(row.format(i) for i in range(n)))
+    began = time.perf_counter()
+    got = read_measurements(path, joint_kinds=("revolute",) * 10)
+    assert time.perf_counter() - began < 5.0
+    assert (got.position[:, 0] == np.arange(n) + 0.5).all()
+    assert got.configuration_labels[-1] == str(n - 1)
+
+
+def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "data.csv"
+    path.write_text(table(ROW, "6,7,8,9,10"))
+    from elastocal import csv_source
+
+    def count_then_truncate(*arguments):
+        rows = count(*arguments)
+        os.truncate(path, len(HEADER) + len(ROW) + 2)
+        return rows
+
+    count = csv_source.count_rows
+    monkeypatch.setattr(csv_source, "count_rows", count_then_truncate)
+    with pytest.raises(InputError, match="changed while it was read"):
+        read_measurements(path, joint_kinds=("revolute", "revolute"))
+
+
+# --- Parquet ---
+
+
+@pytest.fixture
+def parquet(tmp_path, monkeypatch):
+    """Reads a frame as if it came out of a Parquet file, whatever engines are installed."""
+    pandas = pytest.importorskip("pandas")
+
+    def parquet(columns, **options):
+        path = tmp_path / "data.parquet"
+        path.write_bytes(b"PAR1")
+        monkeypatch.setattr(pandas, "read_parquet", lambda _: pandas.DataFrame(columns))
+        return read_measurements(path, joint_kinds=("revolute", "revolute"), **options)
+
+    return parquet
+
+
+def test_parquet_columns_follow_the_same_rules(parquet):
+    numbers = dict.fromkeys(HEADER.split(","), [1, 2])
+    got = parquet({**numbers, "marker": ["B", "A"], "configuration": [7, 3]})
+    assert got.position[1].tolist() == [0.002, 0.002, 0.002]
+    assert got.marker_names == ("B", "A")
+    assert got.configuration_labels == ("7", "3")
+    for bad, told in [
+        ({"x_mm": ["a", "b"]}, "column x_mm: holds"),
+        ({"x_mm": [True, False]}, "column x_mm: holds bool"),
+        ({"x_mm": [1.0, None]}, "row 2, column x_mm"),
+        ({"marker": ["A", None]}, "row 2, column marker"),
+        ({"marker": ["A", " "]}, "row 2, column marker"),
+        ({"typo": [1, 2]}, "unknown column 'typo'"),
+    ]:
+        with pytest.raises(InputError, match=told):
+            parquet({**numbers, **bad})
+
+
+def test_parquet_needs_an_engine_and_a_parquet_file(tmp_path, monkeypatch):
+    pandas = pytest.importorskip("pandas")
+
+    def no_engine(_):
+        raise ImportError
+
+    path = tmp_path / "data.pq"
+    path.write_bytes(b"not parquet")
+    with pytest.raises(InputError, match="not a Parquet file"):
+        read_measurements(path, joint_kinds=())
+    path.write_bytes(b"PAR1")
+    monkeypatch.setattr(pandas, "read_parquet", no_engine)
+    with pytest.raises(InputError, match="pip install pyarrow"):
+        read_measurements(path, joint_kinds=())
+
+
+# --- writing ---
+
+
+def test_what_cannot_be_read_back_is_not_written(read, tmp_path):
+    from dataclasses import replace
+
+    got = read(table(ROW))
+    for wrong in (
+        replace(got, position=got.position * np.nan),
+        replace(got, marker_names=("two\nlines",)),
+    ):
+        with pytest.raises(InputError):
+            write_measurements(wrong, tmp_path / "out.csv")
+    with pytest.raises(InputError, match="does not exist"):
+        write_measurements(got, tmp_path / "absent" / "out.csv")
+    assert os.listdir(tmp_path) == ["data.csv"]
