@@ -374,6 +374,7 @@ def test_without_configurations_only_identical_rows_are_duplicates(read, refusal
         (HEADER.encode() + b"\n" + b"1" * 70_000, "line 2: longer than 64 KiB"),
         (HEADER.encode() + b"\n1,2,3,4,\0005\n", "line 2: NUL"),
         (HEADER.encode() + b"\n" * 20_000, "blank lines"),
+        (table("\ufeff" + ROW).encode(), "byte order mark inside"),
     ],
 )
 def test_a_file_that_is_no_text_table_is_refused(refusal, data, told):
@@ -411,20 +412,54 @@ def test_a_table_of_many_rows_reads_in_seconds(tmp_path):
     assert got.configuration_labels[-1] == str(n - 1)
 
 
-def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path, monkeypatch):
+def test_a_file_that_vanishes_between_two_looks_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "data.csv"
-    path.write_text(table(ROW, "6,7,8,9,10"))
-    from elastocal import csv_source
+    path.write_text(table(ROW))
+    real = os.stat
 
-    def count_then_truncate(*arguments):
-        rows = count(*arguments)
-        os.truncate(path, len(HEADER) + len(ROW) + 2)
-        return rows
+    def stat_then_vanish(name, *arguments, **options):
+        found = real(name, *arguments, **options)
+        if str(name) == str(path):
+            monkeypatch.undo()
+            path.rename(tmp_path / "elsewhere.csv")
+        return found
 
-    count = csv_source.count_rows
-    monkeypatch.setattr(csv_source, "count_rows", count_then_truncate)
-    with pytest.raises(InputError, match="changed while it was read"):
+    monkeypatch.setattr(os, "stat", stat_then_vanish)
+    with pytest.raises(InputError):
         read_measurements(path, joint_kinds=("revolute", "revolute"))
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    from elastocal import csv_lines
+
+    monkeypatch.setattr(csv_lines, "CHUNK_BYTES", 1)
+
+
+def test_a_table_read_in_pieces_is_the_same_table(read, small_chunks):
+    header = "configuration;marker;" + HEADER.replace(",", ";")
+    rows = ["b;x;1;0;0;0;0", "a;x;2;0;0;0;0", "", "b;y;3;0;0,5;0;0", "c;x;4;0;0,5;0;0"]
+    got = read(table(*rows, header=header))
+    assert got.configuration_labels == ("b", "a", "c")
+    assert got.configuration.tolist() == [0, 1, 0, 2]
+    assert got.marker.tolist() == [0, 0, 1, 0]
+    assert got.row.tolist() == [2, 3, 5, 6]
+    assert got.position[:, 0].tolist() == [0, 0, 0.0005, 0.0005]
+
+
+@pytest.mark.parametrize(("first", "second"), [("1.5", "2,5"), ("1,5", "2.5")])
+def test_mixed_decimal_marks_are_found_across_pieces(refusal, small_chunks, first, second):
+    header = HEADER.replace(",", ";")
+    message = refusal(table(f"1;2;3;4;{first}", "1;2;3;4;7", f"1;2;3;4;{second}", header=header))
+    assert f"line 2, column z_mm: '{first}'" in message
+    assert f"line 4, column z_mm: '{second}'" in message
+
+
+def test_more_rows_than_any_campaign_has_are_refused(refusal, small_chunks, monkeypatch):
+    from elastocal import csv_lines
+
+    monkeypatch.setattr(csv_lines, "MAX_ROWS", 3)
+    assert "more than 3 rows" in refusal(table(*(f"{i},2,3,4,5" for i in range(9))))
 
 
 # --- Parquet ---

@@ -13,6 +13,8 @@ from elastocal.nearest import quoted
 
 MAX_LINE = 64 * 1024
 MAX_BLANK_LINES = 10_000
+MAX_ROWS = 5_000_000
+CHUNK_BYTES = 1 << 20
 DELIMITERS = ",;\t"
 # pandas takes True and False for 1 and 0; "true" in any case it knows has one of these in it.
 TRUTH_VALUES = (b"rue", b"RUE", b"alse", b"ALSE")
@@ -48,24 +50,31 @@ def read_header(source: str, handle: BinaryIO) -> Dialect:
 
 
 @dataclass(frozen=True)
-class Rows:
-    """The line `numbers` of all data rows; whether `truth_values` may stand in one of them."""
+class Chunk:
+    """Some consecutive data lines: their text and their `numbers` in the file.
 
+    `truth_values`: whether True or False may stand in one of them.
+    """
+
+    data: bytes
     numbers: array[int]
     truth_values: bool
 
 
-def count_rows(source: str, handle: BinaryIO, dialect: Dialect) -> Rows:
-    """The data rows below the header, each with as many fields as the header.
+def chunks(source: str, handle: BinaryIO, dialect: Dialect) -> Iterator[Chunk]:
+    """All data lines from `dialect.start`, each with as many fields as the header, in chunks.
 
-    Reads from `dialect.start` in bounded memory.  Raises InputError for NUL bytes, overlong
-    lines, other encodings, stray carriage returns, wrong field counts, and files without data.
+    Raises InputError for NUL bytes, overlong lines, other encodings, stray carriage returns,
+    wrong field counts, too many rows, and files without data; memory stays bounded.
     """
-    rows = array("q")
+    handle.seek(dialect.start)
     delimiter = dialect.delimiter.encode()
-    expected, blanks, truth_values = len(dialect.header), 0, False
-    for number, line in _lines(source, handle, dialect):
-        if is_blank(line, dialect.delimiter):
+    expected = len(dialect.header)
+    number, blanks, rows, size = 1, 0, 0, 0
+    lines: list[bytes] = []
+    numbers = array("q")
+    while line := _bounded_line(source, handle, number := number + 1):
+        if not line.strip(b" \r\n" if delimiter == b"\t" else b" \t\r\n"):
             blanks += 1
             if blanks > MAX_BLANK_LINES:
                 raise InputError(f"{source}, line {number}: more than {MAX_BLANK_LINES} blank "
@@ -82,21 +91,34 @@ def count_rows(source: str, handle: BinaryIO, dialect: Dialect) -> Rows:
             hint = "; where decimals are written with a comma, separate the columns by ';'"
             raise InputError(
                 f"{source}: line {number} has {found} fields, header has {expected}"
-                f"{hint if found > expected and delimiter == b',' else '; complete the line'}"
+                f"{hint if found > expected and delimiter == b',' else '; correct the line'}"
             )
-        truth_values = truth_values or any(word in line for word in TRUTH_VALUES)
-        rows.append(number)
-    if not rows:
+        lines.append(line)
+        numbers.append(number)
+        size += len(line)
+        if size >= CHUNK_BYTES:
+            rows += len(lines)
+            yield _chunk(lines, numbers)
+            lines, numbers, size = [], array("q"), 0
+            if rows > MAX_ROWS:
+                raise InputError(
+                    f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out"
+                )
+    if lines:
+        yield _chunk(lines, numbers)
+    elif not rows:
         raise InputError(f"{source}: has a header but no rows; add measurements below it")
-    return Rows(rows, truth_values)
 
 
-def fields(source: str, handle: BinaryIO, dialect: Dialect) -> Iterator[tuple[int, list[str]]]:
-    """(line number, cells) of every data row, from `dialect.start`."""
-    for number, line in _lines(source, handle, dialect):
-        if not is_blank(line, dialect.delimiter):
-            text = _decode(source, line, number).rstrip("\r\n")
-            yield number, split(source, number, text, dialect.delimiter)
+def _chunk(lines: list[bytes], numbers: array[int]) -> Chunk:
+    data = b"".join(lines)
+    return Chunk(data, numbers, any(word in data for word in TRUTH_VALUES))
+
+
+def fields(source: str, chunk: Chunk, dialect: Dialect) -> Iterator[tuple[int, list[str]]]:
+    """(line number, cells) of every line of a chunk."""
+    for number, line in zip(chunk.numbers, chunk.data.splitlines(), strict=True):
+        yield number, split(source, number, line.decode(), dialect.delimiter)
 
 
 def split(source: str, number: int, text: str, delimiter: str) -> list[str]:
@@ -109,18 +131,6 @@ def split(source: str, number: int, text: str, delimiter: str) -> list[str]:
             f"{source}, line {number}: quotation marks do not match in {quoted(text)}; close "
             "them on the same line"
         ) from None
-
-
-def is_blank(line: bytes, delimiter: str) -> bool:
-    return not line.strip(b" \r\n" if delimiter == "\t" else b" \t\r\n")
-
-
-def _lines(source: str, handle: BinaryIO, dialect: Dialect) -> Iterator[tuple[int, bytes]]:
-    handle.seek(dialect.start)
-    number = 2
-    while line := _bounded_line(source, handle, number):
-        yield number, line
-        number += 1
 
 
 def _bounded_line(source: str, handle: BinaryIO, number: int) -> bytes:
@@ -146,9 +156,15 @@ def _bounded_line(source: str, handle: BinaryIO, number: int) -> bytes:
 
 def _decode(source: str, line: bytes, number: int) -> str:
     try:
-        return line.decode("utf-8")
+        text = line.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{source}, line {number}: not UTF-8 text (byte 0x{line[error.start]:02x}); save "
             "the table as CSV in UTF-8"
         ) from None
+    if number > 1 and "\ufeff" in text:
+        raise InputError(
+            f"{source}, line {number}: a byte order mark inside the file; if files were joined, "
+            "remove the second header"
+        )
+    return text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,20 +24,24 @@ def is_label(text: str) -> bool:
 
 
 def _is_control(character: str) -> bool:
-    return unicodedata.category(character) in ("Cc", "Cs")
+    return unicodedata.category(character) in ("Cc", "Cs") or character == "\ufeff"
 
 
-def in_order(codes: NDArray[np.integer], names: Sequence[str]) -> Labels:
-    """Labels with blanks at their ends cut off, renumbered by first appearance.
+class LabelCollector:
+    """Gathers the labels of a column piece by piece, coded by first appearance."""
 
-    `codes` (n,) index into `names`; names that no row uses are dropped.
-    """
-    n = len(codes)
-    first = np.full(len(names), n)
-    first[codes[::-1]] = np.arange(n)[::-1]
-    new_code: dict[str, int] = {}
-    renumber = np.zeros(len(names), dtype=np.int64)
-    for old in np.argsort(first, kind="stable"):
-        if first[old] < n:
-            renumber[old] = new_code.setdefault(str(names[old]).strip(), len(new_code))
-    return Labels(renumber[codes], tuple(new_code))
+    def __init__(self) -> None:
+        self._code_of: dict[str, int] = {}
+        self._pieces: list[NDArray[np.int64]] = []
+
+    def add(self, codes: NDArray[np.integer], names: Iterable[object]) -> None:
+        """More rows: `codes` (n,) index into `names`, which stand in order of appearance.
+
+        Blanks at the ends of a name are cut off.
+        """
+        new = [self._code_of.setdefault(str(n).strip(), len(self._code_of)) for n in names]
+        self._pieces.append(np.array(new, dtype=np.int64)[codes])
+
+    def labels(self) -> Labels:
+        """All rows so far."""
+        return Labels(np.concatenate(self._pieces), tuple(self._code_of))

@@ -8,7 +8,7 @@ import numpy as np
 
 from elastocal.errors import InputError
 from elastocal.files import open_input
-from elastocal.labels import Labels, in_order
+from elastocal.labels import LabelCollector, Labels
 from elastocal.raw_table import ChooseLayout, RawTable
 
 
@@ -66,4 +66,6 @@ def _labels(source: str, name: str, column) -> Labels:  # type: ignore[no-untype
         raise InputError(
             f"{source}, row {i + 1}, column {name}: empty cell; write a name or number"
         )
-    return in_order(*column.astype(str).factorize())
+    collector = LabelCollector()
+    collector.add(*column.astype(str).factorize())
+    return collector.labels()

@@ -1,0 +1,85 @@
+"""Small identifications to report on: a KR 270-2 with hostile marker names, and a clean one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_of
+
+from elastocal.cell import CartesianNoise, Tracker
+from elastocal.identification.identify import Options, identify
+from elastocal.identification.result import IdentificationResult
+from elastocal.manipulator.model import Model
+from elastocal.simulation.simulate import simulate, values_from
+
+EFFECTS = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
+SCRIPT = "<script>alert(1)</script>"
+MARKUP = "[red]$x^2$ & \x1b[31m"
+SIGMA = 3e-5
+
+
+@dataclass(frozen=True)
+class Case:
+    """A result and the true values behind it."""
+
+    result: IdentificationResult
+    truth: dict[str, float]
+
+
+def make_case(
+    names: tuple[str, ...] = ("M1", "M2"),
+    effects: tuple[str, ...] = EFFECTS,
+    poses: int = 14,
+    sigma: float | None = SIGMA,
+    faulty: int = 0,
+    drop: bool = False,
+    observe: str = "position",
+) -> Case:
+    """Readings with 30 µm noise of an arm whose base and joints are off by about 1 mm, 1 mrad."""
+    cell = kr270_cell(effects, observe)
+    points = dict(zip(names, MARKERS.values(), strict=False))
+    noise = None if sigma is None else CartesianNoise(np.full(3, sigma))
+    cell = replace(
+        cell,
+        tool=replace(cell.tool, markers=points),
+        tracker=Tracker(noise=noise, rotation_sigma=3e-5 if observe == "pose" else None),
+    )
+    model = Model(kr270_chain(), cell)
+    rng = np.random.default_rng(7)
+    table = table_of(
+        random_poses(model.chain, poses, 3), np.array([600.0, 0.0, -2600.0]), names, both=True
+    )
+    truth = {
+        p.name: float(p.nominal + 1e-3 * rng.normal())
+        if p.effect in ("base_frame", "joint_offset")
+        else float(p.nominal)
+        for p in model.parameters
+    }
+    table = simulate(model, table, values_from(model, truth), rng, noise=False)
+    position = np.asarray(table.position) + SIGMA * rng.normal(size=(len(table), 3))
+    position[3 : 3 + 5 * faulty : 5] += 0.03
+    table = replace(table, position=position)
+    if table.rotation is not None:
+        rotation = table.rotation + 3e-5 * rng.normal(size=(len(table), 3))
+        table = replace(table, rotation=rotation)
+    return Case(identify(model, table, Options(drop_outliers=drop)), truth)
+
+
+@pytest.fixture(scope="session")
+def case() -> Case:
+    """Two markers, one reading faulty, some parameters alone, combined, absorbed, invisible."""
+    return make_case(faulty=1)
+
+
+@pytest.fixture(scope="session")
+def hostile() -> Case:
+    """Marker names with markup and control characters."""
+    return make_case((SCRIPT, MARKUP), poses=8, faulty=1, drop=True)
+
+
+@pytest.fixture(scope="session")
+def new_case() -> Callable[..., Case]:
+    return make_case

@@ -1,0 +1,214 @@
+"""The page: complete, self-contained, harmless, whole or not there at all."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from elastocal.errors import InputError
+from elastocal.report import html, residuals
+from elastocal.report.html import report_page, write_report
+
+VOID = {"meta", "br", "link", "img", "hr", "input"}
+SVG_LEAVES = {"line", "circle", "path", "use", "rect"}
+
+
+class Structure(HTMLParser):
+    """Open tags, ids and text; complains where tags do not match."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.rows: list[list[str]] = []
+        self.texts: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.tags.add(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_startendtag(self, tag: str, attrs: Any) -> None:
+        self.tags.add(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+        if "td" in self.open or "th" in self.open:
+            self.rows[-1][-1] += data.strip()
+
+
+def parsed(page: str) -> Structure:
+    structure = Structure()
+    structure.feed(page)
+    assert structure.open == []
+    return structure
+
+
+@pytest.fixture(scope="module")
+def page(case: Any) -> str:
+    return report_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
+
+
+def test_every_parameter_is_on_the_page_and_no_number_where_none_is_known(
+    page: str, case: Any
+) -> None:
+    rows = {row[0]: row for row in parsed(page).rows if row}
+    for e in case.result.estimates:
+        row = rows[e.name]
+        if e.identifiable:
+            assert re.fullmatch(r"−?\d+(\.\d+)?", row[1])
+        else:
+            assert row[1] == "–"
+            assert row[-1].startswith(("held", "only as", "fixed"))
+
+
+def test_structure(page: str) -> None:
+    structure = parsed(page)
+    assert not {"script", "link", "img", "iframe", "object"} & structure.tags
+    assert page.count("<figure>") == page.count("</figure>") == 5
+    text = "".join(structure.texts)
+    for heading in ("Parameters", "Combinations", "What is not determined", "Residuals",
+                    "Correlations over 0.9", "Outliers", "To repeat this"):  # fmt: skip
+        assert heading in text
+    assert "elastocal identify c.toml d.csv" in text
+    assert "prefers-color-scheme: dark" in page
+    assert "@media print" in page
+
+
+def test_no_network(page: str) -> None:
+    addresses = set(re.findall(r"""(?:https?:)?//[^\s"'<>)]+""", page))
+    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
+    assert "@import" not in page
+    assert set(re.findall(r"url\(([^)]*)\)", page)) == set(re.findall(r"url\((#[^)]*)\)", page))
+
+
+def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
+    figures = re.findall(r"<svg xmlns=.*?</svg>", page, re.DOTALL)
+    assert len(figures) == 5
+    for figure in figures:
+        ElementTree.fromstring(figure)
+        assert "var(--ink)" in figure
+        assert "#0102" not in figure
+        assert "mathdefault" not in figure
+
+
+def test_names_from_files_are_text(hostile: Any) -> None:
+    page = report_page(hostile.result, command="elastocal <b>", inputs={"<i>.csv": "<u>"})
+    structure = parsed(page)
+    assert not {"script", "b", "i", "u"} & structure.tags
+    assert "\x1b" not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert any("[red]$x^2$ & " in text for text in structure.texts)
+    assert "left out" in "".join(structure.texts).lower()
+
+
+def test_size_of_a_long_table(case: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """40 000 readings: thinned, said so, and below 6 MB."""
+    seen = case.result.observations
+    times = 40000 // len(seen.lead) + 1
+    index = np.tile(np.arange(len(seen.lead)), times)
+    lead = replace(seen, lead=seen.lead[index], value=np.tile(seen.value, times))
+    long = replace(
+        case.result,
+        observations=lead,
+        residual=np.tile(case.result.residual, times),
+        held_out=np.tile(case.result.held_out, times),
+        noise={**case.result.noise, "kind": "none"},
+    )
+    write_report(long, tmp_path / "r.html")
+    assert (tmp_path / "r.html").stat().st_size < 6e6
+    assert "a random choice of 5000 of" in (tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def test_small_tables_are_drawn_whole(page: str, case: Any) -> None:
+    assert "random choice" not in page
+    shown = residuals.residuals_of(case.result).shown
+    assert len(shown) == len(case.result.observations.lead)
+
+
+def test_same_result_same_page(case: Any, page: str) -> None:
+    again = report_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
+    assert again == page
+
+
+def test_configuration_of_matplotlib_does_not_matter(case: Any, page: str) -> None:
+    with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30}):
+        again = report_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
+    assert again == page
+
+
+def test_inputs_are_hashed(case: Any, tmp_path: Path) -> None:
+    data = tmp_path / "data.csv"
+    data.write_bytes(b"q1_deg\n1\n")
+    write_report(case.result, tmp_path / "r.html", inputs=[data])
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert hashlib.sha256(data.read_bytes()).hexdigest() in text
+    with pytest.raises(InputError, match="no such file"):
+        write_report(case.result, tmp_path / "other.html", inputs=[tmp_path / "missing.csv"])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["data.csv", "r.html"]
+
+
+def test_failure_while_writing_leaves_nothing(
+    case: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full_disk(source: object, target: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full_disk)
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(case.result, tmp_path / "r.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_failure_while_drawing_keeps_the_old_page(
+    case: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "r.html").write_text("old", encoding="utf-8")
+
+    def broken(*_: object) -> dict[str, str]:
+        raise RuntimeError("no figures today")
+
+    monkeypatch.setattr(html, "_figures", broken)
+    with pytest.raises(RuntimeError):
+        write_report(case.result, tmp_path / "r.html")
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("r.html", "old")]
+
+
+def test_missing_folder(case: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        write_report(case.result, tmp_path / "none" / "r.html")
+
+
+def test_configuration_without_held_out_error(case: Any) -> None:
+    held_out = case.result.held_out.copy()
+    held_out[: 3 * 4] = np.inf
+    page = report_page(replace(case.result, held_out=held_out, heldout_rms=float("inf")))
+    parsed(page)
+    assert "1 without held-out error" in page
+    assert "is not known" in page
+
+
+def test_other_observations(new_case: Callable[..., Any]) -> None:
+    pose = new_case(("M1",), ("base_frame", "joint_offset"), poses=8, observe="pose")
+    text = report_page(pose.result, pose.truth)
+    parsed(text)
+    assert "rz in µrad" in text
+    bare = new_case(("M1",), ("base_frame",), poses=6, sigma=None)
+    assert "No noise was stated" in report_page(bare.result)

@@ -1,0 +1,151 @@
+"""Terminal output: nothing undetermined looks known, nothing is cut off, names stay names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from elastocal.identification.result import Combination
+from elastocal.report.rows import texts
+from elastocal.report.tables import (
+    combination_table,
+    parameter_table,
+    print_result,
+    summary_lines,
+)
+from elastocal.report.words import (
+    combination_truth,
+    inside,
+    shortened,
+    standings,
+)
+
+
+def cells(table: Table) -> list[dict[str, str]]:
+    """Rows of a table, column header → text."""
+    columns = {str(c.header): [str(cell) for cell in c.cells] for c in table.columns}
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def printed(width: int, *arguments: Any) -> str:
+    console = Console(width=width, force_terminal=False)
+    with console.capture() as capture:
+        print_result(console, *arguments)
+    return capture.get()
+
+
+def test_case_has_every_kind_of_parameter(case: Any) -> None:
+    assert {"alone", "combined", "absorbed"} <= set(standings(case.result).values())
+
+
+def test_every_parameter_has_a_row_and_a_number_only_where_determined(case: Any) -> None:
+    rows = cells(parameter_table(case.result))
+    assert [row["parameter"] for row in rows] == list(case.result.model.names)
+    for row, e in zip(rows, case.result.estimates, strict=True):
+        if e.identifiable:
+            assert float(row["value"]) == pytest.approx(float(texts(e, None)[0]))
+            assert float(row["± 95 %"]) > 0
+            assert row["note"] == ""
+        else:
+            assert (row["value"], row["± 95 %"]) == ("–", "–")
+            assert row["note"].startswith(("held", "only as", "fixed"))
+
+
+def test_undetermined_rows_can_be_left_out(case: Any) -> None:
+    rows = cells(parameter_table(case.result, undetermined=False))
+    alone = [e.name for e in case.result.estimates if e.identifiable]
+    assert [row["parameter"] for row in rows] == alone
+
+
+def test_truth_column_says_inside_or_outside(case: Any) -> None:
+    name = next(e.name for e in case.result.estimates if e.identifiable)
+    wrong = case.truth | {name: case.result.estimate(name).ci95[1] + 1.0}
+    rows = {row["parameter"]: row for row in cells(parameter_table(case.result, wrong))}
+    assert rows[name]["in 95 %"] == "outside"
+    for e in case.result.estimates:
+        if e.name != name:
+            expected = inside(case.truth[e.name], e.ci95)
+            assert rows[e.name]["in 95 %"] == expected
+            assert (expected == "") == (not e.identifiable)
+
+
+def test_combination_is_compared_as_a_whole(case: Any) -> None:
+    rows = cells(combination_table(case.result, case.truth))
+    assert len(rows) == len(case.result.combinations) > 0
+    for row, c in zip(rows, case.result.combinations, strict=True):
+        true = combination_truth(case.result, c, case.truth)
+        assert row["in 95 %"] == inside(true, c.ci95) != ""
+    first = case.result.combinations[0]
+    partly = {k: v for k, v in case.truth.items() if k != list(first.terms)[1]}
+    assert cells(combination_table(case.result, partly))[0]["truth"] == "–"
+
+
+@pytest.mark.parametrize("width", [40, 60, 79, 80, 120, 200])
+def test_no_number_is_cut_off_at_any_width(case: Any, width: int) -> None:
+    text = printed(width, case.result, case.truth)
+    assert max(map(len, text.splitlines())) <= width
+    beginning = text[: text.index("Readings")]
+    assert "…" not in beginning
+    joined = "".join(beginning.split())
+    for e in case.result.estimates:
+        if e.identifiable and width >= 60:
+            assert texts(e, None)[0] in joined
+    if width >= 80:
+        for name in case.result.model.names:
+            assert name in text
+
+
+def test_held_values_are_never_printed(case: Any) -> None:
+    """Rows of undetermined parameters hold a dash; their held values appear nowhere as estimates.
+
+    The first member of a combination has a held value that is the combination's value, so only
+    rows of the parameter table are looked at.
+    """
+    for row, e in zip(cells(parameter_table(case.result)), case.result.estimates, strict=True):
+        if not e.identifiable:
+            assert not any(ch.isdigit() for ch in row["value"] + row["± 95 %"])
+
+
+def test_names_are_not_markup_and_not_terminal_commands(hostile: Any) -> None:
+    text = printed(160, hostile.result, hostile.truth)
+    assert "\x1b" not in text
+    assert "[red]$x^2$" in text
+    assert "<script>alert(1)</script>" in text
+
+
+def test_what_is_not_determined_is_told_in_one_line_each(case: Any) -> None:
+    text = " ".join(printed(200, case.result).split())
+    absorbed = [n for n, s in standings(case.result).items() if s == "absorbed"]
+    assert f"held at nominal, absorbed in a combination: {', '.join(absorbed)}" in text
+
+
+def test_summary_in_words(case: Any) -> None:
+    lines = summary_lines(case.result, case.truth)
+    text = "\n".join(lines)
+    assert "56 position readings in 14 configurations, 2 markers (table)" in text
+    assert "tracker sigma [30.0, 30.0, 30.0] µm" in text
+    assert f"Degrees of freedom: {case.result.dof}" in lines
+    assert "held-out poses" in text
+    assert "times the stated noise" in text
+    assert text.count("Warning: ") == len(case.result.warnings) > 0
+    assert "intervals at 95 % hold the true value" in text
+
+
+def test_pose_and_fixed_and_unweighted(new_case: Callable[..., Any]) -> None:
+    result = new_case(("M1",), ("base_frame", "joint_offset"), observe="pose").result
+    assert "rotations" in "\n".join(summary_lines(result))
+    plain = new_case(("M1",), ("base_frame",), poses=6, sigma=None).result
+    text = "\n".join(summary_lines(plain))
+    assert "ordinary least squares" in text
+    assert "No noise was stated" in text
+
+
+def test_shortened_expression() -> None:
+    terms = {"a": 1.0, "b": -0.012345, "c": 1.0000001, "d": 5.0, "e": -2.5, "f": 1e-3}
+    c = Combination(terms, "m", 0.0, 1.0, (-2.0, 2.0))
+    assert shortened(c) == "a + c + 5.00·d - 2.50·e + 2 more"
+    assert shortened(c, 6) == "a - 0.0123·b + c + 5.00·d - 2.50·e + 0.00100·f"
