@@ -162,7 +162,6 @@ def test_small_radians_in_columns_of_degrees(model):
             "the joint angles are probably radians in columns named …_deg")  # fmt: skip
 
 
-@pytest.mark.xfail(strict=True, reason="the search for faulty readings refits with too few left")
 def test_equations_count_against_what_can_be_determined_not_against_all_names(model):
     """30 parameters, of which the planar arm shows 15: 6 poses (18 equations) are enough."""
     assert len(model.names) == 30

@@ -151,7 +151,7 @@ def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
 # --- leaving them out -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [2, 3, 4])
 def test_dropping_equals_never_having_had_them(seed):
     model = Model(planar_chain(), cell_of(PLACED))
     table, _, rng = clean_table(model, seed, 40)

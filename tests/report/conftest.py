@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +31,7 @@ class Case:
 def make_case(
     names: tuple[str, ...] = ("M1", "M2"),
     effects: tuple[str, ...] = EFFECTS,
-    poses: int = 14,
+    poses: int = 8,
     sigma: float | None = SIGMA,
     faulty: int = 0,
     drop: bool = False,
@@ -50,7 +49,7 @@ def make_case(
     model = Model(kr270_chain(), cell)
     rng = np.random.default_rng(7)
     table = table_of(
-        random_poses(model.chain, poses, 3), np.array([600.0, 0.0, -2600.0]), names, both=True
+        random_poses(model.chain, poses, 3), np.array([0.0, 0.0, -2600.0]), names, both=True
     )
     truth = {
         p.name: float(p.nominal + 1e-3 * rng.normal())
@@ -58,28 +57,36 @@ def make_case(
         else float(p.nominal)
         for p in model.parameters
     }
+    table = replace(table, rotation=np.zeros((len(table), 3)))
     table = simulate(model, table, values_from(model, truth), rng, noise=False)
     position = np.asarray(table.position) + SIGMA * rng.normal(size=(len(table), 3))
     position[3 : 3 + 5 * faulty : 5] += 0.03
     table = replace(table, position=position)
-    if table.rotation is not None:
-        rotation = table.rotation + 3e-5 * rng.normal(size=(len(table), 3))
-        table = replace(table, rotation=rotation)
+    rotation = np.asarray(table.rotation) + 3e-5 * rng.normal(size=(len(table), 3))
+    table = replace(table, rotation=rotation)
     return Case(identify(model, table, Options(drop_outliers=drop)), truth)
 
 
 @pytest.fixture(scope="session")
 def case() -> Case:
-    """Two markers, one reading faulty, some parameters alone, combined, absorbed, invisible."""
-    return make_case(faulty=1)
+    """Two markers; some parameters alone, some combined, absorbed, invisible."""
+    return make_case(poses=12)
 
 
 @pytest.fixture(scope="session")
 def hostile() -> Case:
     """Marker names with markup and control characters."""
-    return make_case((SCRIPT, MARKUP), poses=8, faulty=1, drop=True)
+    effects = ("base_frame", "marker_position")
+    return make_case((SCRIPT, MARKUP), effects, faulty=1, drop=True)
 
 
 @pytest.fixture(scope="session")
-def new_case() -> Callable[..., Case]:
-    return make_case
+def pose() -> Case:
+    """Position and orientation of one marker; everything determined but base and joint 1."""
+    return make_case(("M1",), ("base_frame", "joint_offset"), observe="pose")
+
+
+@pytest.fixture(scope="session")
+def bare() -> Case:
+    """Base frame only, from one marker without stated noise, one reading faulty."""
+    return make_case(("M1",), ("base_frame",), sigma=None, faulty=1)

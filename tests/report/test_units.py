@@ -50,7 +50,7 @@ def test_display(value: float, unit: str, shown: tuple[float, str]) -> None:
         (5.0, 123.0, ("0", "120")),
         (1.0, 0.0, ("1", "0")),
         (1.0, math.inf, ("1", "–")),
-        (1.23456789012, 2e-14, ("1.23456789012000e+00", "2.0e-14")),
+        (1.23456789012, 2e-14, ("1.234567890120000e+00", "2.0e-14")),
     ],
 )
 def test_digits_fit_the_uncertainty(value: float, half: float, shown: tuple[str, str]) -> None:

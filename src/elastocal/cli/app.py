@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -107,3 +108,5 @@ def check_outputs(*paths: Path | None) -> None:
             raise InputError(
                 f"{path}: the folder {path.absolute().parent} does not exist; create it first"
             )
+        if not os.access(path.absolute().parent, os.W_OK):
+            raise InputError(f"{path}: no permission to write in {path.absolute().parent}")

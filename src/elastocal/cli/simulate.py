@@ -64,7 +64,7 @@ def simulate(
     force = None if load is None else np.array(load)
     rows = expand_plan(poses, tuple(model.cell.tool.markers), repeats, force)
     table = run(model, rows, x, rng, noise=not no_noise)
-    write_measurements(table, output)
+    write_measurements(table, output, model.chain.kinds)
     if truth is not None:
         named = dict(zip(model.names, (float(v) for v in x), strict=True))
         atomic_write_text(truth, json.dumps(named, indent=1) + "\n")

@@ -58,7 +58,7 @@ def run_demo(
     progress(f"measuring {len(rows)} simulated readings")
     table = simulate(model, rows, values_from(model, truth), seed)
     data_path = folder / "data.csv"
-    write_measurements(table, data_path)
+    write_measurements(table, data_path, model.chain.kinds)
     result = identify(model, replace(table, source=str(data_path)), progress=progress)
     return Demo(cell_path, plan_path, data_path, truth, published, result)
 

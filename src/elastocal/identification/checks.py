@@ -37,12 +37,25 @@ def check_table(model: Model, table: Measurements) -> None:
 
 
 def limits(model: Model) -> tuple[Array, Array]:
-    """Lower and upper joint limits (n,) in rad or m: the robot's, narrowed by the cell's."""
+    """Lower and upper joint limits (n,) in rad or m: the robot's, narrowed by the cell's.
+
+    Raises InputError where the cell limits a joint that the robot does not have, or leaves a
+    joint no range at all.
+    """
     lower = np.array([j.lower for j in model.chain.joints])
     upper = np.array([j.upper for j in model.chain.joints])
     for name, (low, high) in model.cell.limits.items():
         i = int(name.removeprefix("joint")) - 1
+        if i >= len(lower):
+            raise InputError(
+                f"{model.cell.path}: [limits] names {name}, but robot '{model.chain.name}' has "
+                f"{len(lower)} joints"
+            )
         lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
+        if lower[i] >= upper[i]:
+            raise InputError(
+                f"{model.cell.path}: [limits] {name} leaves no range inside the robot's own limits"
+            )
     return lower, upper
 
 

@@ -1,0 +1,300 @@
+"""Every wrong input ends with one message that names it, the right exit code, and no traceback."""
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+from support.files import write_campaign
+from typer.testing import CliRunner
+
+from elastocal.cli import app
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    return write_campaign(tmp_path)
+
+
+def run(*arguments):
+    """Exit code and stderr of a command; whatever is not a clean exit is an error of ours."""
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    return result.exit_code, result.stderr
+
+
+def refused(code, *fragments, campaign, extra=()):
+    """`identify` must end with `code` and a message holding the fragments, writing nothing."""
+    cell, data = campaign
+    before = sorted(os.listdir(cell.parent))
+    found, message = run("identify", cell, data, "-o", cell.parent / "result.json", "-q", *extra)
+    assert found == code, message
+    assert "Traceback" not in message
+    for fragment in fragments:
+        assert re.search(fragment, message), f"{fragment!r} not in {message!r}"
+    assert sorted(os.listdir(cell.parent)) == before
+
+
+def edit(path: Path, pattern: str, replacement: str, count: int = 1) -> None:
+    text = path.read_text(encoding="utf-8")
+    changed = re.sub(pattern, replacement, text, count=count, flags=re.M)
+    assert changed != text
+    path.write_text(changed, encoding="utf-8")
+
+
+def cells_of(path: Path) -> list[list[str]]:
+    return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def write_cells(path: Path, rows: list[list[str]]) -> None:
+    path.write_text("\n".join(",".join(row) for row in rows) + "\n", encoding="utf-8")
+
+
+def drop_column(path: Path, name: str) -> None:
+    rows = cells_of(path)
+    k = rows[0].index(name)
+    write_cells(path, [row[:k] + row[k + 1 :] for row in rows])
+
+
+def set_cell(path: Path, line: int, column: str, text: str) -> None:
+    rows = cells_of(path)
+    rows[line - 1][rows[0].index(column)] = text
+    write_cells(path, rows)
+
+
+def test_the_campaign_itself_is_accepted(campaign):
+    cell, data = campaign
+    code, message = run("identify", cell, data, "-o", cell.parent / "result.json", "-q")
+    assert code == 0, message
+    assert (cell.parent / "result.json").exists()
+
+
+# --- the table -----------------------------------------------------------------------------
+
+
+def test_missing_column(campaign):
+    drop_column(campaign[1], "z_mm")
+    refused(2, "data.csv", "z_mm", campaign=campaign)
+
+
+def test_column_without_a_unit(campaign):
+    edit(campaign[1], "x_mm", "x")
+    refused(2, "data.csv", "'x' has no unit", "x_mm", campaign=campaign)
+
+
+def test_mixed_units(campaign):
+    edit(campaign[1], "y_mm", "y_m")
+    refused(2, "data.csv", "x_mm and y_m mix units", campaign=campaign)
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "", "abc", "12,5"])
+def test_no_number_in_a_cell(campaign, text):
+    set_cell(campaign[1], 5, "y_mm", text)
+    refused(2, "data.csv", "line 5", campaign=campaign)
+
+
+def test_empty_file(campaign):
+    campaign[1].write_text("")
+    refused(2, "data.csv", "empty", campaign=campaign)
+
+
+def test_header_only(campaign):
+    write_cells(campaign[1], cells_of(campaign[1])[:1])
+    refused(2, "data.csv", "no rows|no measurements|only a header", campaign=campaign)
+
+
+def test_one_row(campaign):
+    write_cells(campaign[1], cells_of(campaign[1])[:2])
+    refused(1, "data.csv", "measure", campaign=campaign)
+
+
+def test_duplicate_rows(campaign):
+    rows = cells_of(campaign[1])
+    write_cells(campaign[1], [*rows, rows[3]])
+    refused(2, "data.csv", "lines 4 and 14", "repeat", campaign=campaign)
+
+
+def test_unknown_marker(campaign):
+    rows = cells_of(campaign[1])
+    names = ["marker", *["M1"] * 4, "M7", *["M1"] * (len(rows) - 6)]
+    write_cells(campaign[1], [[n, *row] for n, row in zip(names, rows, strict=True)])
+    refused(2, "line 6", "M7", "M1", campaign=campaign)
+
+
+def test_joint_count_differs_from_the_robot(campaign):
+    drop_column(campaign[1], "q6_deg")
+    refused(2, "data.csv", "5 joint columns", "6 joints", campaign=campaign)
+
+
+def test_joints_beyond_limits(campaign):
+    set_cell(campaign[1], 4, "q2_deg", "77.0")
+    refused(2, "line 4", "joint2", "77°", "limits", campaign=campaign)
+
+
+def test_degrees_given_as_radians(campaign):
+    edit(campaign[1], r"q\d_deg", lambda m: m[0].replace("deg", "rad"), count=6)
+    refused(2, "degrees", "rename it to …_deg", campaign=campaign)
+
+
+def test_metres_given_as_millimetres(campaign):
+    edit(campaign[1], r"(\w)_mm", r"\1_m", count=3)
+    refused(2, "millimetres in columns named …_m", campaign=campaign)
+
+
+def test_millimetres_given_as_metres(campaign):
+    rows = cells_of(campaign[1])
+    scaled = [[*r[:6], *(f"{float(v) / 1e3:.9f}" for v in r[6:])] for r in rows[1:]]
+    write_cells(campaign[1], [rows[0], *scaled])
+    refused(2, "metres in columns named …_mm", campaign=campaign)
+
+
+def test_all_poses_equal(campaign):
+    rows = cells_of(campaign[1])
+    same = [[*rows[1][:6], *row[6:]] for row in rows[1:]]
+    write_cells(campaign[1], [rows[0], *same])
+    refused(1, "same pose", campaign=campaign)
+
+
+def test_fewer_equations_than_parameters(campaign):
+    write_cells(campaign[1], cells_of(campaign[1])[:5])
+    refused(1, "12 equations", "15 parameters", "measure more", campaign=campaign)
+
+
+def test_a_file_that_vanishes(campaign):
+    campaign[1].unlink()
+    refused(2, "data.csv", "no such file", campaign=campaign)
+
+
+def test_crlf_bom_and_semicolons_with_decimal_commas_are_understood(campaign):
+    cell, data = campaign
+    text = data.read_text(encoding="utf-8")
+    plain = run("identify", cell, data, "--json", "-q")
+    german = text.replace(",", ";").replace(".", ",").replace("\n", "\r\n")
+    data.write_bytes("\ufeff".encode() + german.encode())
+    assert plain[0] == 0
+    result = CliRunner().invoke(app, ["identify", str(cell), str(data), "--json", "-q"])
+    assert result.exit_code == 0, result.stderr
+    again = CliRunner().invoke(app, ["identify", str(cell), str(data), "--json", "-q"])
+    assert result.stdout == again.stdout
+
+
+def test_thousands_separators_are_refused_and_not_misread(campaign):
+    cell, data = campaign
+    text = data.read_text(encoding="utf-8").replace(",", ";")
+    data.write_text(text, encoding="utf-8")
+    edit(data, r"(-?\d+\.\d+);(-?\d+\.\d+)$", r"\1;1.234,5")
+    refused(2, "data.csv", r"1\.234,5", campaign=campaign)
+
+
+def test_binary_garbage(campaign):
+    campaign[1].write_bytes(bytes(range(256)) * 40)
+    refused(2, "data.csv", campaign=campaign)
+
+
+@pytest.mark.long
+def test_a_gigabyte_of_garbage_costs_no_memory(campaign):
+    resource = pytest.importorskip("resource")
+    with open(campaign[1], "ab") as handle:
+        block = b"garbage " * (1 << 17)
+        for _ in range(1024):
+            handle.write(block)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refused(2, "data.csv", campaign=campaign)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+# --- robot and cell ------------------------------------------------------------------------
+
+
+def test_malformed_urdf(campaign):
+    (campaign[0].parent / "arm.urdf").write_text("<robot><link name='a'></robot>")
+    refused(2, "arm.urdf", "line 1", campaign=campaign)
+
+
+def test_urdf_with_a_loop(campaign):
+    loop = (
+        '<joint name="again" type="fixed"><parent link="link_5"/><child link="link_2"/></joint>'
+        "</robot>"
+    )
+    edit(campaign[0].parent / "arm.urdf", "</robot>", loop)
+    refused(2, "arm.urdf", "link_2", "loop", campaign=campaign)
+
+
+def test_unnamed_flange_among_several(campaign):
+    more = '<link name="camera"/><joint name="c" type="fixed"><parent link="link_6"/>'
+    more += '<child link="camera"/></joint></robot>'
+    edit(campaign[0].parent / "arm.urdf", "</robot>", more)
+    refused(2, "arm.urdf", "flange", "camera", campaign=campaign)
+
+
+def test_flange_that_is_no_link(campaign):
+    edit(campaign[0], "arm.urdf\"", 'arm.urdf"\nflange = "flnge"')
+    refused(2, "flnge", "did you mean 'flange'", campaign=campaign)
+
+
+def test_malformed_toml(campaign):
+    edit(campaign[0], r"\[model\]", "[model")
+    refused(2, "cell.toml", "line", campaign=campaign)
+
+
+def test_unknown_key(campaign):
+    edit(campaign[0], "effects", "efects")
+    refused(2, "cell.toml", "efects", "effects", campaign=campaign)
+
+
+def test_unknown_effect(campaign):
+    edit(campaign[0], "joint_offset", "joint_ofset")
+    refused(2, "joint_ofset", "joint_offset", campaign=campaign)
+
+
+def test_missing_robot_file(campaign):
+    (campaign[0].parent / "arm.urdf").unlink()
+    refused(2, "arm.urdf", campaign=campaign)
+
+
+# --- outputs and options -------------------------------------------------------------------
+
+
+def test_output_folder_that_does_not_exist(campaign):
+    cell, data = campaign
+    code, message = run("identify", cell, data, "-o", cell.parent / "no" / "result.json", "-q")
+    assert code == 2 and "does not exist" in message
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_output_folder_that_cannot_be_written(campaign):
+    cell, data = campaign
+    folder = cell.parent / "locked"
+    folder.mkdir(mode=0o500)
+    code, message = run("identify", cell, data, "-o", folder / "result.json", "-q")
+    assert code == 2 and "permission" in message
+
+
+def test_output_that_is_a_directory(campaign):
+    cell, data = campaign
+    code, message = run("identify", cell, data, "-o", cell.parent, "-q")
+    assert code == 2 and "directory" in message
+
+
+def test_unknown_weights(campaign):
+    refused(2, "--weights", "sideways", campaign=campaign, extra=("--weights", "sideways"))
+
+
+def test_weights_that_nothing_states(campaign):
+    refused(2, "sigma_um", campaign=campaign, extra=("--weights", "axis"))
+
+
+def test_fixing_what_is_not_there(campaign):
+    refused(
+        2, "joint2.ofset", "joint2.offset", campaign=campaign, extra=("--fix", "joint2.ofset")
+    )
+
+
+def test_covariance_of_the_wrong_size(campaign):
+    path = campaign[0].parent / "covariance.csv"
+    path.write_text("1,0\n0,1\n")
+    refused(2, "covariance", "36", campaign=campaign, extra=("--covariance", path))
+
+
+def test_missing_arguments_are_a_usage_error():
+    code, message = run("identify")
+    assert code == 2 and "Traceback" not in message
