@@ -96,7 +96,7 @@ def test_cartesian_noise_of_cell_and_rows():
 
 def test_turning_station_and_points_together_turns_the_covariance():
     """About the vertical, which the tracker's angles refer to."""
-    points = np.random.default_rng(6).normal(size=(8, 3)) + [3, 0, 0]
+    points = np.random.default_rng(6).normal(size=(8, 3)) + np.array([3, 0, 0])
     c, s = np.cos(0.7), np.sin(0.7)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     a, _ = position_covariance(table(points), Tracker(STATION, NOISE), "polar")

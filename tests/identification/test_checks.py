@@ -8,8 +8,8 @@ from support.calibration import (
     GEOMETRY,
     cell_of,
     measured,
-    planar_chain,
     placement,
+    planar_chain,
     table_at,
     true_values,
 )
@@ -128,7 +128,7 @@ def test_prismatic_limits_are_in_metres():
     model = Model(Chain("slider", tuple(joints), placement([0.1, 0, 0])), cell_of(GEOMETRY))
     q = np.zeros((5, 3))
     q[2, 2] = 15.0  # not an angle: no talk of turns
-    with pytest.raises(InputError, match=r"line 4: joint3 \(slide\) at 15 m is beyond .* \[0, 0\.8"):
+    with pytest.raises(InputError, match=r"line 4: joint3 \(slide\) at 15 m is beyond"):
         check_limits(model, table_at(q))
 
 

@@ -30,7 +30,7 @@ def some_table(n=12, states=1, seed=0):
     rng = np.random.default_rng(seed)
     forces = [[0.0, 0.0, -100.0 * s] for s in range(states)]
     table = table_at(rng.normal(size=(n, 3)), forces)
-    position = rng.normal(size=(len(table), 3)) + [2.0, 1.0, 0.5]
+    position = rng.normal(size=(len(table), 3)) + np.array([2.0, 1.0, 0.5])
     return replace(table, position=position)
 
 

@@ -52,8 +52,7 @@ def rows_of(outliers):
 
 def false_alarms(model, tables, poses):
     return sum(
-        bool(identify(model, clean_table(model, seed, poses)[0]).outliers)
-        for seed in range(tables)
+        bool(identify(model, clean_table(model, seed, poses)[0]).outliers) for seed in range(tables)
     )
 
 
@@ -104,7 +103,7 @@ def test_errors_among_several_load_states_and_markers():
 def test_error_and_ratio_of_a_faulty_reading():
     """8 mm on one reading: so it is reported, in m and in multiples of the noise (√3 per σ)."""
     model = Model(planar_chain(), cell_of(PLACED))
-    table, truth, _ = clean_table(model, 5, 30)
+    table, _, _ = clean_table(model, 5, 30)
     table.position[11] += [0.0, 8e-3, 0.0]
     (outlier,) = identify(model, table).outliers
     assert outlier.line == 13

@@ -202,12 +202,8 @@ def test_expand_plan_orders_rows_as_one_would_measure():
     plan = table_at(np.arange(6.0).reshape(2, 3))
     rows = expand_plan(plan, ("A", "B"), repeats=2, load=np.array([0.0, 0.0, -100.0]))
     assert len(rows) == 2 * 2 * 2 * 2
-    labels = list(
-        zip(rows.configuration, rows.repeat, rows.force[:, 2], rows.marker, strict=True)
-    )
-    expected = [
-        (c, r, f, m) for c in (0, 1) for r in (0, 1) for f in (0.0, -100.0) for m in (0, 1)
-    ]
+    labels = list(zip(rows.configuration, rows.repeat, rows.force[:, 2], rows.marker, strict=True))
+    expected = [(c, r, f, m) for c in (0, 1) for r in (0, 1) for f in (0.0, -100.0) for m in (0, 1)]
     assert labels == expected
     assert rows.marker_names == ("A", "B")
     assert np.array_equal(rows.row, np.arange(16) + 2)

@@ -29,7 +29,9 @@ def random_chain(seed: int, n: int = 6, vertical_first: bool = False) -> Chain:
     rng = np.random.default_rng(seed)
     joints = []
     for i in range(n):
-        T = placement(rng.uniform(-0.3, 0.3, 3) + [0, 0, 0.2], Rotation.random(random_state=rng))
+        T = placement(
+            rng.uniform(-0.3, 0.3, 3) + np.array([0, 0, 0.2]), Rotation.random(random_state=rng)
+        )
         axis = rng.normal(size=3)
         if i == 0 and vertical_first:
             T, axis = placement([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 1.0])
@@ -75,7 +77,9 @@ def cell_of(
     )  # fmt: skip
 
 
-def table_at(q: Array, forces: Any = ((0, 0, 0),), markers: Sequence[str] = ("M1",)) -> Measurements:
+def table_at(
+    q: Array, forces: Any = ((0, 0, 0),), markers: Sequence[str] = ("M1",)
+) -> Measurements:
     """Every pose under every force with every marker; a configuration per pose, positions zero.
 
     `forces` (states, 3) for all poses, or (poses, states, 3).

@@ -76,7 +76,7 @@ def _noise(result: IdentificationResult) -> list[str]:
     return [
         f"The residual is {ratio:.1f} times the stated noise ({result.noise['description']}): "
         "something is unmodelled or the stated noise is too small. The intervals use the "
-        "residual, not the stated noise; add effects or run diagnose."
+        "residual, not the stated noise; look for effects that the model lacks."
     ]
 
 
@@ -91,7 +91,7 @@ def _bounds(result: IdentificationResult, solution: Solution) -> list[str]:
                 f"{e.name} stands at its bound {bound:g} {e.unit}; its interval does not hold. "
                 "Check load direction and torque signs, or fix it there."
             )
-        elif e.value is not None:
+        elif e.value is not None and e.std is not None and abs(e.value - bound) > 2 * e.std:
             found.append(
                 f"{e.name} = {e.value:.3g} ± {e.std:.2g} {e.unit} lies beyond its physical bound "
                 f"{bound:g}: check load direction and torque signs, measure poses that load it "

@@ -137,9 +137,7 @@ def errors(result: IdentificationResult) -> str:
         for k, (name, v) in enumerate(rows):
             colour = SERIES[0] if name.startswith("nominal") else SERIES[1]
             axes.plot([v * 1e6], [-k], "o", color=colour, markersize=8)
-            axes.annotate(
-                length(v), (v * 1e6, -k), (0, 7), textcoords="offset points", ha="center"
-            )
+            axes.annotate(length(v), (v * 1e6, -k), (0, 7), textcoords="offset points", ha="center")
         names = [name.replace(" (", "\n(") for name, _ in rows]
         axes.set_yticks([-k for k in range(len(rows))], names)
         axes.set_ylim(0.6 - len(rows), 0.7)

@@ -27,7 +27,8 @@ from elastocal.report.words import (
 __all__ = ["combination_table", "parameter_table", "print_result", "summary_lines"]
 
 NARROW = 80  # columns; below, each number shares one column with its interval and unit
-FEW = 6  # parameters without a number of their own, which the table may list one by one
+WIDE = 110  # columns; from here on a note fits beside the numbers
+FEW = 6  # parameters without a number of their own, which the table then lists one by one
 STYLE = {"inside": "green", "outside": "bold red"}
 
 
@@ -82,7 +83,7 @@ def print_result(
     """Single estimates, combinations, what is not determined, and the summary in words."""
     brief = console.width < NARROW
     alone = len(names_of(result, ALONE))
-    listed = not brief and 0 < len(result.estimates) - alone <= FEW
+    listed = console.width >= WIDE and 0 < len(result.estimates) - alone <= FEW
     if alone or listed:
         console.print(parameter_table(result, truth, listed, brief))
     if result.combinations:

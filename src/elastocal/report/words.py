@@ -92,9 +92,7 @@ def inside(value: float | None, ci95: tuple[float, float] | None) -> str:
 def coverage(result: IdentificationResult, truth: Truth) -> tuple[int, int]:
     """How many 95 % intervals hold the true value, of how many that could be compared."""
     found = [inside(truth.get(e.name), e.ci95) for e in result.estimates]
-    found += [
-        inside(combination_truth(result, c, truth), c.ci95) for c in result.combinations
-    ]
+    found += [inside(combination_truth(result, c, truth), c.ci95) for c in result.combinations]
     return found.count("inside"), len(found) - found.count("")
 
 
