@@ -157,9 +157,7 @@ def test_polar_noise_has_a_constant_part_and_a_part_per_metre(read):
 
 
 def test_dh_robot_with_convention_and_masses(read, folder):
-    robot = read(
-        '[robot]\ndh = "dh.csv"\ndh_convention = "modified"\nmasses = "links.csv"'
-    ).robot
+    robot = read('[robot]\ndh = "dh.csv"\ndh_convention = "modified"\nmasses = "links.csv"').robot
     assert (robot.dh, robot.masses) == (folder / "dh.csv", folder / "links.csv")
     assert robot.dh_convention == "modified"
 

@@ -27,7 +27,7 @@ def test_a_failure_leaves_the_old_file_and_no_temporary_one(tmp_path, failure):
 
 
 def test_missing_folder_is_an_input_error_that_names_it(tmp_path):
-    with pytest.raises(InputError, match="folder .*absent does not exist"):
+    with pytest.raises(InputError, match=r"folder .*absent does not exist"):
         atomic_write_text(tmp_path / "absent" / "a.txt", "")
 
 

@@ -163,9 +163,7 @@ def test_what_is_written_reads_back_bit_for_bit(tmp_path, table, data):
     joints = table.q.shape[1]
     kinds = tuple(
         data.draw(
-            st.lists(
-                st.sampled_from(["revolute", "prismatic"]), min_size=joints, max_size=joints
-            )
+            st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=joints, max_size=joints)
         )
     )
     path = tmp_path / "data.csv"

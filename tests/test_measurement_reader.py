@@ -480,7 +480,7 @@ def parquet(tmp_path, monkeypatch):
 
 
 def test_parquet_columns_follow_the_same_rules(parquet):
-    numbers = dict.fromkeys(HEADER.split(","), [1, 2])
+    numbers = {name: [1, 2] for name in HEADER.split(",")}
     got = parquet({**numbers, "marker": ["B", "A"], "configuration": [7, 3]})
     assert got.position[1].tolist() == [0.002, 0.002, 0.002]
     assert got.marker_names == ("B", "A")

@@ -93,8 +93,10 @@ def one(name: str, n: int, seed: int) -> tuple[float, float, int]:
     information = (B[:, kept] * sizes[kept]).T @ (B[:, kept] * sizes[kept])
     B_test = arm.regressor(test, x, kept).B * sizes[kept]
     spread = np.einsum("ij,ji->", B_test, np.linalg.solve(information, B_test.T))
-    return float((error**2).sum() / TEST_POSES), float(spread * SIGMA**2 / TEST_POSES), len(
-        found.determined
+    return (
+        float((error**2).sum() / TEST_POSES),
+        float(spread * SIGMA**2 / TEST_POSES),
+        len(found.determined),
     )
 
 

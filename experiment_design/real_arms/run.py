@@ -1,6 +1,6 @@
 """Identify the real arms of the public data sets, by elastocal's own command line.
 
-    ELASTOCAL_DATASETS=… python run.py      prints a table, writes result.md and out/*.json
+ELASTOCAL_DATASETS=… python run.py      prints a table, writes result.md and out/*.json
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def main() -> None:
     data, out = prepare(), HERE / "out"
     out.mkdir(exist_ok=True)
     lines = [HEADER]
-    print("\nAll errors in mm; rms and mean of the 3-D position error (of the length for cables).\n")
+    print("\nErrors in mm: rms and mean of the 3-D position error, of the length for cables.\n")
     print(HEADER)
     for k, (label, cell, table, test, options) in enumerate(RUNS):
         result = out / f"{k}_{Path(cell).stem}.json"

@@ -1,4 +1,5 @@
 """The work cell as the user describes it: TOML → frozen dataclasses (DESIGN: cell file)."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field

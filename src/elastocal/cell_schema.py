@@ -42,9 +42,7 @@ class ToolTable(Table):
 class TrackerTable(Table):
     position_m: Vector3 | None = _key("three numbers in m")
     anchor_m: Vector3 | None = _key("three numbers in m")
-    sigma_um: Positive | Positive3 | None = _key(
-        "one positive number in µm, or three for x, y, z"
-    )
+    sigma_um: Positive | Positive3 | None = _key("one positive number in µm, or three for x, y, z")
     range_um: Positive | None = _key("a positive number in µm")
     range_ppm: NonNegative | None = _key("a number >= 0 in µm per m")
     transverse_um: Positive | None = _key("a positive number in µm")

@@ -173,6 +173,6 @@ def _check_required(
             )
             found = listed((c.header for cs in present.values() for c in cs.values()), 12)
             raise InputError(
-                f"{source}: the columns {needed} are missing, which observe = \"{observe}\" in "
+                f'{source}: the columns {needed} are missing, which observe = "{observe}" in '
                 f"the cell file needs; found {found or 'no known column'}"
             )

@@ -1,4 +1,5 @@
 """What the user measured: one validated, frozen table in SI units."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace

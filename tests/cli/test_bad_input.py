@@ -178,7 +178,7 @@ def test_crlf_bom_and_semicolons_with_decimal_commas_are_understood(campaign):
 
 
 def test_thousands_separators_are_refused_and_not_misread(campaign):
-    cell, data = campaign
+    data = campaign[1]
     text = data.read_text(encoding="utf-8").replace(",", ";")
     data.write_text(text, encoding="utf-8")
     edit(data, r"(-?\d+\.\d+);(-?\d+\.\d+)$", r"\1;1.234,5")
@@ -227,7 +227,7 @@ def test_unnamed_flange_among_several(campaign):
 
 
 def test_flange_that_is_no_link(campaign):
-    edit(campaign[0], "arm.urdf\"", 'arm.urdf"\nflange = "flnge"')
+    edit(campaign[0], 'arm.urdf"', 'arm.urdf"\nflange = "flnge"')
     refused(2, "flnge", "did you mean 'flange'", campaign=campaign)
 
 
@@ -284,9 +284,7 @@ def test_weights_that_nothing_states(campaign):
 
 
 def test_fixing_what_is_not_there(campaign):
-    refused(
-        2, "joint2.ofset", "joint2.offset", campaign=campaign, extra=("--fix", "joint2.ofset")
-    )
+    refused(2, "joint2.ofset", "joint2.offset", campaign=campaign, extra=("--fix", "joint2.ofset"))
 
 
 def test_covariance_of_the_wrong_size(campaign):

@@ -102,7 +102,6 @@ def test_small_angles_in_degrees_taken_for_radians(model):
             "probably degrees given as radians (or the reverse), or another robot")  # fmt: skip
 
 
-@pytest.mark.xfail(strict=True, reason="the ratio of extents is 22 here, EXTENT_FACTOR is 30")
 def test_radians_in_columns_of_degrees(model):
     table = table_for(model)
     radians = replace(table, q=np.radians(table.q))

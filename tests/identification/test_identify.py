@@ -411,7 +411,6 @@ def test_a_fixed_parameter_stays():
     assert result.residual_rms > identify(model, table).residual_rms
 
 
-@pytest.mark.xfail(strict=True, reason="start_values places what the user fixed, hint or no hint")
 def test_fixing_the_base_at_its_hint():
     """Base position and attitude given and held: used exactly, the rest identified."""
     R = Rotation.random(random_state=5)

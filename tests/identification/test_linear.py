@@ -27,8 +27,10 @@ def rational_solution(B, y, w):
                 factor = table[k][i]
                 table[k] = [a - factor * b for a, b in zip(table[k], table[i], strict=True)]
     x = [line[-1] for line in table]
-    rss = sum((v - sum(a * b for a, b in zip(r, x, strict=True))) ** 2
-              for r, v in zip(rows, right, strict=True))
+    rss = sum(
+        (v - sum(a * b for a, b in zip(r, x, strict=True))) ** 2
+        for r, v in zip(rows, right, strict=True)
+    )
     inverse = np.array([[float(v) for v in line[p : 2 * p]] for line in table])
     return np.array([float(v) for v in x]), inverse, float(rss)
 
@@ -52,9 +54,7 @@ def nearly_dependent_problem(seed, gap=1e-11):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(
-    "problem", [random_problem, polynomial_problem, nearly_dependent_problem]
-)
+@pytest.mark.parametrize("problem", [random_problem, polynomial_problem, nearly_dependent_problem])
 def test_equals_rational_arithmetic(problem, seed):
     B, y, w = problem(seed)
     x, cofactor, rss = rational_solution(B, y, w)
@@ -63,8 +63,12 @@ def test_equals_rational_arithmetic(problem, seed):
     np.testing.assert_allclose(solution.x, x, rtol=1e-13)
     sizes = np.sqrt(np.diag(cofactor))
     np.testing.assert_allclose(np.sqrt(np.diag(solution.cofactor)), sizes, rtol=1e-13)
-    np.testing.assert_allclose(solution.cofactor / np.outer(sizes, sizes),
-                               cofactor / np.outer(sizes, sizes), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        solution.cofactor / np.outer(sizes, sizes),
+        cofactor / np.outer(sizes, sizes),
+        rtol=0,
+        atol=1e-13,
+    )
     assert solution.rss == pytest.approx(rss, rel=1e-13)
     assert solution.optimality < 1e-15
 
@@ -160,8 +164,9 @@ def test_scale_and_tolerance_decide_what_counts_as_dependent():
     typical = np.array([1, 1, 1e-9, 1, 1, 1])
     assert solve_weighted(B, y, w, scale=typical).rank == 6
     assert list(solve_weighted(B, y, w, scale=typical, rank_tolerance=1e-6).dropped) == [2]
-    np.testing.assert_allclose(solve_weighted(B, y, w, scale=typical).x,
-                               solve_weighted(B, y, w).x, rtol=1e-13)
+    np.testing.assert_allclose(
+        solve_weighted(B, y, w, scale=typical).x, solve_weighted(B, y, w).x, rtol=1e-13
+    )
 
 
 def test_zero_tolerance_survives_exact_dependence():

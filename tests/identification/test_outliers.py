@@ -167,10 +167,6 @@ def test_dropping_equals_never_having_had_them(seed):
     assert dropped.heldout_rms == pytest.approx(never.heldout_rms, rel=1e-4)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="solve: under residuals of 2 cm no parameter's typical size is worth a column",
-)
 def test_errors_of_decimetres_do_not_end_the_identification():
     """6 of 40 readings off by up to 0.1 m, base and marker to be placed."""
     model = Model(planar_chain(), cell_of(PLACED))
@@ -224,9 +220,6 @@ def test_stated_sigmas_count():
     assert rows_of(result.outliers).tolist() == [20]
 
 
-@pytest.mark.xfail(
-    strict=True, reason="refits get the covariance of all rows, are refused, and the search ends"
-)
 def test_outliers_are_found_under_a_given_covariance_too():
     model = Model(planar_chain(), cell_of(PLACED))
     table, _, _ = clean_table(model, 10, 30)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.cells import kr270_chain, random_table
 
 from elastocal.cell import Cell, EffectChoice, ModelSpec, Robot, Tool
 from elastocal.identification.identify import identify
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
-from support.cells import kr270_chain, random_table
 
 PAGE = Path(__file__).parents[2] / "docs" / "adding-an-effect.md"
 

@@ -124,7 +124,7 @@ def test_base_and_flange_names_are_checked(tmp_path: Path) -> None:
         read(tmp_path, arm(), base="L0")
     with pytest.raises(InputError, match=r"flange link 'l44' is not there \(did you mean 'l4'"):
         read(tmp_path, arm(), flange="l44")
-    with pytest.raises(InputError, match="flange 'l1' is not below base 'l3'; links.*: l4$"):
+    with pytest.raises(InputError, match=r"flange 'l1' is not below base 'l3'; links.*: l4$"):
         read(tmp_path, arm(), base="l3", flange="l1")
     with pytest.raises(InputError, match=r"0 moving joints between 'l2' and 'l2' \(none\)"):
         read(tmp_path, arm(), base="l2", flange="l2")
@@ -146,7 +146,7 @@ def test_unreadable_files_are_explained(tmp_path: Path) -> None:
         read_urdf(binary)
     encoded = tmp_path / "encoded.urdf"
     encoded.write_bytes(b'<?xml version="1.0" encoding="shift_jis"?><robot/>')
-    with pytest.raises(InputError, match="not XML|has no <link>"):
+    with pytest.raises(InputError, match=r"not XML|has no <link>"):
         read_urdf(encoded)
 
 

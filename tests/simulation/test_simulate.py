@@ -133,7 +133,6 @@ def test_poses():
     assert low < (((noisy.position - exact.position) / AXIS.noise.sigma) ** 2).sum() < high
 
 
-@pytest.mark.xfail(strict=True, reason="simulate asks a plan for the rotations it is to make")
 def test_poses_from_a_plan_without_rotations():
     model, truth = pose_case()
     plan = replace(plan_of(model), position=None)
@@ -235,7 +234,6 @@ def test_an_arm_that_buckles_is_refused_with_its_line():
         simulate(model, plan, model.nominal, 0)
 
 
-@pytest.mark.xfail(strict=True, reason="simulate returns NaN distances without a word")
 def test_distances_without_equilibrium_are_refused_with_their_line():
     nominal = Nominal(joint_compliance=(1e-3,) * 6)
     cell = cell_of(("joint_compliance",), observe="distance", nominal=nominal)

@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-
 from support.robots import KR270
 
 CELL = """\
@@ -23,9 +22,10 @@ effects = ["base_frame", "joint_offset", "marker_position"]
 
 def write_campaign(folder: Path, poses: int = 12) -> tuple[Path, Path]:
     """cell.toml, arm.urdf and an exact data.csv (degrees, millimetres) in `folder`."""
+    from support.cells import random_poses, table_of
+
     from elastocal.cell_reader import read_cell
     from elastocal.manipulator.model import Model
-    from support.cells import random_poses, table_of
 
     shutil.copyfile(KR270, folder / "arm.urdf")
     cell = folder / "cell.toml"

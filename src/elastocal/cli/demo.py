@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import Seed, app, console, progress_line, reporting_errors
+from elastocal.cli.app import Json, Seed, app, console, progress_line, reporting_errors
 
 
 @app.command()
@@ -17,6 +18,7 @@ def demo(
         Path, typer.Option("-o", "--output", help="Folder for the example's files.")
     ] = Path("demo_out"),
     seed: Seed = 2013,
+    as_json: Json = False,
 ) -> None:
     """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
 
@@ -29,7 +31,10 @@ def demo(
         done = run_demo(folder, seed, progress)
         report = folder / "report.html"
         inputs = [done.cell, done.plan, done.data]
-        write_results(done.result, folder / "result.json", report, None, inputs, done.truth)
+        write_results(done.result, folder / "result.json", report, None, inputs, done.truth, seed)
+    if as_json:
+        typer.echo(json.dumps(done.result.to_json() | {"truth": done.truth}, indent=1))
+        return
     from elastocal.report.tables import print_result
 
     print_result(console(), done.result, truth=done.truth)

@@ -38,9 +38,7 @@ def identify(
     test: Annotated[
         Path | None, typer.Option(help="Measurements never fitted, to test the result on.")
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option(help="Write a report (one HTML page).")
-    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")] = None,
     residuals: Annotated[
         Path | None, typer.Option(help="Write residuals of every reading as CSV.")
     ] = None,
@@ -89,7 +87,7 @@ def identify(
         )
         result = run(model, tables[0], chosen, None if test is None else tables[1], progress)
         inputs = [p for p in (cell, data, test, covariance) if p is not None]
-        write_results(result, output, report, residuals, inputs)
+        write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
         typer.echo(json.dumps(result.to_json(), indent=1))
         return

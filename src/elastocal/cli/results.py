@@ -19,6 +19,7 @@ def write_results(
     residuals: Path | None,
     inputs: list[Path],
     truth: dict[str, float] | None = None,
+    seed: int | None = None,
 ) -> None:
     """Write what was asked for, each file whole or not at all.
 
@@ -37,4 +38,4 @@ def write_results(
         from elastocal.report.html import write_report
 
         command = " ".join(["elastocal", *sys.argv[1:]])
-        write_report(result, report, truth=truth, command=command, inputs=inputs)
+        write_report(result, report, truth=truth, command=command, inputs=inputs, seed=seed)

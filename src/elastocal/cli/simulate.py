@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import CellFile, Seed, app, check_outputs, reporting_errors
+from elastocal.cli.app import CellFile, Json, Seed, app, check_outputs, reporting_errors
 from elastocal.errors import InputError
 
 
@@ -35,6 +35,7 @@ def simulate(
     repeats: Annotated[int, typer.Option(min=1, help="Readings per pose and load state.")] = 1,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Exact readings.")] = False,
     seed: Seed = 0,
+    as_json: Json = False,
 ) -> None:
     """Synthetic measurements from the cell's model, with chosen errors and noise.
 
@@ -65,9 +66,13 @@ def simulate(
     rows = expand_plan(poses, tuple(model.cell.tool.markers), repeats, force)
     table = run(model, rows, x, rng, noise=not no_noise)
     write_measurements(table, output, model.chain.kinds)
+    named = dict(zip(model.names, (float(v) for v in x), strict=True))
     if truth is not None:
-        named = dict(zip(model.names, (float(v) for v in x), strict=True))
         atomic_write_text(truth, json.dumps(named, indent=1) + "\n")
+    if as_json:
+        summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
+        typer.echo(json.dumps(summary | {"seed": seed, "truth": named}, indent=1))
+        return
     typer.echo(f"wrote {len(table)} readings of {len(poses)} poses to {output}")
 
 

@@ -12,7 +12,7 @@ from elastocal.identification.result import IdentificationResult, Outlier
 from elastocal.identification.solve import Solution
 
 FEW_DOF_PER_PARAMETER = 1.0
-ILL_CONDITIONED = 1e4
+ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
 FAR_ABOVE_STATED = 2.0
 MANY = 0.05
 
@@ -56,7 +56,9 @@ def _few_poses(result: IdentificationResult) -> list[str]:
 
 def _conditioning(result: IdentificationResult, solution: Solution) -> list[str]:
     kept = solution.reduction.kept
-    scaled = solution.problem.weights.apply(solution.fit.B) * solution.sizes[kept]
+    # Unit columns: what is judged is how far they are from parallel, not their units.
+    scaled = solution.problem.weights.apply(solution.fit.B)
+    scaled = scaled / np.linalg.norm(scaled, axis=0)
     _, singular, Vt = linalg.svd(linalg.qr(scaled, mode="r")[0][: len(kept)])
     if singular[0] <= ILL_CONDITIONED * singular[-1]:
         return []
@@ -82,14 +84,16 @@ def _noise(result: IdentificationResult) -> list[str]:
 
 def _bounds(result: IdentificationResult, solution: Solution) -> list[str]:
     found = []
+    at_bound = {result.model.names[c] for c in solution.reduction.at_bound}
     for e, p in zip(result.estimates, result.model.parameters, strict=True):
         if p.lower < e.held < p.upper or not (np.isfinite(p.lower) or np.isfinite(p.upper)):
             continue
         bound = p.lower if e.held <= p.lower else p.upper
-        if solution.problem.bounded:
+        if p.name in at_bound:
             found.append(
-                f"{e.name} stands at its bound {bound:g} {e.unit}; its interval does not hold. "
-                "Check load direction and torque signs, or fix it there."
+                f"{e.name} stands at its bound {bound:g} {e.unit}; it is held there and has no "
+                "interval. Check load direction and torque signs, or measure poses that load it "
+                "more."
             )
         elif e.value is not None and e.std is not None and abs(e.value - bound) > 2 * e.std:
             found.append(
@@ -107,12 +111,17 @@ def _lines(readings: tuple[Outlier, ...]) -> str:
     return f"lines {shown}{' …' if len(runs) > 8 else ''}"
 
 
+def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
+    n = len(readings)
+    return f"1 reading {one}" if n == 1 else f"{n} readings {many}"
+
+
 def _outliers(result: IdentificationResult) -> list[str]:
     found = []
     if result.outliers:
         lines = _lines(result.outliers)
         found.append(
-            f"{len(result.outliers)} readings lie beyond what the noise explains ({lines}). "
+            f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains ({lines}). "
             "Check them; --drop-outliers leaves them out and says so."
         )
         if len(result.outliers) > MANY * len(result.observations.lead):
@@ -124,7 +133,7 @@ def _outliers(result: IdentificationResult) -> list[str]:
     if result.excluded:
         lines = _lines(result.excluded)
         found.append(
-            f"{len(result.excluded)} readings were left out as faulty ({lines}); all "
-            "are listed in the result under 'excluded'."
+            f"{_count(result.excluded, 'was', 'were')} left out as faulty ({lines}); all are "
+            "listed in the result under 'excluded'."
         )
     return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
@@ -17,6 +19,7 @@ Array = NDArray[np.float64]
 # Readings and nominal arm may differ this much in extent (a long tool, few joints moving)
 # before a wrong unit is the likelier cause.
 EXTENT_FACTOR = 30.0
+SMALL_ANGLE = np.radians(2 * np.pi)  # what a full turn in rad reads as in degrees
 LIMIT_SLACK = np.radians(0.5)  # controllers overshoot soft limits by a little
 SAME = 1e-9
 
@@ -107,18 +110,27 @@ def _check_units(model: Model, table: Measurements) -> None:
     if reach < SAME or extent < SAME:
         return
     ratio = extent / reach
-    if 1 / EXTENT_FACTOR < ratio < EXTENT_FACTOR:
-        return
-    if ratio > EXTENT_FACTOR and np.abs(table.q).max() < 0.12:
-        cause = "the joint angles are probably radians in columns named …_deg"
+    if _looks_like_radians(model, table, ratio, extent):
+        cause = "the joint angles are probably radians in columns named …_deg: rename to …_rad"
     elif ratio > EXTENT_FACTOR:
         cause = "the positions are probably millimetres in columns named …_m: rename to …_mm"
-    else:
+    elif ratio < 1 / EXTENT_FACTOR:
         cause = "the positions are probably metres in columns named …_mm: rename to …_m"
+    else:
+        return
     raise InputError(
         f"{table.source}: the readings extend over {extent * 1e3:.4g} mm, but the nominal arm's "
         f"flange moves over {reach * 1e3:.4g} mm at these joint values; {cause}"
     )
+
+
+def _looks_like_radians(model: Model, table: Measurements, ratio: float, extent: float) -> bool:
+    """Radians read as degrees: the arm hardly moves, and turned back it moves as measured."""
+    if ratio < 3 or "prismatic" in model.chain.kinds or np.abs(table.q).max() > SMALL_ANGLE:
+        return False
+    turned = replace(table, q=np.degrees(table.q))
+    flange = rigid_model(model).flange_poses(turned)[:, :3, 3]
+    return 1 / 3 < extent / float(np.linalg.norm(np.ptp(flange, axis=0))) < 3
 
 
 def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:

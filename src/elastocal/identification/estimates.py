@@ -117,15 +117,17 @@ def _estimates(
         found[int(d)] = Estimate(
             p.name, p.unit, p.nominal, float(x[d]), combined_with=tuple(partners[int(d)]), note=note
         )
+    for c in reduction.at_bound:
+        p = model.parameters[c]
+        note = f"held at its bound {x[c]:g}: the data want it beyond"
+        found[int(c)] = Estimate(p.name, p.unit, p.nominal, float(x[c]), note=note)
     for i, p in enumerate(model.parameters):
         if i not in found:
             found[i] = Estimate(p.name, p.unit, p.nominal, float(x[i]), note="fixed by the user")
     return tuple(found[i] for i in range(len(model.parameters))), tuple(combinations)
 
 
-def _correlations(
-    covariance: Array, names: tuple[str, ...]
-) -> tuple[tuple[str, str, float], ...]:
+def _correlations(covariance: Array, names: tuple[str, ...]) -> tuple[tuple[str, str, float], ...]:
     """Pairs with |ρ| over 0.9, strongest first."""
     std = np.sqrt(np.diag(covariance))
     rho = covariance / np.outer(std, std)

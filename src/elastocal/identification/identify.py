@@ -19,6 +19,8 @@ from elastocal.manipulator.observation import Observations, observe, subset
 from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]
+
+
 @dataclass(frozen=True)
 class Options:
     """How to identify.
@@ -58,12 +60,17 @@ def identify(
         check_table(model, test)
     seen = observe(table, model.observe)
     progress("finding the start")
-    x0 = start_values(model, table, options.seed)
-    whole = _solution(model, seen, x0, options, progress)
+    free = fixed_and_free(model, options.fixed)
+    x0 = start_values(model, table, options.seed, free)
+    whole = _solution(model, seen, x0, free, options, progress)
 
     def refit(good: NDArray[np.bool_], final: bool = False) -> Solution:
+        chosen = options
+        if options.covariance is not None:
+            rows = np.repeat(good, seen.size)
+            chosen = replace(options, covariance=options.covariance[np.ix_(rows, rows)])
         silent = progress if final else _silent
-        return _solution(model, subset(seen, good), x0, options, silent, final)
+        return _solution(model, subset(seen, good), x0, free, chosen, silent, final)
 
     progress("looking for faulty readings")
     faulty, clean = find_faulty(whole, refit)
@@ -86,11 +93,11 @@ def _solution(
     model: Model,
     seen: Observations,
     x0: Array,
+    free: NDArray[np.int64],
     options: Options,
     progress: Progress,
     try_wider: bool = True,
 ) -> Solution:
-    free = fixed_and_free(model, options.fixed)
     weights = weights_for(seen, model.cell.tracker, options.weights, options.covariance)
     problem = Problem(model, seen, weights, x0, free, options.bounded)
     solution = solve(problem, progress, try_wider)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +29,15 @@ class Reduction:
     """`kept` and `dropped` parameter indices; `mixing` (kept, dropped) with B_D ≈ B_K · mixing.
 
     The data determine β_k = X_k + Σ_d mixing[k, d] X_d, the kept parameter with what it stands
-    for.  `invisible` are dropped parameters that move no reading at all.
+    for.  `invisible` are dropped parameters that move no reading at all,
+    `at_bound` those that a bounded fit holds at their bound.
     """
 
     kept: NDArray[np.int64]
     dropped: NDArray[np.int64]
     mixing: Array
     invisible: NDArray[np.int64]
+    at_bound: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def terms(self, k: int, sizes: Array, std: float) -> dict[int, float]:
         """Parameters combined with kept parameter number k, and their factors.

@@ -18,18 +18,25 @@ DISTANCE_STARTS = 64
 DISTANCE_SAMPLE = 300
 
 
-def start_values(model: Model, table: Measurements, seed: int = 0) -> Array:
+def start_values(
+    model: Model, table: Measurements, seed: int = 0, free: NDArray[np.int64] | None = None
+) -> Array:
     """Parameter values (parameters,) near the data: nominal, but base, markers and cable placed.
 
-    Only parameters that are active in the model are moved.  Positions are registered to the
-    nominal arm; distances are fitted by a robust multi-start.
+    Only parameters that are active in the model and among `free` (default all) are moved.
+    Positions are registered to the nominal arm; distances are fitted by a robust multi-start.
     """
     x = model.nominal.copy()
+    movable = set(range(len(x)) if free is None else free.tolist())
     if model.observe == "distance":
-        return _distance_start(model, table, x, seed)
+        return _distance_start(model, table, x, seed, movable)
     if table.position is None:
         return x
-    places = {p.where for p in model.parameters if p.effect in ("base_frame", "marker_position")}
+    places = {
+        p.where
+        for i, p in enumerate(model.parameters)
+        if i in movable and p.effect in ("base_frame", "marker_position")
+    }
     if not places:
         return x
     names = list(model.cell.tool.markers)
@@ -58,7 +65,7 @@ def start_values(model: Model, table: Measurements, seed: int = 0) -> Array:
     if model.observe == "pose" and table.rotation is not None:
         values |= _target_rotations(found.rotation, T, table.take(rows), codes[rows], names)
     for i, parameter in enumerate(model.parameters):
-        if parameter.name in values:
+        if parameter.name in values and i in movable:
             x[i] = values[parameter.name]
     return x
 
@@ -76,7 +83,9 @@ def _target_rotations(
     return values
 
 
-def _distance_start(model: Model, table: Measurements, x: Array, seed: int) -> Array:
+def _distance_start(
+    model: Model, table: Measurements, x: Array, seed: int, movable: set[int]
+) -> Array:
     """Anchor, offset and attachment by robust least squares from many anchors.
 
     A distance tells the side of the robot on which the anchor lies only through all poses
@@ -84,7 +93,7 @@ def _distance_start(model: Model, table: Measurements, x: Array, seed: int) -> A
     """
     columns = np.array(
         [i for i, p in enumerate(model.parameters)
-         if p.effect in ("distance_sensor", "marker_position")]
+         if i in movable and p.effect in ("distance_sensor", "marker_position")]
     )  # fmt: skip
     if not len(columns):
         return x
@@ -120,5 +129,3 @@ def _distance_start(model: Model, table: Measurements, x: Array, seed: int) -> A
             best, best_cost = trial.copy(), found.cost
             best[columns] = found.x
     return best
-
-

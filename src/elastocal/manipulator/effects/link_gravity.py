@@ -30,7 +30,7 @@ class LinkGravity(Effect):
         require(
             bool(chain.masses),
             f"link_gravity is on, but robot '{chain.name}' has no masses: give <inertial> "
-            "elements in the URDF, or [robot] masses = \"links.csv\" for a DH robot, "
+            'elements in the URDF, or [robot] masses = "links.csv" for a DH robot, '
             "or set [model] link_gravity = false",
         )
         return ()
