@@ -73,7 +73,7 @@ def test_sets_are_complete():
 @pytest.mark.parametrize("name", sorted(set(CERTIFIED) - {"Filip"}))
 def test_far_more_digits_where_the_data_are_exact_numbers(name):
     # Filip is limited by the rounding of x**k to double, which its condition of 5e9 amplifies
-    B, y, _ = read(name)
+    B, y, certified = read(name)
     solution = solve_weighted(B, y)
     assert digits(solution.x, certified["x"]) > 13
     if name not in EXACT_FIT:
