@@ -25,16 +25,32 @@ SAME = 1e-9
 
 
 def check_table(model: Model, table: Measurements) -> None:
-    """Joint count, joint limits and units of a table against the robot.
+    """A table to fit: as any table, and more than one pose.
 
-    Raises InputError that names file, line, joint and remedy.
+    Raises InputError that names file, line, joint and remedy; InsufficientDataError where all
+    rows hold the same pose.
     """
+    check_rows(model, table)
+    if len(np.unique(table.q, axis=0)) < 2:
+        raise InsufficientDataError(
+            f"{table.source}: all {len(table)} rows hold the same pose; measure at different "
+            "joint angles (at least as many poses as a third of the parameters)"
+        )
+
+
+def check_rows(model: Model, table: Measurements) -> None:
+    """Any table: finite numbers, joint count, joint limits, units; InputError otherwise."""
     n = model.chain.n_joints
     if table.q.shape[1] != n:
         raise InputError(
             f"{table.source} has {table.q.shape[1]} joint columns, but robot "
             f"'{model.chain.name}' has {n} joints"
         )
+    for name in ("q", "position", "rotation", "distance", "force", "torque", "sigma"):
+        values = getattr(table, name)
+        if values is not None and not np.isfinite(values).all():
+            k = int(np.argwhere(~np.isfinite(values))[0][0])
+            raise InputError(f"{table.source}, line {table.row[k]}: {name} is not finite")
     check_limits(model, table)
     _check_units(model, table)
 
@@ -96,12 +112,6 @@ def check_limits(model: Model, table: Measurements) -> None:
 
 def _check_units(model: Model, table: Measurements) -> None:
     """Compare the extent of the readings with that of the nominal arm at the same joints."""
-    poses = np.unique(table.q, axis=0)
-    if len(poses) < 2:
-        raise InsufficientDataError(
-            f"{table.source}: all {len(table)} rows hold the same pose; measure at different "
-            "joint angles (at least as many poses as a third of the parameters)"
-        )
     if table.position is None:
         return
     flange = rigid_model(model).flange_poses(table)[:, :3, 3]

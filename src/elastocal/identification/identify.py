@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.checks import check_table, fixed_and_free
+from elastocal.identification.checks import check_rows, check_table, fixed_and_free
 from elastocal.identification.estimates import summarise
 from elastocal.identification.noise import WeightKind, scaled_by_component, weights_for
 from elastocal.identification.outliers import describe, find_faulty
@@ -57,7 +57,7 @@ def identify(
     options = options or Options()
     check_table(model, table)
     if test is not None:
-        check_table(model, test)
+        check_rows(model, test)
     seen = observe(table, model.observe)
     progress("finding the start")
     free = fixed_and_free(model, options.fixed)
