@@ -53,8 +53,8 @@ def run_demo(
     model = Model.from_cell(cell)
     plan = read_plan(plan_path, joint_kinds=model.chain.kinds)
     rows = expand_plan(plan, tuple(cell.tool.markers), REPEATS, np.array(LOAD_N))
-    rows = replace(rows, sigma=_reading_sigma(folder)[rows.configuration])
-    truth, published = _compliances(folder)
+    rows = replace(rows, sigma=reading_sigma(folder)[rows.configuration])
+    truth, published = published_compliances(folder)
     progress(f"measuring {len(rows)} simulated readings")
     table = simulate(model, rows, values_from(model, truth), seed)
     data_path = folder / "data.csv"
@@ -77,14 +77,14 @@ def _rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(handle))
 
 
-def _reading_sigma(folder: Path) -> np.ndarray:
+def reading_sigma(folder: Path) -> np.ndarray:
     """Standard deviation (configurations, 3) in m of one reading, from Table 1."""
     table = _rows(folder / "table1_noise.csv")
     deflection = np.array([[float(row[f"sigma_{a}_um"]) for a in "xyz"] for row in table])
     return deflection * 1e-6 / np.sqrt(2)
 
 
-def _compliances(folder: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+def published_compliances(folder: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """True values in rad/(N m), and the published OLS value with its ±3σ, by parameter name."""
     truth = {"joint1.compliance": UNSEEN_COMPLIANCE}
     published = {}

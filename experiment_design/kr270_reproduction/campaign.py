@@ -1,0 +1,71 @@
+"""One simulated campaign of the paper: Table 2's poses, Table 1's noise, Table 3's compliances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from elastocal.cell_reader import read_cell
+from elastocal.demo import LOAD_N, REPEATS, published_compliances, reading_sigma
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import observe
+from elastocal.measurement_reader import read_plan
+from elastocal.simulation.simulate import expand_plan, simulate, values_from
+
+DEMO = Path(str(files("elastocal.demo")))
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Linearised at the truth: B (810, 9), exact deflections (810,), σ (810,) in m.
+
+    `group` (810,) numbers configuration × direction, `configuration` (810,) 0 to 14.
+    """
+
+    names: tuple[str, ...]
+    truth: np.ndarray
+    B: np.ndarray
+    exact: np.ndarray
+    sigma: np.ndarray
+    group: np.ndarray
+    configuration: np.ndarray
+
+    def draw(self, seed: list[int], configuration_effect: float = 0.0) -> np.ndarray:
+        """Δp (810,) less what B does not explain: B·truth + noise, eq. (4).
+
+        `configuration_effect` in m: standard deviation of an error common to the 18 readings of
+        a configuration in a direction.
+        """
+        rng = np.random.default_rng(seed)
+        noise = self.sigma * rng.normal(size=len(self.sigma))
+        common = configuration_effect * rng.normal(size=self.group.max() + 1)
+        return self.B @ self.truth + noise + common[self.group]
+
+
+def campaign() -> Campaign:
+    """The campaign at the true equilibrium; joint 1, which the load cannot show, is left out."""
+    cell = read_cell(DEMO / "cell.toml")
+    model = Model.from_cell(cell)
+    plan = read_plan(DEMO / "plan.csv", joint_kinds=model.chain.kinds)
+    rows = expand_plan(plan, tuple(cell.tool.markers), REPEATS, np.array(LOAD_N))
+    named, _ = published_compliances(DEMO)
+    x = values_from(model, named)
+    table = simulate(model, rows, x, 0, noise=False)
+    at = model.regressor(table, x)
+    visible = np.flatnonzero(np.linalg.norm(at.B, axis=0) > 1e-6 * np.linalg.norm(at.B))
+    seen = observe(table, "deflection")
+    configuration = np.repeat(seen.configuration, 3)
+    direction = np.tile(np.arange(3), len(seen.lead))
+    deflection_sigma = reading_sigma(DEMO) * np.sqrt(2)
+    return Campaign(
+        names=tuple(model.names[i] for i in visible),
+        truth=x[visible],
+        B=at.B[:, visible],
+        exact=at.prediction,
+        sigma=deflection_sigma[configuration, direction],
+        group=configuration * 3 + direction,
+        configuration=configuration,
+    )

@@ -1,0 +1,150 @@
+"""The estimators of Klimchik et al. 2013, exactly as published.
+
+They are here to be reproduced and compared with; `identify` is what to use.  What they are worth
+is measured in experiment_design/kr270_reproduction.  Symbols as in the paper: B (rows, parameters),
+Δp (rows,), W = diag(w), Σ = diag(σ).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.errors import InputError
+from elastocal.identification.linear import LinearSolution, solve_weighted
+
+Array = NDArray[np.float64]
+
+SMALLEST = 1e-9  # m, below any tracker's resolution: σ_i of zero has no inverse
+SIGMA_0 = 10e-6  # m, the tracker's claimed precision, σ₀ of eq. (14)
+
+
+@dataclass(frozen=True)
+class PublishedFit:
+    """X̂ (parameters,), its stated covariance (parameters, parameters) and the weights w (rows,).
+
+    `residual` (rows,) is Δp − B X̂.
+    """
+
+    method: str
+    x: Array
+    covariance: Array
+    weights: Array
+    residual: Array
+
+    @property
+    def std(self) -> Array:
+        """Stated standard deviations (parameters,); the paper's intervals are ±3 of them."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def ols(B: Array, dp: Array, sigma: Array | None = None) -> PublishedFit:
+    """Ordinary least squares, eq. (6).
+
+    Covariance by eq. (7), s² (BᵀB)⁻¹ with s² = rss/(rows − parameters), or, where `sigma`
+    (rows,) is given, by the sandwich of eq. (8), (BᵀB)⁻¹ BᵀΣ²B (BᵀB)⁻¹.
+    """
+    found = _solve(B, dp, np.ones(len(dp)))
+    if sigma is None:
+        covariance = found.covariance()
+    else:
+        covariance = _sandwich(B, np.ones(len(dp)), _positive(sigma, len(dp)), found.cofactor)
+    return PublishedFit("ols", found.x, covariance, np.ones(len(dp)), found.residual)
+
+
+def wls(B: Array, dp: Array, weights: Array, sigma: Array | None = None) -> PublishedFit:
+    """Weighted least squares, eq. (10), minimising Σ (w_i (B X − Δp)_i)² (eq. 9).
+
+    Covariance by eq. (11), (BᵀW²B)⁻¹ BᵀW²Σ²W²B (BᵀW²B)⁻¹, with the σ given; without σ by the
+    corrected eq. (13), (BᵀΣ⁻²B)⁻¹ with σ = 1/w, which is what (11) becomes where WΣ = I.
+    """
+    w = _positive(weights, len(dp))
+    found = _solve(B, dp, w)
+    covariance = found.cofactor
+    if sigma is not None:
+        covariance = _sandwich(B, w, _positive(sigma, len(dp)), found.cofactor)
+    return PublishedFit("wls", found.x, covariance, w, found.residual)
+
+
+def eq14_weights(sigma: Array, sigma_0: float = SIGMA_0, lam: float = 1.0) -> Array:
+    """w_i = σ₀ / (σ₀ + λ σ_i), eq. (14); σ₀ keeps a lucky σ_i of zero from ruling the fit."""
+    if sigma_0 <= 0 or lam <= 0:
+        raise InputError(f"eq. (14) needs positive σ₀ and λ; found {sigma_0} and {lam}")
+    return sigma_0 / (sigma_0 + lam * np.asarray(sigma, dtype=float))
+
+
+def group_sigma(residual: Array, group: NDArray[np.int64]) -> Array:
+    """σ_i (rows,) as the standard deviation of the residuals in the row's group.
+
+    A group is a configuration in one direction: 3 markers × 6 repeats give 18 values.
+    Raises InputError where a group has a single value.
+    """
+    count = np.bincount(group)
+    if (count[count > 0] < 2).any():
+        raise InputError("σ by group needs at least two readings per configuration and direction")
+    mean = np.bincount(group, residual) / np.maximum(count, 1)
+    squared = np.bincount(group, (residual - mean[group]) ** 2)
+    return np.sqrt(squared / np.maximum(count - 1, 1))[group]
+
+
+def eq14(
+    B: Array,
+    dp: Array,
+    group: NDArray[np.int64] | None = None,
+    *,
+    sigma_0: float = SIGMA_0,
+    lam: float = 1.0,
+    iterations: int = 30,
+    tolerance: float = 1e-6,
+) -> list[PublishedFit]:
+    """WLS with the weights of eq. (14), iterated until values and intervals settle.
+
+    σ_i comes from the groups (`group` (rows,) given), or from each residual itself, σ_i = |e_i|,
+    which is what the paper's figures need.  The first entry is OLS with eq. (8), each following
+    one uses the residuals of its predecessor; the last is the result.  Stated covariance: eq. (13)
+    with those σ_i, (BᵀΣ⁻²B)⁻¹, as the paper's intervals are: a reading that the fit happens to
+    pass through counts as known exactly, which is why they are far too small per residual.
+    """
+    first = ols(B, dp)
+    sigma = _sigma(first.residual, group)
+    history = [ols(B, dp, np.maximum(sigma, SMALLEST))]
+    for _ in range(iterations):
+        w = eq14_weights(sigma, sigma_0, lam)
+        found = wls(B, dp, w)
+        stated = wls(B, dp, 1 / np.maximum(sigma, SMALLEST)).covariance
+        method = "eq14 per residual" if group is None else "eq14 by group"
+        history.append(PublishedFit(method, found.x, stated, w, found.residual))
+        sigma = _sigma(found.residual, group)
+        before, now = history[-2], history[-1]
+        moved = np.abs(now.x - before.x) / np.maximum(np.abs(now.x), 1e-300)
+        widened = np.abs(now.std - before.std) / now.std
+        if len(history) > 2 and max(moved.max(), widened.max()) < tolerance:
+            break
+    return history
+
+
+def _sigma(residual: Array, group: NDArray[np.int64] | None) -> Array:
+    return np.abs(residual) if group is None else group_sigma(residual, group)
+
+
+def _solve(B: Array, dp: Array, w: Array) -> LinearSolution:
+    found = solve_weighted(B, dp, w)
+    if found.dropped.size:
+        raise InputError(
+            f"columns {found.dropped.tolist()} of B depend on the others; drop them first"
+        )
+    return found
+
+
+def _sandwich(B: Array, w: Array, sigma: Array, cofactor: Array) -> Array:
+    middle = B * (w**2 * sigma)[:, None]
+    return cofactor @ (middle.T @ middle) @ cofactor
+
+
+def _positive(values: Array, n: int) -> Array:
+    checked = np.asarray(values, dtype=float)
+    if checked.shape != (n,) or not (np.isfinite(checked) & (checked > 0)).all():
+        raise InputError(f"weights and sigmas must be {n} positive finite numbers")
+    return checked

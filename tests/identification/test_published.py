@@ -1,0 +1,88 @@
+"""The published estimators against their own equations, written out."""
+
+import numpy as np
+import pytest
+
+from elastocal.errors import InputError
+from elastocal.identification.published import (
+    eq14,
+    eq14_weights,
+    group_sigma,
+    ols,
+    wls,
+)
+
+RNG = np.random.default_rng(14)
+B = RNG.normal(size=(90, 4))
+X = np.array([1.0, -2.0, 0.5, 3.0])
+SIGMA = np.exp(RNG.normal(size=90)) * 1e-2
+DP = B @ X + SIGMA * RNG.normal(size=90)
+GROUP = np.repeat(np.arange(5), 18)
+
+
+def test_ols_is_equation_6_with_7_and_8():
+    inverse = np.linalg.inv(B.T @ B)
+    plain = ols(B, DP)
+    np.testing.assert_allclose(plain.x, inverse @ B.T @ DP, rtol=1e-10)
+    s2 = plain.residual @ plain.residual / (90 - 4)
+    np.testing.assert_allclose(plain.covariance, s2 * inverse, rtol=1e-10, atol=1e-18)
+    sandwich = inverse @ (B.T @ np.diag(SIGMA**2) @ B) @ inverse
+    np.testing.assert_allclose(ols(B, DP, SIGMA).covariance, sandwich, rtol=1e-9, atol=1e-18)
+
+
+def test_wls_is_equation_10_with_11_and_13():
+    w = 1 / SIGMA
+    inverse = np.linalg.inv(B.T @ np.diag(w**2) @ B)
+    found = wls(B, DP, w)
+    np.testing.assert_allclose(found.x, inverse @ B.T @ (w**2 * DP), rtol=1e-10)
+    np.testing.assert_allclose(found.covariance, inverse, rtol=1e-9, atol=1e-18)
+    # With WΣ = I, (11) is (13); with other weights it is larger.
+    np.testing.assert_allclose(wls(B, DP, w, SIGMA).covariance, inverse, rtol=1e-9, atol=1e-18)
+    other = wls(B, DP, np.ones(90), SIGMA)
+    assert (np.diag(other.covariance) >= np.diag(inverse) * (1 - 1e-9)).all()
+
+
+def test_the_scale_of_weights_moves_no_value():
+    a, b = wls(B, DP, 1 / SIGMA), wls(B, DP, 7 / SIGMA)
+    np.testing.assert_allclose(a.x, b.x, rtol=1e-12)
+
+
+def test_equation_14():
+    np.testing.assert_allclose(eq14_weights(np.array([0.0, 10e-6, 90e-6])), [1.0, 0.5, 0.1])
+    np.testing.assert_allclose(eq14_weights(np.array([10e-6]), lam=3.0), [0.25])
+    with pytest.raises(InputError, match="positive"):
+        eq14_weights(np.ones(2), lam=0.0)
+
+
+def test_sigma_by_group_is_the_standard_deviation_within():
+    e = RNG.normal(size=90) + GROUP  # a mean per group is not scatter
+    found = group_sigma(e, GROUP)
+    np.testing.assert_allclose(found[::18], [e[g == GROUP].std(ddof=1) for g in range(5)])
+    with pytest.raises(InputError, match="two readings"):
+        group_sigma(e[:3], np.array([0, 0, 1]))
+
+
+def test_groups_settle_near_the_oracle():
+    sigma = np.repeat(np.array([20, 40, 80, 120, 150]) * 1e-6, 18)
+    dp = B @ X + sigma * np.random.default_rng(1).normal(size=90)
+    history = eq14(B, dp, GROUP)
+    assert history[0].method == "ols" and len(history) < 30
+    oracle = wls(B, dp, 1 / sigma)
+    assert np.abs(history[-1].x - oracle.x).max() < 3 * oracle.std.max()
+
+
+def test_iterating_on_each_residual_states_far_too_little():
+    """The paper's gain: stated intervals shrink manifold, errors do not (see the study)."""
+    B810 = np.random.default_rng(2).normal(size=(810, 9))
+    errors, stated = [], []
+    for seed in range(40):
+        e = 80e-6 * np.random.default_rng([3, seed]).normal(size=810)
+        last = eq14(B810, e)[-1]
+        errors.append(last.x)
+        stated.append(last.std)
+    assert np.sqrt(np.mean(np.square(errors))) > 2 * np.mean(stated)
+
+
+def test_dependent_columns_are_refused():
+    with pytest.raises(InputError, match="depend"):
+        ols(np.column_stack([B, B[:, 0]]), DP)
