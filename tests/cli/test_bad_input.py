@@ -269,6 +269,13 @@ def test_output_folder_that_cannot_be_written(campaign):
     assert code == 2 and "permission" in message
 
 
+@pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="needs Linux's /sys")
+def test_output_folder_where_not_even_root_may_write(campaign):
+    cell, data = campaign
+    code, message = run("identify", cell, data, "-o", "/sys/kernel/result.json", "-q")
+    assert code == 2 and "/sys/kernel" in message and "write" in message
+
+
 def test_output_that_is_a_directory(campaign):
     cell, data = campaign
     code, message = run("identify", cell, data, "-o", cell.parent, "-q")
