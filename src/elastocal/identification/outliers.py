@@ -36,9 +36,9 @@ def find_faulty(solution: Solution, refit: Callable[[Mask], Solution]) -> tuple[
             beyond, cost = _judge(solution, current, good)
         except ElastocalError:
             break  # that subset does not determine a valid arm: it cannot judge the others
-        visited.append((cost, good, current))
         if beyond.sum() >= len(beyond) // 2:
-            break  # no majority to go by
+            break  # no majority agrees with this fit: it cannot judge
+        visited.append((cost, good, current))
         if any(np.array_equal(~beyond, mask) for _, mask, _ in visited):
             good = ~beyond
             break
