@@ -33,6 +33,7 @@ SENTENCES = {
     "outliers": "beyond what the noise explains",
     "excluded": "left out as faulty",
     "share": "too large a share for reading errors",
+    "lack": "Configurations scatter more than their repeats",
 }
 
 

@@ -15,6 +15,7 @@ FEW_DOF_PER_PARAMETER = 1.0
 ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
 FAR_ABOVE_STATED = 2.0
 MANY = 0.05
+LACK_OF_FIT = 0.001  # false-alarm rate of a sentence that calls intervals too narrow
 
 
 def warnings_for(result: IdentificationResult, solution: Solution) -> IdentificationResult:
@@ -24,6 +25,7 @@ def warnings_for(result: IdentificationResult, solution: Solution) -> Identifica
         *_few_poses(result),
         *_conditioning(result, solution),
         *_noise(result),
+        *_lack_of_fit(result),
         *_bounds(result, solution),
         *_outliers(result),
     ]
@@ -79,6 +81,19 @@ def _noise(result: IdentificationResult) -> list[str]:
         f"The residual is {ratio:.1f} times the stated noise ({result.noise['description']}): "
         "something is unmodelled or the stated noise is too small. The intervals use the "
         "residual, not the stated noise; look for effects that the model lacks."
+    ]
+
+
+def _lack_of_fit(result: IdentificationResult) -> list[str]:
+    found = result.noise["lack_of_fit"]
+    if found is None or found["p"] > LACK_OF_FIT:
+        return []
+    return [
+        f"Configurations scatter more than their repeats (lack of fit: F = {found['F']:.2f} on "
+        f"{found['dof_between']} and {found['dof_pure']} degrees of freedom, p = {found['p']:.1g}):"
+        " the arm does not come back to the same place, or an effect is missing. The intervals "
+        "take all readings for independent and are too narrow; measure more configurations "
+        "rather than more repeats."
     ]
 
 

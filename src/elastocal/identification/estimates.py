@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy import stats
 
 from elastocal.identification.advice import warnings_for
 from elastocal.identification.heldout import rms_3d
+from elastocal.identification.lack_of_fit import lack_of_fit
 from elastocal.identification.linear import solve_weighted
 from elastocal.identification.result import (
     Combination,
@@ -48,11 +50,13 @@ def summarise(
     estimates, combinations = _estimates(model, solution, std, half)
     determined = tuple(model.names[c] for c in kept)
     seen = problem.observations
+    misfit = lack_of_fit(seen, final.whitened, len(kept))
     noise: dict[str, Any] = {
         "kind": problem.weights.kind,
         "description": problem.weights.description,
         "sigma_um": None if problem.weights.absolute else sigma * 1e6,
         "ratio_to_stated": sigma if problem.weights.absolute else None,
+        "lack_of_fit": None if misfit is None else asdict(misfit),
     }
     result = IdentificationResult(
         model=model,

@@ -1,0 +1,81 @@
+"""The lack-of-fit test: pure error from repeats against the scatter between configurations."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+from support.calibration import cell_of, planar_chain, table_at
+from support.cells import random_poses
+
+from elastocal.identification.identify import identify
+from elastocal.identification.lack_of_fit import lack_of_fit
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import observe
+
+PLACED = ("base_frame", "marker_position")
+SIGMA, POSES, REPEATS = 5e-5, 14, 4
+SENTENCE = "Configurations scatter more than their repeats"
+
+
+def campaign(seed, effect=0.0, repeats=REPEATS):
+    """Readings of a planar arm, each pose repeated, with an error common to a configuration."""
+    model = Model(planar_chain(), cell_of(PLACED))
+    once = table_at(random_poses(model.chain, POSES, seed), [[0, 0, 0]])
+    n = len(once)
+    table = once.take(np.repeat(np.arange(n), repeats))
+    table = replace(table, row=np.arange(n * repeats) + 2, repeat=np.tile(np.arange(repeats), n))
+    rng = np.random.default_rng([seed, 1])
+    exact = model.predict(table).reshape(-1, 3)
+    common = effect * rng.normal(size=(len(table.configuration_labels), 3))
+    noise = SIGMA * rng.normal(size=exact.shape) + common[table.configuration]
+    return model, replace(table, position=exact + noise)
+
+
+def test_it_is_the_textbook_decomposition():
+    """Against the sums written out for one mean fitted to groups of unequal size."""
+    _, table = campaign(0)
+    table = table.take(np.arange(len(table)) % 7 != 3)
+    seen = observe(table, "position")
+    e = np.random.default_rng(1).normal(size=(len(table), 3))
+    e -= e.mean(axis=0)
+    found = lack_of_fit(seen, e.ravel(), 3)
+    key = table.configuration * 100 + table.marker
+    groups = [e[key == k] for k in np.unique(key)]
+    pure = sum(((g - g.mean(axis=0)) ** 2).sum() for g in groups)
+    between = sum(len(g) * (g.mean(axis=0) ** 2).sum() for g in groups)
+    dof_pure = 3 * sum(len(g) - 1 for g in groups)
+    dof_between = 3 * (len(groups) - 1)
+    assert (found.dof_pure, found.dof_between) == (dof_pure, dof_between)
+    np.testing.assert_allclose(found.F, between / dof_between / (pure / dof_pure), rtol=1e-12)
+
+
+def test_p_values_are_uniform_where_nothing_lacks():
+    """Kolmogorov-Smirnov over 60 clean campaigns, at a level of one in a thousand."""
+    p = []
+    for seed in range(60):
+        model, table = campaign(seed)
+        p.append(identify(model, table).noise["lack_of_fit"]["p"])
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_a_configuration_effect_is_told():
+    model, table = campaign(3, effect=1e-4)
+    result = identify(model, table)
+    found = result.noise["lack_of_fit"]
+    # The effect's variance is 4 times a reading's; means of 4 readings carry it whole.
+    assert found["p"] < 1e-6 and 5 < found["F"] < 50
+    assert any(w.startswith(SENTENCE) for w in result.warnings)
+    json.dumps(result.to_json(), allow_nan=False)
+
+
+def test_a_clean_campaign_is_left_in_peace():
+    model, table = campaign(4)
+    assert not any(w.startswith(SENTENCE) for w in identify(model, table).warnings)
+
+
+def test_without_repeats_there_is_no_test():
+    model, table = campaign(5, repeats=1)
+    result = identify(model, table)
+    assert result.noise["lack_of_fit"] is None
+    assert not any(w.startswith(SENTENCE) for w in result.warnings)
