@@ -22,3 +22,9 @@ class InsufficientDataError(ElastocalError):
     """The input is well formed, but the data do not support an answer."""
 
     exit_code = 1
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise InputError with `message` unless `condition` holds."""
+    if not condition:
+        raise InputError(message)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell import CartesianNoise, PolarNoise, Tracker
-from elastocal.errors import InputError
+from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ def position_covariance(table: Measurements, tracker: Tracker, kind: str) -> tup
     """
     n = len(table)
     if kind == "rows":
-        _need(table.sigma is not None, f"{table.source} has no sigma_… columns")
+        need(table.sigma is not None, f"{table.source} has no sigma_… columns")
         sigma = np.asarray(table.sigma)
         text = f"per-row {table.sigma_frame} sigmas from the table"
         polar = table.sigma_frame == "polar"
@@ -62,7 +62,7 @@ def position_covariance(table: Measurements, tracker: Tracker, kind: str) -> tup
 def polar_axes(sight: Array) -> Array:
     """Unit vectors (n, 3, 3): range, azimuth and elevation direction of each line of sight."""
     length = np.linalg.norm(sight, axis=1, keepdims=True)
-    _need(bool((length > 0).all()), "a marker stands at the tracker's own position")
+    need(bool((length > 0).all()), "a marker stands at the tracker's own position")
     radial = sight / length
     azimuth = np.column_stack([-radial[:, 1], radial[:, 0], np.zeros(len(radial))])
     flat = np.linalg.norm(azimuth, axis=1)
@@ -72,10 +72,10 @@ def polar_axes(sight: Array) -> Array:
 
 
 def _position(table: Measurements) -> Array:
-    _need(table.position is not None, f"{table.source} has no positions")
+    need(table.position is not None, f"{table.source} has no positions")
     return np.asarray(table.position)
 
 
-def _need(condition: bool, message: str) -> None:
-    if not condition:
-        raise InputError(f"these weights cannot be formed: {message}")
+def need(condition: bool, message: str) -> None:
+    """Raise InputError unless `condition` holds: what the noise model lacks."""
+    require(condition, f"these weights cannot be formed: {message}")

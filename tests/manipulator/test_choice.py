@@ -23,7 +23,7 @@ from elastocal.cell import Cell, Nominal, Robot, Tool
 from elastocal.errors import InputError
 from elastocal.manipulator.choice import choose_effects, load_chain
 from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model, rigid_model
+from elastocal.manipulator.model import Model
 
 NAMES = sorted(set(CATALOGUE) - {"payload", "link_gravity"})
 
@@ -154,7 +154,7 @@ def test_the_tables_force_bends_an_arm_that_only_names_compliance() -> None:
 
 
 def test_a_rigid_model_has_no_effect_left() -> None:
-    rigid = rigid_model(model_of(*NAMES, link_gravity=True))
+    rigid = model_of(*NAMES, link_gravity=True).rigid
     assert rigid.names == ()
     assert rigid.deflection(random_table(rigid.chain, 1, seed=0)).shape[1] == 0
 

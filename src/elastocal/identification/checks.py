@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.manipulator.model import Model, rigid_model
+from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import Observations
 from elastocal.measurements import Measurements
 from elastocal.nearest import did_you_mean
@@ -114,7 +114,7 @@ def _check_units(model: Model, table: Measurements) -> None:
     """Compare the extent of the readings with that of the nominal arm at the same joints."""
     if table.position is None:
         return
-    flange = rigid_model(model).flange_poses(table)[:, :3, 3]
+    flange = model.rigid.flange_poses(table)[:, :3, 3]
     reach = float(np.linalg.norm(np.ptp(flange, axis=0)))
     extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
     if reach < SAME or extent < SAME:
@@ -139,7 +139,7 @@ def _looks_like_radians(model: Model, table: Measurements, ratio: float, extent:
     if ratio < 3 or "prismatic" in model.chain.kinds or np.abs(table.q).max() > SMALL_ANGLE:
         return False
     turned = replace(table, q=np.degrees(table.q))
-    flange = rigid_model(model).flange_poses(turned)[:, :3, 3]
+    flange = model.rigid.flange_poses(turned)[:, :3, 3]
     return 1 / 3 < extent / float(np.linalg.norm(np.ptp(flange, axis=0))) < 3
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from elastocal.identification.checks import check_rows, check_table, fixed_and_free
 from elastocal.identification.estimates import summarise
+from elastocal.identification.heldout import rms_3d
 from elastocal.identification.noise import WeightKind, scaled_by_component, weights_for
 from elastocal.identification.outliers import describe, find_faulty
 from elastocal.identification.result import IdentificationResult, TestErrors
@@ -112,7 +113,7 @@ def _solution(
 
 def _test_errors(model: Model, x: Array, table: Measurements) -> TestErrors:
     seen = observe(table, model.observe)
-    error = (seen.value - model.predict(table, x, seen)).reshape(-1, seen.size)[:, :3]
-    length = np.linalg.norm(error, axis=1)
-    rms = float(np.sqrt(np.mean(length**2)))
+    error = seen.value - model.predict(table, x, seen)
+    length = np.linalg.norm(error.reshape(-1, seen.size)[:, :3], axis=1)
+    rms = rms_3d(error, seen.size)
     return TestErrors(rms, float(length.mean()), float(length.max()), len(length))

@@ -17,7 +17,7 @@ from scipy import sparse
 from elastocal.cell import Tracker
 from elastocal.errors import InputError
 from elastocal.manipulator.observation import Observations
-from elastocal.tracker_noise import available_noise, position_covariance
+from elastocal.tracker_noise import available_noise, need, position_covariance
 
 Array = NDArray[np.float64]
 WeightKind = Literal["auto", "none", "rows", "axis", "polar", "covariance"]
@@ -56,13 +56,13 @@ def weights_for(
     if chosen == "none":
         return Weights("none", None, False, "unit weights (ordinary least squares)")
     if seen.kind == "distance":
-        _need(tracker.distance_sigma is not None, "distances need [tracker] distance_um")
+        need(tracker.distance_sigma is not None, "distances need [tracker] distance_um")
         sigma = float(tracker.distance_sigma or 1.0)
         whiten = sparse.csr_array(sparse.eye_array(len(seen.value)) / sigma)
         return Weights("axis", whiten, True, f"distance sigma {sigma * 1e6:.3g} µm from the cell")
     blocks, text = position_covariance(seen.table, tracker, chosen)
     if seen.kind == "pose":
-        _need(tracker.rotation_sigma is not None, "poses need [tracker] rotation_urad")
+        need(tracker.rotation_sigma is not None, "poses need [tracker] rotation_urad")
         full = np.zeros((len(seen.table), 6, 6))
         full[:, :3, :3] = blocks
         full[:, 3:, 3:] = np.eye(3) * float(tracker.rotation_sigma or 1.0) ** 2
@@ -91,20 +91,15 @@ def _available(seen: Observations, tracker: Tracker) -> str:
     return available_noise(seen.table, tracker)
 
 
-def _need(condition: bool, message: str) -> None:
-    if not condition:
-        raise InputError(f"these weights cannot be formed: {message}")
-
-
 def _given(seen: Observations, covariance: Array | None) -> Weights:
-    _need(covariance is not None, "weights 'covariance' need a matrix (--covariance FILE)")
+    need(covariance is not None, "weights 'covariance' need a matrix (--covariance FILE)")
     matrix = np.asarray(covariance, dtype=float)
     n = len(seen.value)
-    _need(
+    need(
         matrix.shape == (n, n),
         f"the covariance is {matrix.shape}, but there are {n} rows (observations × components)",
     )
-    _need(
+    need(
         bool(np.isfinite(matrix).all()) and np.allclose(matrix, matrix.T, rtol=1e-9),
         "the covariance must be finite and symmetric",
     )

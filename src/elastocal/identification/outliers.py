@@ -10,7 +10,7 @@ from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.result import Outlier
-from elastocal.identification.solve import PLACED_EFFECTS, Solution
+from elastocal.identification.solve import Solution, is_placed
 from elastocal.identification.trimmed import majority, median_scale
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ def _suspects(solution: Solution) -> Mask:
     """
     problem = solution.problem
     model, seen = problem.model, problem.observations
-    placed = np.array([c for c in problem.free if model.parameters[c].effect in PLACED_EFFECTS])
+    placed = problem.free[is_placed(model)[problem.free]]
     if not len(placed):
         return ~majority(np.zeros((len(seen.value), 0)), solution.fit.whitened, seen.size)
     at = model.regressor(seen.table, problem.x0, placed, seen)

@@ -45,17 +45,23 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
 def reduced_fit(
     problem: Problem, sizes: Array, x: Array, sigma: float, threshold: float
 ) -> tuple[Fit, Reduction]:
-    chosen = _reduction(problem, sizes, x, sigma, threshold)
+    """Choose a minimal complete set at x and fit it, the others held at the start."""
+    chosen = _reduction(problem, sizes, _free_columns(problem, x), sigma, threshold)
     return _fit_of(problem, sizes, x, chosen, max_steps=60), chosen
 
 
+def _free_columns(problem: Problem, x: Array) -> Array:
+    """Whitened B (rows, free) at x."""
+    seen = problem.observations
+    return problem.weights.apply(problem.model.regressor(seen.table, x, problem.free, seen).B)
+
+
 def _reduction(
-    problem: Problem, sizes: Array, x: Array, sigma: float, threshold: float
+    problem: Problem, sizes: Array, B: Array, sigma: float, threshold: float
 ) -> Reduction:
-    """A minimal complete set at x, as indices into the model's parameters."""
-    model, seen, free = problem.model, problem.observations, problem.free
-    B = problem.weights.apply(model.regressor(seen.table, x, free, seen).B)
-    parameters = tuple(model.parameters[c] for c in free)
+    """A minimal complete set of the whitened B (rows, free), as indices into all parameters."""
+    seen, free = problem.observations, problem.free
+    parameters = tuple(problem.model.parameters[c] for c in free)
     local = reduce(B, sizes[free], parameters, sigma, threshold)
     if not len(local.kept):
         raise InsufficientDataError(
@@ -99,9 +105,10 @@ def prefer_wider(
     on the linearised model, then on the refitted one.
     """
     size = problem.observations.size
+    B = _free_columns(problem, found.x)
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
-        wider = _reduction(problem, sizes, found.x, sigma, threshold)
+        wider = _reduction(problem, sizes, B, sigma, threshold)
         if len(wider.kept) <= len(reduction.kept):
             continue
         x, linear_heldout = _linear_step(problem, found.x, wider)
@@ -114,6 +121,7 @@ def prefer_wider(
         wide_heldout = heldout_of(problem, wide.B, wide.residual)
         if wide.converged and rms_3d(wide_heldout, size) < rms_3d(heldout, size):
             found, reduction, heldout = wide, wider, wide_heldout
+            B = _free_columns(problem, found.x)
     return found, reduction, heldout
 
 

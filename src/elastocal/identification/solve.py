@@ -21,6 +21,7 @@ from elastocal.identification.selection import (
     reduced_fit,
     residual_sigma,
 )
+from elastocal.manipulator.model import Model
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -58,9 +59,9 @@ def solve(
     model, seen = problem.model, problem.observations
     start = model.regressor(seen.table, problem.x0, None, seen)
     sizes = model.sizes(start.B)
-    sizes[[p.effect in PLACED_EFFECTS for p in model.parameters]] = PLACED
+    sizes[is_placed(model)] = PLACED
     check_enough(model, seen, start.B[:, problem.free] * sizes[problem.free])
-    placed = np.array([c for c in problem.free if model.parameters[c].effect in PLACED_EFFECTS])
+    placed = problem.free[is_placed(model)[problem.free]]
     if len(placed):
         progress("placing base and markers")
         problem = replace(problem, x0=_tied_fit(replace(problem, free=placed), sizes).x)
@@ -85,11 +86,15 @@ def solve(
     return Solution(problem, found, reduction, sizes, heldout, rms_3d(nominal, seen.size))
 
 
+def is_placed(model: Model) -> NDArray[np.bool_]:
+    """Which parameters (parameters,) registration places: base, markers, cable."""
+    return np.array([p.effect in PLACED_EFFECTS for p in model.parameters], dtype=bool)
+
+
 def _tied_fit(problem: Problem, sizes: Array) -> Fit:
     """Fit of all free parameters with weak ties, scaled by a noise level found on the way."""
     model, seen, free = problem.model, problem.observations, problem.free
-    placed = np.array([p.effect in PLACED_EFFECTS for p in model.parameters])
-    width = np.where(placed, sizes, LOOSE * sizes)[free]
+    width = np.where(is_placed(model), sizes, LOOSE * sizes)[free]
     misfit = problem.weights.apply(seen.value - model.predict(seen.table, problem.x0, seen))
     sigma = max(float(np.sqrt(np.mean(misfit**2))), 1e-12)
     x = problem.x0

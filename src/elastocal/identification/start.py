@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from elastocal.identification.registration import RegistrationProblem, register
-from elastocal.manipulator.model import Model, rigid_model
+from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ def start_values(
     light = ~np.any(table.force != 0, axis=1)
     enough = light.sum() >= 12 and set(codes[light]) == set(codes)
     rows = np.flatnonzero(light) if enough else np.arange(len(table))
-    T = rigid_model(model).flange_poses(table.take(rows))
+    T = model.rigid.flange_poses(table.take(rows))
     nominal = model.cell.model.nominal
     problem = RegistrationProblem(
         T[:, :3, :3], T[:, :3, 3], table.position[rows], codes[rows],
@@ -101,7 +101,7 @@ def _distance_start(
     if len(table) > DISTANCE_SAMPLE:
         table = table.take(np.sort(rng.choice(len(table), DISTANCE_SAMPLE, replace=False)))
     distance = np.asarray(table.distance)
-    centre = rigid_model(model).flange_poses(table)[:, :3, 3].mean(axis=0)
+    centre = model.rigid.flange_poses(table)[:, :3, 3].mean(axis=0)
     anchor = [i for i in columns if "anchor" in model.parameters[i].name]
     directions = qmc.Sobol(3, rng=seed).random(DISTANCE_STARTS) * 2 - 1
     best, best_cost = x, np.inf

@@ -16,7 +16,6 @@ from typing import Any
 import casadi as ca
 
 from elastocal.cell import Cell
-from elastocal.errors import InputError
 from elastocal.manipulator import rigid
 from elastocal.manipulator.chain import Chain
 
@@ -139,9 +138,3 @@ class Arm:
     def deflection_laws(self, tau: ca.SX) -> ca.SX:
         """θ = law(τ) of every spring, stacked."""
         return ca.vertcat(*[s.law(tau[k]) for k, s in enumerate(self.springs)])
-
-
-def require(condition: bool, message: str) -> None:
-    """Raise InputError with `message` unless `condition` holds."""
-    if not condition:
-        raise InputError(message)

@@ -27,30 +27,32 @@ class Equilibrium:
         jacobian = ca.jacobian(residual, theta)
         self._tape = Tape([*inputs, p, theta], [residual, jacobian])
 
-    def solve(self, inputs: Sequence[NDArray], p: NDArray) -> NDArray:
-        """θ (n, size) by Newton's method on all rows; rows that do not settle become NaN."""
-        n = len(inputs[0])
-        theta = self._stationary(inputs, p, n)
-        return self._accepted(inputs, p, theta)
+    def solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
+        """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there.
 
-    def _accepted(self, inputs: Sequence[NDArray], p: NDArray, theta: NDArray) -> NDArray:
-        real = theta.real
+        Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.
+        """
+        theta = self._stationary(inputs, p, len(inputs[0]))
         with np.errstate(invalid="ignore"):
-            theta[(np.abs(real) > LARGEST).any(axis=1)] = np.nan
+            theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan
+        F_theta = self._tape(*inputs, p, theta)[1]
+        theta[self._unstable(F_theta.real)] = np.nan
+        F_theta[~np.isfinite(theta).all(axis=1)] = np.eye(self.size)
+        return theta, F_theta
+
+    def _unstable(self, F_theta: NDArray) -> NDArray:
+        """Indices of the rows whose stationary point is no minimum of the potential."""
         # F_θ = 1 − C·H with the potential's Hessian H: stable while its eigenvalues are positive,
         # which they are wherever C·H is small; only soft poses need the eigenvalues themselves.
-        F_theta = self._tape(*inputs, p, theta)[1].real
         soft = np.abs(F_theta - np.eye(self.size)).sum(axis=2).max(axis=1) >= 1
         rows = np.flatnonzero(soft & np.isfinite(F_theta).all(axis=(1, 2)))
-        if len(rows):
-            unstable = np.linalg.eigvals(F_theta[rows]).real.min(axis=1) <= 0
-            theta[rows[unstable]] = np.nan
-        return theta
+        if not len(rows):
+            return rows
+        return rows[np.linalg.eigvals(F_theta[rows]).real.min(axis=1) <= 0]
 
     def _stationary(self, inputs: Sequence[NDArray], p: NDArray, n: int) -> NDArray:
         theta = np.zeros((n, self.size), dtype=np.result_type(np.float64, p, *inputs))
         active = np.arange(n)
-        step = np.zeros(0)
         for _ in range(MAX_STEPS):
             rows = [a[active] for a in inputs]
             F, F_theta = self._tape(*rows, p, theta[active])

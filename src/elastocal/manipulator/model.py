@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,14 @@ class Model:
         spec = replace(self.cell.model, effects=effects)
         return Model(self.chain, replace(self.cell, model=spec))
 
+    @cached_property
+    def rigid(self) -> Model:
+        """The nominal arm with no effect and its base at the data's origin, for registration."""
+        spec = self.cell.model
+        nominal = replace(spec.nominal, base_position=None, base_rotation=None)
+        spec = replace(spec, effects=(), observe="position", nominal=nominal, link_gravity=False)
+        return Model(self.chain, replace(self.cell, model=spec))
+
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(p.name for p in self.parameters)
@@ -97,19 +106,18 @@ class Model:
     def _settle(self, inputs: list[NDArray], x: NDArray) -> NDArray:
         if not self._symbolic.implicit:
             return np.zeros((len(inputs[0]), len(self._symbolic.arm.springs)), dtype=x.dtype)
-        return self._symbolic.equilibrium.solve(inputs, x)
+        return self._symbolic.equilibrium.solve(inputs, x)[0]
 
     def _rows(
         self, table: Measurements, x: NDArray, columns: tuple[int, ...]
     ) -> tuple[NDArray, NDArray]:
         """Reading (n_rows, size) and B (n_rows, size, columns) of every table row."""
         inputs = row_inputs(self._symbolic.arm, table)
-        theta = self._settle(inputs, x)
         if not self._symbolic.implicit:
-            h, B = self._symbolic.tape("B", columns)(*inputs, x, theta)
+            h, B = self._symbolic.tape("B", columns)(*inputs, x, self._settle(inputs, x))
             return h[..., 0], B
-        h_theta, F_theta = self._symbolic.tape("slopes")(*inputs, x, theta)
-        F_theta[~np.isfinite(theta).all(axis=1)] = np.eye(F_theta.shape[1])
+        theta, F_theta = self._symbolic.equilibrium.solve(inputs, x)
+        h_theta = self._symbolic.tape("slopes")(*inputs, x, theta)[0]
         adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), h_theta.transpose(0, 2, 1))
         adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
         h, B = self._symbolic.tape("B", columns)(*inputs, x, theta, adjoint)
@@ -170,12 +178,3 @@ class Model:
         x = self.nominal if x is None else np.asarray(x)
         inputs = row_inputs(self._symbolic.arm, table)
         return self._symbolic.tape("frames")(*inputs, x, self._settle(inputs, x))
-
-
-def rigid_model(model: Model) -> Model:
-    """The nominal arm with no effect and its base at the data's origin, for registration."""
-    nominal = replace(model.cell.model.nominal, base_position=None, base_rotation=None)
-    spec = replace(
-        model.cell.model, effects=(), observe="position", nominal=nominal, link_gravity=False
-    )
-    return Model(model.chain, replace(model.cell, model=spec))

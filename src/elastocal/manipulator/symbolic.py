@@ -109,7 +109,7 @@ class SymbolicArm:
         if name == "reading":
             return Tape(inputs, [h])
         if name == "slopes":
-            return Tape(inputs, [ca.jacobian(h, theta), ca.jacobian(self._residual, theta)])
+            return Tape(inputs, [ca.jacobian(h, theta)])
         if not self.implicit:
             return Tape(inputs, [h, ca.jacobian(h, p)[:, columns]])
         # Adjoint of the equilibrium: with λ = F_θ⁻ᵀ h_θᵀ the total derivative of component c is

@@ -5,7 +5,8 @@ from __future__ import annotations
 import casadi as ca
 
 from elastocal.cell import Cell
-from elastocal.manipulator.arm import Arm, Spring, require
+from elastocal.errors import require
+from elastocal.manipulator.arm import Arm, Spring
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
 from elastocal.manipulator.parameter import ParameterSpec

@@ -5,8 +5,9 @@ from __future__ import annotations
 import casadi as ca
 
 from elastocal.cell import Cell
+from elastocal.errors import require
 from elastocal.manipulator import rigid
-from elastocal.manipulator.arm import Arm, require
+from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects.base import Effect, Symbols, index, links
 from elastocal.manipulator.parameter import ParameterSpec
