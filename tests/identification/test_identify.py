@@ -92,6 +92,9 @@ def kr270_coverage(seeds, poses):
 
 
 def check_coverage(inside, sizes, spring_hits):
+    share = 100 * sum(inside) / sum(sizes)
+    print(f"\n95 % intervals that hold the truth: {sum(inside)} of {sum(sizes)} ({share:.1f} %), "
+          f"of compliances {spring_hits.sum()} of {spring_hits.size}")  # fmt: skip
     assert in_share(inside, sizes)
     low, high = binomial_band(spring_hits.size, 0.95)
     assert low <= spring_hits.sum() <= high
