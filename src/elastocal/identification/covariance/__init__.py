@@ -1,0 +1,1 @@
+"""Covariances and intervals of a least-squares fit, under different assumptions on the errors."""

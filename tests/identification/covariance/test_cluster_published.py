@@ -1,0 +1,114 @@
+"""Cluster-robust covariance against published values and closed forms.
+
+The reference values are outputs printed in the documentation of the R package clubSandwich
+(Pustejovsky; reference pages vcovCR.lm, vcovCR.lm_robust and coef_test) for R's data set
+ChickWeight (Crowder & Hand 1990): growth curves of 50 chicks on four diets, clusters of 2 to 12.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from elastocal.identification.covariance.cluster import cluster_robust
+
+KINDS = ("CR0", "CR1", "CR2", "CR3")
+
+
+def chicks():
+    """weight (578,), time (578,), chick (578,), diet (578,)."""
+    lines = (Path(__file__).parent / "chick_weight.csv").read_text().splitlines()[1:]
+    days = [*range(0, 21, 2), 21]
+    rows = []
+    for chick, line in enumerate(lines, start=1):
+        diet, weights = line.split(",")
+        rows += [
+            (float(w), d, chick, int(diet)) for w, d in zip(weights.split(), days, strict=False)
+        ]
+    weight, time, chick, diet = np.array(rows).T
+    return weight, time, chick.astype(int), diet.astype(int)
+
+
+def residual(B, y):
+    return y - B @ np.linalg.lstsq(B, y, rcond=None)[0]
+
+
+@pytest.mark.parametrize("sorted_rows", [True, False])
+def test_clubsandwich_vcov_of_chick_weights(sorted_rows):
+    """lm(weight ~ Time + Diet:Time), vcovCR(type = "CR2") as printed, 7 decimals; SE and d.f. as
+    conf_int prints them for the same fit by lm_robust."""
+    weight, time, chick, diet = chicks()
+    assert len(weight) == 578
+    B = np.column_stack([np.ones(578), time, *(time * (diet == d) for d in (2, 3, 4))])
+    order = np.arange(578) if sorted_rows else np.random.default_rng(1).permutation(578)
+    found = cluster_robust(B[order], residual(B, weight)[order], chick[order], "CR2")
+    printed = [
+        [3.9317840, -0.7851508, -0.2560762, -0.0750498, 0.2695861],
+        [-0.7851508, 0.4360726, -0.3314209, -0.3436398, -0.3665016],
+        [-0.2560762, -0.3314209, 1.3680862, 0.3475327, 0.3482061],
+        [-0.0750498, -0.3436398, 0.3475327, 1.1195632, 0.3483146],
+        [0.2695861, -0.3665016, 0.3482061, 0.3483146, 0.5416587],
+    ]
+    np.testing.assert_allclose(found.matrix, printed, rtol=0, atol=5.1e-8)
+    np.testing.assert_allclose(found.std, [1.983, 0.660, 1.170, 1.058, 0.736], atol=5.1e-4)
+    np.testing.assert_allclose(found.dof, [48.7, 31.4, 19.0, 19.0, 18.4], atol=0.051)
+    x = np.linalg.lstsq(B, weight, rcond=None)[0]
+    low, high = found.interval(x).T
+    np.testing.assert_allclose(low, [23.874, 5.703, -0.837, 1.524, 1.317], atol=5.1e-4)
+    np.testing.assert_allclose(high[[0, 1]], [31.84, 8.40], atol=5.1e-3)
+
+
+def test_clubsandwich_coef_test_of_chick_weights():
+    """lm(weight ~ Diet * Time), coef_test(vcov = "CR2"): SE and Satterthwaite d.f. as printed."""
+    weight, time, chick, diet = chicks()
+    diets = [1.0 * (diet == d) for d in (2, 3, 4)]
+    B = np.column_stack([np.ones(578), *diets, time, *(time * d for d in diets)])
+    found = cluster_robust(B, residual(B, weight), chick, "CR2")
+    np.testing.assert_allclose(found.std[5:], [1.49, 1.35, 1.01], atol=5.1e-3)
+    np.testing.assert_allclose(found.dof[5:], [18.8, 18.8, 18.3], atol=0.051)
+
+
+@pytest.mark.parametrize("sizes", [(1, 4, 9, 2, 2, 7), (3, 3, 3, 3), (20, 1, 1)])
+def test_a_mean_has_its_closed_form(sizes):
+    """One column of ones: the sums over cluster sizes that clubSandwich's tests state for the
+    variances and Satterthwaite dof of CR0, CR1 (there without (n − 1)/(n − p) = 1) and CR2."""
+    nj = np.array(sizes, dtype=float)
+    N, m = nj.sum(), len(nj)
+    cluster = np.repeat(np.arange(m), sizes)
+    y = np.random.default_rng(2).normal(size=int(N))
+    e = y - y.mean()
+    square = np.bincount(cluster, e) ** 2 / N**2
+    found = {k: cluster_robust(np.ones((len(y), 1)), e, cluster, k) for k in KINDS}
+    variances = {
+        "CR0": square.sum(),
+        "CR1": square.sum() * m / (m - 1),
+        "CR2": (square / (1 - nj / N)).sum(),
+        "CR3": (square / (1 - nj / N) ** 2).sum(),
+    }
+    dof_0 = (N**2 - (nj**2).sum()) ** 2 / (
+        N**2 * (nj**2).sum() - 2 * N * (nj**3).sum() + (nj**2).sum() ** 2
+    )
+    dof_2 = N**2 / (
+        N**2 * (nj**2 / (N - nj) ** 2).sum()
+        - 2 * N * (nj**3 / (N - nj) ** 2).sum()
+        + (nj**2 / (N - nj)).sum() ** 2
+    )
+    for kind, dof in {"CR0": dof_0, "CR1": dof_0, "CR2": dof_2}.items():
+        np.testing.assert_allclose(found[kind].dof, dof, rtol=1e-10)
+    for kind in KINDS:
+        np.testing.assert_allclose(found[kind].matrix, variances[kind], rtol=1e-10)
+
+
+def test_balanced_contrasts_have_the_dof_of_a_two_sample_t_test():
+    """Equal clusters, a column that varies within them: G − 1.  Cluster-level groups of m₁ and
+    m₂ clusters: the dof of the two-sample t with unequal variances (clubSandwich tests it as a
+    special case)."""
+    m1, m2, size = 5, 9, 4
+    G = m1 + m2
+    cluster = np.repeat(np.arange(G), size)
+    group = (cluster >= m1) * 1.0
+    within = np.tile([0.0, 1.0], G * size // 2)
+    B = np.column_stack([np.ones(len(cluster)), group, within])
+    e = residual(B, np.random.default_rng(3).normal(size=len(B)))
+    welch = G**2 * (m1 - 1) * (m2 - 1) / (m1**2 * (m1 - 1) + m2**2 * (m2 - 1))
+    np.testing.assert_allclose(cluster_robust(B, e, cluster).dof[1:], [welch, G - 1], rtol=1e-10)

@@ -1,0 +1,34 @@
+"""The t intervals of an estimated covariance."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from elastocal.errors import InputError
+from elastocal.identification.covariance.estimate import Covariance, t_quantile
+
+
+def test_each_parameter_has_its_own_t():
+    matrix = np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 0.0], [0.0, 0.0, 1.0]])
+    found = Covariance("x", matrix, np.array([5.0, np.inf, 0.0]), "")
+    x = np.array([1.0, 2.0, 3.0])
+    t, z = stats.t.ppf(0.95, 5), stats.norm.ppf(0.95)
+    expected = [[1 - 2 * t, 1 + 2 * t], [2 - 3 * z, 2 + 3 * z], [-np.inf, np.inf]]
+    np.testing.assert_allclose(found.interval(x, 0.9), expected, rtol=1e-12)
+    np.testing.assert_array_equal(found.std, [2.0, 3.0, np.inf])
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9545, 0.9999])
+def test_the_quantile_holds_its_level(level):
+    dof = np.array([0.3, 1.0, 4.5, 200.0])
+    inside = 1 - 2 * stats.t.sf(t_quantile(level, dof), dof)
+    np.testing.assert_allclose(inside, level, rtol=1e-9)
+
+
+def test_bad_input_is_told():
+    found = Covariance("x", np.eye(2), np.full(2, 5.0), "")
+    for level in (0.0, 1.0, 95.0, np.nan):
+        with pytest.raises(InputError, match=r"0\.95"):
+            found.interval(np.zeros(2), level)
+    with pytest.raises(InputError, match="2 parameters"):
+        found.interval(np.zeros(3))
