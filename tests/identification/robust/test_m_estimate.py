@@ -1,0 +1,180 @@
+"""M-estimates agree with independent solvers, and L1 carries its own proof."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+import statsmodels.api as sm
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import optimize
+from scipy.spatial.transform import Rotation
+
+from elastocal.errors import InputError
+from elastocal.identification.robust.asymptotic import asymptotic_covariance
+from elastocal.identification.robust.loss import Absolute, Bisquare, Huber
+from elastocal.identification.robust.m_estimate import m_estimate
+from elastocal.identification.robust.mm_estimate import mm_estimate
+from elastocal.identification.robust.student_t import student_t
+from elastocal.identification.robust.tuning import huber
+
+
+def regression(seed, n=120, p=4):
+    rng = np.random.default_rng(seed)
+    B = rng.normal(size=(n, p)) * 10.0 ** rng.uniform(-6, 3, p)
+    x = rng.normal(size=p) / np.linalg.norm(B, axis=0)
+    return B, B @ x + 0.1 * rng.standard_t(2.5, size=n)
+
+
+@pytest.mark.parametrize("kind", ["H1", "H2", "H3"])
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (Huber(1, 1.345), sm.robust.norms.HuberT(1.345)),
+        (Bisquare(1, 4.685), sm.robust.norms.TukeyBiweight(4.685)),
+    ],
+    ids=["huber", "tukey"],
+)
+def test_estimate_scale_and_covariance_are_those_of_statsmodels(ours, theirs, kind):
+    """Columns scaled to unit length for statsmodels, whose pseudo-inverse needs that."""
+    B, y = regression(1)
+    unit = np.linalg.norm(B, axis=0)
+    reference = sm.RLM(y, B / unit, M=theirs).fit(cov=kind, tol=1e-13, maxiter=2000)
+    found = m_estimate(B, y, ours)
+    np.testing.assert_allclose(found.x * unit, reference.params, rtol=1e-8)
+    assert found.scale == pytest.approx(reference.scale, rel=1e-8)
+    scaled = asymptotic_covariance(found, kind).matrix * np.outer(unit, unit)
+    np.testing.assert_allclose(scaled, reference.bcov_scaled, rtol=1e-8, atol=1e-14)
+
+
+@pytest.mark.parametrize("rule", ["median", "proposal2", "m", 0.2])
+@pytest.mark.parametrize("loss", [huber(3), Bisquare(3, 5.5), Absolute(3)], ids=lambda f: f.name)
+def test_regression_affine_and_scale_equivariance(arm, loss, rule):
+    rng = np.random.default_rng(3)
+    y = arm.observed(arm.errors(rng, 0.1)[0])
+    A, v = rng.normal(size=(9, 9)), rng.normal(size=9)
+    known = 6.0 * rule if not isinstance(rule, str) else rule
+    plain = m_estimate(arm.B, y, loss, size=3, scale=rule)
+    moved = m_estimate(arm.B @ A, 6.0 * (y + arm.B @ v), loss, size=3, scale=known)
+    np.testing.assert_allclose(A @ moved.x, 6.0 * (plain.x + v), rtol=1e-7, atol=1e-7)
+    assert moved.scale == pytest.approx(6.0 * plain.scale, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    "fit",
+    [
+        lambda B, y: m_estimate(B, y, huber(3), size=3),
+        lambda B, y: m_estimate(B, y, Absolute(3), size=3),
+        lambda B, y: mm_estimate(B, y, size=3),
+        lambda B, y: student_t(B, y, size=3, nu=4.0),
+    ],
+    ids=["huber", "l1", "mm", "student-t"],
+)
+def test_the_axes_of_a_reading_do_not_matter(arm, fit):
+    """Each reading turned by its own rotation, as another tracker frame would: same x, weights."""
+    rng = np.random.default_rng(9)
+    y = arm.observed(arm.errors(rng, 0.1)[0])
+    turn = Rotation.random(270, random_state=1).as_matrix()
+    B2 = (turn @ arm.B.reshape(270, 3, 9)).reshape(-1, 9)
+    y2 = (turn @ y.reshape(270, 3, 1)).ravel()
+    one, two = fit(arm.B, y), fit(B2, y2)
+    np.testing.assert_allclose(one.x, two.x, atol=1e-7)
+    np.testing.assert_allclose(one.weights, two.weights, rtol=1e-5, atol=1e-8)
+
+
+def test_vector_huber_minimises_its_objective(arm):
+    """At the known scale: against BFGS on Σρ."""
+    y = arm.observed(arm.errors(np.random.default_rng(4), 0.1)[0])
+    loss = huber(3)
+
+    def cost(x):
+        d = np.linalg.norm((y - arm.B @ x).reshape(-1, 3), axis=1)
+        return loss.rho(d).sum()
+
+    found = m_estimate(arm.B, y, loss, size=3, scale=1.0)
+    best = optimize.minimize(cost, found.x + 0.1, method="BFGS", options={"gtol": 1e-7})
+    assert found.objective <= best.fun * (1 + 1e-12)
+    np.testing.assert_allclose(found.x, best.x, atol=1e-5)
+    assert found.converged and found.optimality < 1e-8
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_l1_is_the_linear_programs_optimum(seed):
+    """The primal program, Σ(u + v) with Bx + u − v = y; ours solves the dual."""
+    B, y = regression(seed, n=80)
+    unit = np.linalg.norm(B, axis=0)
+    n, p = B.shape
+    cost = np.concatenate([np.zeros(p), np.ones(2 * n)])
+    equations = np.hstack([B / unit, np.eye(n), -np.eye(n)])
+    bounds = [(None, None)] * p + [(0, None)] * (2 * n)
+    lp = optimize.linprog(cost, A_eq=equations, b_eq=y, bounds=bounds)
+    found = m_estimate(B, y, Absolute(1))
+    assert np.abs(found.residual).sum() == pytest.approx(lp.fun, rel=1e-9)
+    np.testing.assert_allclose(found.x * unit, lp.x[:p], atol=1e-7 * np.abs(lp.x[:p]).max())
+    assert found.converged and found.optimality < 1e-10
+    assert (np.abs(found.residual) < 1e-12).sum() == p  # a vertex
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_the_sum_of_lengths_is_the_cone_programs_optimum(size):
+    rng = np.random.default_rng(size)
+    B = rng.normal(size=(40 * size, 5))
+    y = B @ np.ones(5) + rng.standard_t(2, size=40 * size)
+    x = cp.Variable(5)
+    lengths = [cp.norm(y[k : k + size] - B[k : k + size] @ x) for k in range(0, len(y), size)]
+    problem = cp.Problem(cp.Minimize(cp.sum(cp.hstack(lengths))))
+    problem.solve(solver=cp.CLARABEL)
+    found = m_estimate(B, y, Absolute(size), size=size)
+    total = np.linalg.norm(found.residual.reshape(-1, size), axis=1).sum()
+    assert total <= problem.value * (1 + 1e-8)
+    np.testing.assert_allclose(found.x, x.value, atol=1e-4)
+    assert found.converged and found.optimality < 1e-8
+
+
+def test_the_certificate_of_l1_survives_an_observation_met_exactly():
+    """More than half of the readings agree on one x: the sum of lengths has its kink there."""
+    rng = np.random.default_rng(8)
+    B = rng.normal(size=(60, 2))
+    y = B @ np.array([1.0, -2.0])
+    y[:12] += rng.normal(size=12)
+    found = m_estimate(B, y, Absolute(2), size=2)
+    np.testing.assert_allclose(found.x, [1.0, -2.0], atol=1e-8)
+    assert found.converged
+
+
+def test_noiseless_data_are_fitted_exactly():
+    B, _ = regression(5)
+    x = 1 / np.linalg.norm(B, axis=0)
+    for loss in (huber(1), Bisquare(1, 4.685), Absolute(1)):
+        np.testing.assert_allclose(m_estimate(B, B @ x, loss).x, x, rtol=1e-10)
+
+
+@settings(deadline=None)
+@given(
+    rows=st.integers(0, 12),
+    columns=st.integers(0, 4),
+    size=st.integers(0, 4),
+    bad=st.sampled_from([0.0, np.nan, np.inf]),
+)
+def test_input_is_either_fitted_or_refused_with_a_reason(rows, columns, size, bad):
+    rng = np.random.default_rng(rows + 13 * columns)
+    B, y = rng.normal(size=(rows, columns)), rng.normal(size=rows)
+    y[:1] += bad
+    fits = rows > columns > 0 and size > 0 and rows % size == 0 and np.isfinite(bad)
+    try:
+        found = m_estimate(B, y, Huber(max(size, 1), 1.5), size=size)
+    except InputError as error:
+        assert not fits and len(str(error)) > 20
+    else:
+        assert fits and np.isfinite(found.x).all()
+
+
+def test_what_is_wrong_is_named():
+    B, y = regression(6)
+    with pytest.raises(InputError, match=r"columns \[3\]"):
+        m_estimate(np.column_stack([B[:, :3], B[:, 0] + B[:, 1]]), y, huber(1))
+    with pytest.raises(InputError, match="loss is for 3 rows"):
+        m_estimate(B, y, huber(3))
+    with pytest.raises(InputError, match="'mad'"):
+        m_estimate(B, y, huber(1), scale="mad")
+    with pytest.raises(InputError, match="start"):
+        m_estimate(B, y, huber(1), start=np.zeros(3))

@@ -1,0 +1,68 @@
+"""Student-t maximum likelihood against a general optimiser on the density of scipy."""
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from elastocal.errors import InputError
+from elastocal.identification.robust.student_t import log_likelihood, student_t
+
+
+def sample(seed, size, nu=4.0, n=200, p=3):
+    rng = np.random.default_rng(seed)
+    B = rng.normal(size=(n * size, p))
+    heavy = rng.normal(size=(n, size)) / np.sqrt(rng.chisquare(nu, n) / nu)[:, None]
+    return B, B @ np.arange(1.0, p + 1) + 0.3 * heavy.ravel()
+
+
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("given", [True, False])
+def test_it_maximises_the_likelihood(size, given):
+    B, y = sample(size, size)
+
+    def cost(theta):
+        x, log_scale = theta[:3], theta[3]
+        nu = 4.0 if given else np.exp(theta[4])
+        e = (y - B @ x).reshape(-1, size)
+        t = stats.multivariate_t(np.zeros(size), np.exp(2 * log_scale) * np.eye(size), nu)
+        return -np.atleast_1d(t.logpdf(e)).sum()
+
+    found = student_t(B, y, size=size, nu=4.0 if given else None)
+    start = np.concatenate([found.x + 0.02, [np.log(0.4)], [] if given else [np.log(6.0)]])
+    best = optimize.minimize(cost, start, method="BFGS", options={"gtol": 1e-5})
+    assert log_likelihood(found) == pytest.approx(-best.fun, rel=1e-10)
+    assert log_likelihood(found) >= -best.fun - 1e-7
+    np.testing.assert_allclose(found.x, best.x[:3], atol=2e-6)
+    assert found.scale == pytest.approx(np.exp(best.x[3]), rel=1e-5)
+    if not given:
+        assert found.loss.nu == pytest.approx(np.exp(best.x[4]), rel=1e-4)
+    assert found.converged and found.optimality < 1e-9
+
+
+def test_with_one_observation_per_row_scipys_own_fit_agrees():
+    rng = np.random.default_rng(5)
+    y = stats.t(3, 2.0, 0.5).rvs(300, random_state=rng)
+    nu, mean, scale = stats.t.fit(y)
+    found = student_t(np.ones((300, 1)), y)
+    assert found.x[0] == pytest.approx(mean, abs=1e-3 * scale)
+    assert found.scale == pytest.approx(scale, rel=1e-2)
+    assert found.loss.nu == pytest.approx(nu, rel=3e-2)
+
+
+def test_normal_errors_give_the_least_squares_fit():
+    """ν runs to the end of its range, where the t differs from the normal by 1/ν."""
+    rng = np.random.default_rng(0)
+    B = rng.normal(size=(900, 4))
+    y = rng.uniform(-1, 1, 900)  # lighter tails than the normal's
+    found = student_t(B, y)
+    least_squares, *_ = np.linalg.lstsq(B, y)
+    assert found.loss.nu > 190
+    np.testing.assert_allclose(found.x, least_squares, atol=0.02 * 0.58 / np.sqrt(900) * 4)
+
+
+def test_nu_must_be_positive_and_have_data():
+    B, y = sample(0, 1)
+    with pytest.raises(InputError, match="nu must be positive"):
+        student_t(B, y, nu=-1.0)
+    with pytest.raises(InputError, match="more observations"):
+        student_t(B[:9], y[:9], size=3)
