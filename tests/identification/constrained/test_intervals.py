@@ -1,0 +1,182 @@
+"""Intervals under constraints: closed forms, coverage near a bound, bootstrap, posterior."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from support.calibration import binomial_band
+
+from elastocal.errors import InputError
+from elastocal.identification.constrained.bootstrap import constrained_bootstrap
+from elastocal.identification.constrained.constraints import (
+    Bounds,
+    Constraints,
+    LinearEquality,
+    SemidefiniteMatrix,
+    non_negative,
+)
+from elastocal.identification.constrained.intervals import profile_intervals
+from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.identification.constrained.solve import solve_constrained
+from elastocal.identification.linear import solve_weighted
+
+NAMES = ("a", "b", "c")
+SIZES = np.array([1e-7, 1e-6, 1e-3])
+RNG = np.random.default_rng(3)
+B = RNG.normal(size=(30, 3)) @ np.array([[1, 0.6, 0], [0, 1, 0.4], [0, 0, 1]]) / SIZES
+COFACTOR = solve_weighted(B, np.zeros(30)).cofactor
+STD = np.sqrt(np.diag(COFACTOR))
+NOISE = RNG.normal(size=30)
+
+
+def readings(*truth_in_std: float) -> np.ndarray:
+    return B @ (STD * truth_in_std) + NOISE
+
+
+def ends(interval) -> np.ndarray:
+    return np.array([interval.lower, interval.upper])
+
+
+def test_without_active_constraints_it_is_the_t_interval():
+    y = readings(10.0, 10.0, 10.0)
+    linear = solve_weighted(B, y)
+    half = stats.t.ppf(0.9, 27) * linear.std()
+    found = profile_intervals(B, y, NAMES, non_negative("a", "b"), level=0.8)
+    for i, name in enumerate(NAMES):
+        np.testing.assert_allclose(
+            ends(found[name]), linear.x[i] + half[i] * np.array([-1, 1]), atol=1e-5 * STD[i]
+        )
+        assert found[name].ends == ("crossing", "crossing")
+
+
+def test_one_bound_in_closed_form():
+    # With one bound S(v) = rss + (v − x̂)²/V still, and Ŝ is its value at the bound.
+    y = readings(-2.0, 5.0, 5.0)
+    free = solve_weighted(B, y)
+    assert free.x[0] < 0
+    found = profile_intervals(B, y, NAMES, non_negative("a"), ["a"], sigma=1.0)["a"]
+    upper = free.x[0] + np.sqrt(stats.chi2.ppf(0.95, 1) * STD[0] ** 2 + free.x[0] ** 2)
+    assert found.lower == 0.0 and found.ends == ("bound", "crossing")
+    assert found.upper == pytest.approx(upper, abs=1e-5 * STD[0])
+
+
+def test_intervals_end_where_other_constraints_end():
+    # a + b = 3 of their sizes and b ≥ 0 leave a at most there, though a itself has no bound.
+    total = 3.0 * STD[0]
+    stated = non_negative("b") + Constraints(
+        equalities=(LinearEquality({"a": 1.0, "b": STD[0] / STD[1]}, total),)
+    )
+    found = profile_intervals(B, readings(2.5, 0.5, 1.0), NAMES, stated, ["a"], sigma=1.0)["a"]
+    assert found.ends[1] == "bound"
+    assert found.upper == pytest.approx(total, abs=1e-4 * STD[0])
+    assert found.lower < total - 0.5 * STD[0]
+
+
+def test_intervals_respect_a_matrix():
+    y = readings(1.0, 0.0, 2.0)
+    unit = {n: {n: 1 / s} for n, s in zip(NAMES, STD, strict=True)}
+    K = SemidefiniteMatrix("K", ((unit["a"], unit["b"]), (unit["b"], unit["c"])))
+    found = profile_intervals(B, y, NAMES, Constraints(matrices=(K,)), ["a", "b"], sigma=1.0)
+    assert found["a"].lower >= -1e-5 * STD[0]
+    free = profile_intervals(B, y, NAMES, Constraints(), ["b"], sigma=1.0)["b"]
+    inside = ends(found["b"])
+    assert free.lower - 1e-4 * STD[1] < inside[0] < inside[1] < free.upper + 1e-4 * STD[1]
+
+
+def test_a_value_that_equalities_fix_is_its_interval():
+    stated = Constraints((Bounds("b", STD[1], STD[1]),))
+    found = profile_intervals(B, readings(1, 1, 1), NAMES, stated, ["b"])["b"]
+    np.testing.assert_allclose(ends(found), STD[1], rtol=1e-12)
+
+
+def test_a_prior_gives_posterior_intervals():
+    prior = GaussianPrior.independent(("a",), [0.0], [STD[0]])
+    y = readings(1.0, 1.0, 1.0)
+    found = profile_intervals(B, y, NAMES, Constraints(), prior=prior, sigma=1.0)
+    fit = solve_constrained(B, y, NAMES, prior=prior)
+    half = stats.norm.ppf(0.975) * np.sqrt(np.diag(fit.cofactor))
+    for i, name in enumerate(NAMES):
+        np.testing.assert_allclose(
+            ends(found[name]), fit.x[i] + half[i] * np.array([-1, 1]), atol=1e-5 * STD[i]
+        )
+
+
+@pytest.mark.parametrize(("truth", "exact"), [(0.0, 0.975), (1.0, None), (6.0, 0.95)])
+def test_coverage_near_a_bound(truth, exact):
+    # On the bound the likelihood ratio is ½χ²₀ + ½χ²₁: 97.5 % exactly; far from it 95 %;
+    # in between at least 95 %.
+    rng = np.random.default_rng(int(10 * truth) + 1)
+    x = STD * [truth, 2.0, -1.0]
+    n, held = 300, 0
+    for _ in range(n):
+        y = B @ x + rng.normal(size=30)
+        found = profile_intervals(B, y, NAMES, non_negative("a"), ["a"], sigma=1.0)["a"]
+        held += found.lower <= x[0] <= found.upper
+    low, high = binomial_band(n, 0.95 if exact is None else exact)
+    assert low <= held
+    assert exact is None or held <= high
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("degrees", [90, 150, 175])
+def test_coverage_with_the_truth_on_two_bounds(degrees):
+    # The likelihood ratio is χ²₁ on two quadrants, |x|² ~ χ²₂ on an angle of α − 90°, else 0.
+    angle = np.radians(degrees)
+    columns = np.array([[1.0, np.cos(angle)], [0.0, np.sin(angle)]])
+    rng = np.random.default_rng(degrees)
+    n, stated = 2000, non_negative("a", "b")
+    draws = rng.normal(size=(n, 2))
+    held = sum(
+        profile_intervals(columns, y, ("a", "b"), stated, ["a"], sigma=1.0)["a"].lower == 0.0
+        for y in draws
+    )
+    low, high = binomial_band(n, 0.975 - stats.chi2.sf(3.8415, 2) * (degrees - 90) / 360)
+    assert low <= held <= high
+
+
+def test_bootstrap_of_an_inactive_fit_has_its_covariance():
+    y = readings(20.0, 20.0, 20.0)
+    found = constrained_bootstrap(B, y, NAMES, non_negative(*NAMES), sigma=1.0, draws=800, seed=2)
+    assert found.failures == 0
+    ratio = found.draws.var(axis=0, ddof=1) / np.diag(COFACTOR)
+    # A sample variance of 800 normal draws has a relative standard deviation of √(2/799) = 5 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=4 * np.sqrt(2 / 799))
+
+
+def test_bootstrap_with_a_prior_has_the_posterior_covariance():
+    prior = GaussianPrior.independent(("a", "c"), [0.0, 0.0], STD[[0, 2]])
+    y = readings(1.0, 1.0, 1.0)
+    fit = solve_constrained(B, y, NAMES, prior=prior)
+    found = constrained_bootstrap(
+        B, y, NAMES, Constraints(), prior=prior, sigma=1.0, draws=800, seed=4
+    )
+    ratio = found.draws.var(axis=0, ddof=1) / np.diag(fit.cofactor)
+    np.testing.assert_allclose(ratio, 1.0, atol=4 * np.sqrt(2 / 799))
+
+
+def test_bootstrap_of_an_active_parameter_is_one_sided():
+    y = readings(-3.0, 5.0, 5.0)
+    found = constrained_bootstrap(B, y, NAMES, non_negative("a"), draws=300, seed=1)
+    fit = solve_constrained(B, y, NAMES, non_negative("a"))
+    low, high = found.interval(fit.x)[0]
+    assert low == 0.0 < high
+    assert 0.3 < np.mean(found.draws[:, 0] == 0) < 0.7  # half of the draws want it beyond
+
+
+def test_bootstrap_does_not_depend_on_the_number_of_processes():
+    y = readings(0.0, 1.0, 1.0)
+    one, two = (
+        constrained_bootstrap(B, y, NAMES, non_negative("a"), draws=20, seed=1, jobs=jobs).draws
+        for jobs in (1, 2)
+    )
+    np.testing.assert_array_equal(one, two)
+
+
+def test_what_cannot_be_judged_is_refused():
+    prior = GaussianPrior.independent(("a",), [0.0], [STD[0]])
+    for intervals in (profile_intervals, constrained_bootstrap):
+        with pytest.raises(InputError, match="state sigma"):
+            intervals(B, readings(1, 1, 1), NAMES, Constraints(), prior=prior)
+        with pytest.raises(InputError, match="no degree of freedom"):
+            intervals(B[:3], NOISE[:3], NAMES, Constraints())
+    with pytest.raises(InputError, match="'d' is not a parameter"):
+        profile_intervals(B, NOISE, NAMES, Constraints(), ["d"])
