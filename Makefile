@@ -5,6 +5,7 @@ PYTHON ?= python3
 CONSTRAINTS ?= constraints.txt
 WORKERS ?= 2
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -22,13 +23,14 @@ NOT_AT_HOME := not-at-home
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long lint clean not-at-home
+.PHONY: help demo test test-long bench lint clean not-at-home
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo       set up .venv if needed, then calibrate a simulated arm"
 	@echo "make test       the test suite              (PYTEST_ARGS=\"tests/manipulator -x\", WORKERS=2)"
 	@echo "make test-long  the long studies among the tests"
+	@echo "make bench      a million readings: wall time and peak memory (BENCH_ARGS=\"--rows 200000\")"
 	@echo "make lint       ruff check, ruff format --check, mypy"
 	@echo "make clean      remove .venv, caches and build products"
 	@echo
@@ -48,6 +50,10 @@ test: $(TEST_TOOLS)
 
 test-long: $(TEST_TOOLS)
 	$(PYTEST) -m long $(PYTEST_ARGS)
+
+bench: export OPENBLAS_NUM_THREADS = 1
+bench: $(RUN_TIME)
+	$(BIN)/python benchmarks/million_rows.py $(BENCH_ARGS)
 
 lint: $(TEST_TOOLS)
 	$(BIN)/python -m ruff check .

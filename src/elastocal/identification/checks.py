@@ -22,6 +22,7 @@ EXTENT_FACTOR = 30.0
 SMALL_ANGLE = np.radians(2 * np.pi)  # what a full turn in rad reads as in degrees
 LIMIT_SLACK = np.radians(0.5)  # controllers overshoot soft limits by a little
 SAME = 1e-9
+PIECE = 2**15  # rows whose flange poses are computed at a time
 
 
 def check_table(model: Model, table: Measurements) -> None:
@@ -31,7 +32,7 @@ def check_table(model: Model, table: Measurements) -> None:
     rows hold the same pose.
     """
     check_rows(model, table)
-    if len(np.unique(table.q, axis=0)) < 2:
+    if (table.q == table.q[:1]).all():
         raise InsufficientDataError(
             f"{table.source}: all {len(table)} rows hold the same pose; measure at different "
             "joint angles (at least as many poses as a third of the parameters)"
@@ -114,8 +115,7 @@ def _check_units(model: Model, table: Measurements) -> None:
     """Compare the extent of the readings with that of the nominal arm at the same joints."""
     if table.position is None:
         return
-    flange = model.rigid.flange_poses(table)[:, :3, 3]
-    reach = float(np.linalg.norm(np.ptp(flange, axis=0)))
+    reach = _reach(model, table)
     extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
     if reach < SAME or extent < SAME:
         return
@@ -138,9 +138,18 @@ def _looks_like_radians(model: Model, table: Measurements, ratio: float, extent:
     """Radians read as degrees: the arm hardly moves, and turned back it moves as measured."""
     if ratio < 3 or "prismatic" in model.chain.kinds or np.abs(table.q).max() > SMALL_ANGLE:
         return False
-    turned = replace(table, q=np.degrees(table.q))
-    flange = model.rigid.flange_poses(turned)[:, :3, 3]
-    return 1 / 3 < extent / float(np.linalg.norm(np.ptp(flange, axis=0))) < 3
+    return 1 / 3 < extent / _reach(model, replace(table, q=np.degrees(table.q))) < 3
+
+
+def _reach(model: Model, table: Measurements) -> float:
+    """Diagonal of the box in m that the nominal arm's flange moves in."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    # Poses are large and extrema are not: a piece of the table at a time.
+    for start in range(0, len(table), PIECE):
+        piece = table.take(np.arange(start, min(start + PIECE, len(table))))
+        flange = model.rigid.flange_poses(piece)[:, :3, 3]
+        low, high = np.minimum(low, flange.min(axis=0)), np.maximum(high, flange.max(axis=0))
+    return float(np.linalg.norm(high - low))
 
 
 def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
@@ -167,7 +176,8 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
 
 
 def check_enough(model: Model, seen: Observations, scaled: Array) -> None:
-    """Refuse when the equations are too few for the minimal set; `scaled` (rows, free)."""
+    """Refuse when the equations are too few for the minimal set; `scaled`: B
+    (rows, free) in typical sizes, or its R."""
     rows = len(seen.value)
     kept = linalg.qr(scaled, mode="r", pivoting=True)[0]
     diagonal = np.abs(np.diag(kept))

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from elastocal.errors import ElastocalError
+from elastocal.identification.chunked import Evaluation, evaluate
+from elastocal.identification.descent import Objective, descend
 from elastocal.identification.linear import solve_weighted
 from elastocal.identification.noise import Weights
+from elastocal.identification.partition import Partition, is_large, partition
+from elastocal.identification.triangle import Triangle
 from elastocal.manipulator.model import Model, Regression
 from elastocal.manipulator.observation import Observations
 
@@ -19,6 +24,9 @@ Array = NDArray[np.float64]
 # Relative change of the cost at which the trust region stops; one exact Gauss–Newton step follows
 # and squares what error is left.
 TOLERANCE = 1e-10
+# The same of a large table, whose evaluations are dear.  The last step is taken: at a million rows
+# it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
+LARGE_TOLERANCE = 1e-8
 
 REASON = {
     -1: "the solver reported improper input",
@@ -48,84 +56,160 @@ class FitProblem:
     tie: Array | None = None
     centre: Array | None = None
     bounded: bool = False
+    # The table in parts, where whoever poses the problem has cut it already.
+    cut: Partition | None = None
+
+    @cached_property
+    def parts(self) -> Partition:
+        if self.cut is not None:
+            return self.cut
+        return partition(self.observations, self.weights, len(self.model.parameters))
+
+    @property
+    def tied_to(self) -> Array:
+        """What `tie` ties the columns to."""
+        return (self.x if self.centre is None else self.centre)[self.columns]
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Bounds (columns,) on the variables u of `values`, infinite unless the fit is bounded."""
+        fitted = [self.model.parameters[c] for c in self.columns]
+        if not self.bounded:
+            return np.full(len(fitted), -np.inf), np.full(len(fitted), np.inf)
+        x, size = self.x[self.columns], self.sizes[self.columns]
+        lower, upper = np.array([(p.lower, p.upper) for p in fitted]).T
+        return (lower - x) / size, (upper - x) / size
+
+    def values(self, u: Array) -> Array:
+        """Parameters (parameters,) with the columns moved by u typical sizes."""
+        x = self.x.copy()
+        x[self.columns] += u * self.sizes[self.columns]
+        return x
+
+    @property
+    def large(self) -> bool:
+        """Whether B is reduced part by part instead of being formed."""
+        return is_large(self.observations, len(self.model.parameters))
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Values x (parameters,), raw and whitened residual (rows,), B of the columns, raw."""
+    """Values x (parameters,), raw and whitened residual (rows,), `triangle` of whitened B and it.
+
+    `columns` (fitted,) index the parameters.
+    """
 
     x: Array
     residual: Array
     whitened: Array
-    B: Array
+    triangle: Triangle
     converged: bool
     reason: str
     steps: int
+    problem: FitProblem = field(repr=False)
+
+    @property
+    def columns(self) -> NDArray[np.int64]:
+        return self.problem.columns
+
+    @cached_property
+    def B(self) -> Array:
+        """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `triangle`."""
+        seen = self.problem.observations
+        return self.problem.model.regressor(seen.table, self.x, self.columns, seen).B
+
+    def cofactor(self) -> Array:
+        """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13).
+
+        Exact to working precision for tables of ordinary size; of a large one from the triangle,
+        exact to working precision times condition number.
+        """
+        scale = self.problem.sizes[self.columns]
+        if self.problem.large:
+            return self.triangle.cofactor(scale)
+        B = self.problem.weights.apply(self.B)
+        return solve_weighted(B, self.whitened, scale=scale).cofactor
 
 
-def fit(problem: FitProblem, max_steps: int = 60) -> Fit:
-    """Levenberg–Marquardt (trust region) from the problem's x, derivatives exact.
+def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLERANCE) -> Fit:
+    """Levenberg–Marquardt from the problem's x, derivatives exact.
+
+    A large table is fitted on triangles, with the cost and the gradient of all rows, until a step
+    promises less than `tolerance` of the cost.
 
     Raises ElastocalError where the start has poses without equilibrium.
     """
+    if problem.large:
+        return _fit_in_parts(problem, max_steps, tolerance)
+    return _fit_whole(problem, max_steps)
+
+
+def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
     model, seen, columns = problem.model, problem.observations, problem.columns
-    size = problem.sizes[columns]
-    table = seen.table
-
-    def values(u: Array) -> Array:
-        x = problem.x.copy()
-        x[columns] = problem.x[columns] + u * size
-        return x
-
-    centre = (problem.x if problem.centre is None else problem.centre)[columns]
+    size, weights = problem.sizes[columns], problem.weights
 
     def residual(u: Array) -> Array:
-        x = values(u)
-        r = problem.weights.apply(model.predict(table, x, seen) - seen.value)
+        x = problem.values(u)
+        r = weights.apply(model.predict(seen.table, x, seen) - seen.value)
         if problem.tie is None:
             return r
-        return np.concatenate([r, (x[columns] - centre) / problem.tie])
+        return np.concatenate([r, (x[columns] - problem.tied_to) / problem.tie])
 
     def jacobian(u: Array) -> Array:
-        B = problem.weights.apply(model.regressor(table, values(u), columns, seen).B * size)
+        B = weights.apply(model.regressor(seen.table, problem.values(u), columns, seen).B * size)
         return B if problem.tie is None else np.vstack([B, np.diag(size / problem.tie)])
 
-    lower, upper = np.full(len(columns), -np.inf), np.full(len(columns), np.inf)
-    if problem.bounded:
-        lower = np.array([model.parameters[c].lower for c in columns])
-        upper = np.array([model.parameters[c].upper for c in columns])
-        lower, upper = ((b - problem.x[columns]) / size for b in (lower, upper))
+    lower, upper = problem.limits
     start = np.clip(np.zeros(len(columns)), lower, upper)
     if not np.isfinite(residual(start)).all():
-        model.regressor(table, values(start), columns, seen)  # names the row
+        evaluate(model, problem.parts, problem.values(start), columns)  # names the row
         raise ElastocalError("the model has no finite prediction at the start values")
     found = least_squares(
         residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
         ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
     )  # fmt: skip
-    x = values(found.x)
-    final = model.regressor(table, x, columns, seen)
+    x = problem.values(found.x)
+    final = model.regressor(seen.table, x, columns, seen)
     if problem.tie is None and not problem.bounded and found.status > 0:
         x, final = _polished(problem, x, final)
+    whitened = weights.apply(final.residual)
     return Fit(
-        x, final.residual, problem.weights.apply(final.residual), final.B,
-        bool(found.status > 0), REASON[int(found.status)], int(found.nfev),
+        x, final.residual, whitened, Triangle.of(weights.apply(final.B), whitened),
+        bool(found.status > 0), REASON[int(found.status)], int(found.nfev), problem,
+    )  # fmt: skip
+
+
+def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
+    columns = problem.columns
+    size = problem.sizes[columns]
+    lower, upper = problem.limits
+
+    def evaluated(u: Array) -> Evaluation:
+        at = evaluate(problem.model, problem.parts, problem.values(u), columns)
+        return Evaluation(at.residual, at.triangle.scaled(size))
+
+    objective = Objective(
+        evaluated, np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size,
+        (problem.tied_to - problem.x[columns]) / size, lower, upper,
+    )  # fmt: skip
+    start = np.clip(np.zeros(len(columns)), lower, upper)
+    found = descend(objective, start, tolerance, max_steps)
+    return Fit(
+        problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
+        found.at.triangle.scaled(1 / size), found.converged, found.reason, found.evaluations,
+        problem,
     )  # fmt: skip
 
 
 def _polished(problem: FitProblem, x: Array, at: Regression) -> tuple[Array, Regression]:
     """One Gauss–Newton step with the exact linear solver, kept where it does not cost."""
-    weights, columns = problem.weights, problem.columns
+    weights, columns, seen = problem.weights, problem.columns, problem.observations
     before = weights.apply(at.residual)
     step = solve_weighted(weights.apply(at.B), before, scale=problem.sizes[columns])
     moved = x.copy()
     moved[columns] += step.x
-    residual = problem.observations.value - problem.model.predict(
-        problem.observations.table, moved, problem.observations
-    )
+    residual = seen.value - problem.model.predict(seen.table, moved, seen)
     after = weights.apply(residual)
     if not np.isfinite(after).all() or after @ after > before @ before:
         return x, at
-    return moved, problem.model.regressor(
-        problem.observations.table, moved, columns, problem.observations
-    )
+    return moved, problem.model.regressor(seen.table, moved, columns, seen)

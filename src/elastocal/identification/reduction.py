@@ -56,7 +56,7 @@ class Reduction:
 def reduce(
     B: Array, sizes: Array, parameters: tuple[Parameter, ...], sigma: float, threshold: float
 ) -> Reduction:
-    """Choose a minimal complete set of columns of the whitened B (rows, parameters).
+    """Choose a minimal complete set of columns of the whitened B (rows, parameters), or of its R.
 
     Columns are scaled by typical size and by the noise `sigma` of a whitened row, so that the
     length of a column off the span of the kept ones counts how many standard deviations a

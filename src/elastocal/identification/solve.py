@@ -8,19 +8,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.errors import ElastocalError
 from elastocal.identification.checks import check_enough
-from elastocal.identification.fit import Fit, FitProblem, fit
+from elastocal.identification.chunked import each, regressor, residual_at
+from elastocal.identification.fit import Fit, fit
 from elastocal.identification.heldout import rms_3d
+from elastocal.identification.partition import Part, sample
 from elastocal.identification.reduction import Reduction
 from elastocal.identification.selection import (
     WORTH_A_COLUMN,
     Problem,
+    choose,
+    fit_kept,
+    free_triangle,
     held_at_bounds,
     heldout_of,
     prefer_wider,
-    reduced_fit,
     residual_sigma,
 )
+from elastocal.identification.triangle import Triangle, merge
 from elastocal.manipulator.model import Model
 
 Array = NDArray[np.float64]
@@ -29,6 +35,11 @@ Progress = Callable[[str], None]
 # Width of the weak tie that keeps undetermined directions still before they are recognised:
 # in typical sizes for deviations from nominal, in m and rad for what registration placed.
 LOOSE, PLACED = 3.0, 0.3
+# Relative change of the cost at which the tied fits of a large table end: what is placed is where
+# parameters that get dropped are held for good; the fit of all is only where their choice begins.
+PLACING, CHOOSING = 1e-14, 1e-2
+# Observations that a large table's fit starts from.
+SAMPLE = 5000
 PLACED_EFFECTS = ("base_frame", "marker_position", "marker_orientation", "distance_sensor")
 
 
@@ -56,34 +67,61 @@ def solve(
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    model, seen = problem.model, problem.observations
-    start = model.regressor(seen.table, problem.x0, None, seen)
-    sizes = model.sizes(start.B)
-    sizes[is_placed(model)] = PLACED
-    check_enough(model, seen, start.B[:, problem.free] * sizes[problem.free])
+    sizes = _sizes_and_check(problem)
+    settled = settle(problem, sizes, progress)
+    problem, found, reduction = settled.problem, settled.fit, settled.reduction
+    heldout = heldout_of(problem, found)
+    if try_wider:
+        progress("comparing with wider sets")
+        found, reduction, heldout = prefer_wider(
+            problem, sizes, found, reduction, heldout, settled.triangle
+        )
+    if problem.bounded:
+        found, reduction = held_at_bounds(problem, sizes, found, reduction)
+        heldout = heldout_of(problem, found)
+    nominal = rms_3d(settled.nominal, problem.observations.size)
+    return Solution(problem, found, reduction, sizes, heldout, nominal)
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A minimal set and its fit: `problem` with base and markers placed at x0, `triangle` of the
+    free columns at the fit, `nominal` (rows,) residual of the nominal arm so placed."""
+
+    problem: Problem
+    fit: Fit
+    reduction: Reduction
+    triangle: Triangle
+    nominal: Array
+
+
+def settle(problem: Problem, sizes: Array, progress: Progress = lambda message: None) -> Settled:
+    """Place base and markers, choose a minimal complete set of parameters and fit it.
+
+    Raises InsufficientDataError where the data determine nothing.
+    """
+    model = problem.model
     placed = problem.free[is_placed(model)[problem.free]]
     if len(placed):
         progress("placing base and markers")
-        problem = replace(problem, x0=_tied_fit(replace(problem, free=placed), sizes).x)
-    nominal = seen.value - model.predict(seen.table, problem.x0, seen)
+        base = _tied_fit(replace(problem, free=placed), sizes, PLACING)
+        problem = replace(problem, x0=base.x)
+        nominal = base.residual
+    else:
+        nominal = residual_at(model, problem.parts, problem.x0)
     progress("first fit, tied weakly to the start")
-    first = _tied_fit(problem, sizes)
+    found = _tied_fit(problem, sizes, CHOOSING)
     progress("choosing the parameters that the data determine")
-    x, sigma, kept = first.x, residual_sigma(first, 0), None
+    sigma, kept, triangle = residual_sigma(found, 0), None, found.triangle
     for _ in range(5):
-        found, reduction = reduced_fit(problem, sizes, x, sigma, WORTH_A_COLUMN)
+        reduction = choose(problem, sizes, triangle, sigma, WORTH_A_COLUMN)
         if kept is not None and np.array_equal(kept, reduction.kept):
             break
         # The threshold is in units of the noise, and the noise is known only after the fit.
-        x, sigma, kept = found.x, residual_sigma(found, len(reduction.kept)), reduction.kept
-    heldout = heldout_of(problem, found.B, found.residual)
-    if try_wider:
-        progress("comparing with wider sets")
-        found, reduction, heldout = prefer_wider(problem, sizes, found, reduction, heldout)
-    if problem.bounded:
-        found, reduction = held_at_bounds(problem, sizes, found, reduction)
-        heldout = heldout_of(problem, found.B, found.residual)
-    return Solution(problem, found, reduction, sizes, heldout, rms_3d(nominal, seen.size))
+        kept = reduction.kept
+        found = fit_kept(problem, sizes, found.x, reduction)
+        sigma, triangle = residual_sigma(found, len(kept)), free_triangle(problem, found)
+    return Settled(problem, found, reduction, triangle, nominal)
 
 
 def is_placed(model: Model) -> NDArray[np.bool_]:
@@ -91,16 +129,53 @@ def is_placed(model: Model) -> NDArray[np.bool_]:
     return np.array([p.effect in PLACED_EFFECTS for p in model.parameters], dtype=bool)
 
 
-def _tied_fit(problem: Problem, sizes: Array) -> Fit:
-    """Fit of all free parameters with weak ties, scaled by a noise level found on the way."""
+def _sizes_and_check(problem: Problem) -> Array:
+    """Typical sizes (parameters,) at the start; refuses where the equations are too few."""
     model, seen, free = problem.model, problem.observations, problem.free
-    width = np.where(is_placed(model), sizes, LOOSE * sizes)[free]
-    misfit = problem.weights.apply(seen.value - model.predict(seen.table, problem.x0, seen))
-    sigma = max(float(np.sqrt(np.mean(misfit**2))), 1e-12)
+    every = np.arange(len(model.parameters))
+
+    def of_part(part: Part) -> tuple[Array, Triangle]:
+        at = regressor(model, part, problem.x0, every)
+        return np.abs(at.B).max(axis=0, initial=0.0), Triangle.of(at.B, at.residual)
+
+    largest, triangles = zip(*each(problem.parts, of_part), strict=True)
+    sizes = model.sizes(np.stack(largest))
+    sizes[is_placed(model)] = PLACED
+    check_enough(model, seen, merge(triangles).R[:, free] * sizes[free])
+    return sizes
+
+
+def _tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
+    """Fit of all free parameters with weak ties, scaled by a noise level found on the way.
+
+    A large table starts where such a fit to a sample of it ends.
+    """
     x = problem.x0
+    if problem.large:
+        part = sample(problem.parts, SAMPLE)
+        rough = replace(problem, observations=part.observations, weights=part.weights)
+        found = _tied_from(rough, sizes, x, _misfit(rough), tolerance)
+        try:
+            return _tied_from(problem, sizes, found.x, residual_sigma(found, 0), tolerance)
+        except ElastocalError:
+            pass  # the sample has led where other readings have no equilibrium
+    return _tied_from(problem, sizes, x, _misfit(problem), tolerance)
+
+
+def _misfit(problem: Problem) -> float:
+    """Root mean square of the whitened residual at the start."""
+    residual = problem.weights.apply(residual_at(problem.model, problem.parts, problem.x0))
+    return max(float(np.sqrt(np.mean(residual**2))), 1e-12)
+
+
+def _tied_from(problem: Problem, sizes: Array, x: Array, sigma: float, tolerance: float) -> Fit:
+    """Tied fits from x until the noise level `sigma` that scales the ties no longer falls."""
+    free = problem.free
+    width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
-        tied = FitProblem(model, seen, problem.weights, x, free, sizes, width / sigma, problem.x0)
-        found = fit(tied, max_steps=25)
+        untied = replace(problem, bounded=False).fit_of(free, x, sizes)
+        tied = replace(untied, tie=width / sigma, centre=problem.x0)
+        found = fit(tied, max_steps=25, tolerance=tolerance)
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:
             return found

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from elastocal.identification.registration import RegistrationProblem, register
+from elastocal.identification.registration import SAMPLE, RegistrationProblem, register
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
@@ -44,8 +44,10 @@ def start_values(
     # Deflected readings would pull the start; unloaded ones serve alone where they are enough
     # and show every marker.
     light = ~np.any(table.force != 0, axis=1)
-    enough = light.sum() >= 12 and set(codes[light]) == set(codes)
+    enough = light.sum() >= 12 and np.array_equal(np.unique(codes[light]), np.unique(codes))
     rows = np.flatnonzero(light) if enough else np.arange(len(table))
+    if len(rows) > SAMPLE:
+        rows = np.random.default_rng(seed).choice(rows, SAMPLE, replace=False)
     T = model.rigid.flange_poses(table.take(rows))
     nominal = model.cell.model.nominal
     problem = RegistrationProblem(

@@ -1,0 +1,64 @@
+"""Levenberg–Marquardt on triangles: it arrives, within bounds, and says when it has not."""
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from elastocal.errors import ElastocalError
+from elastocal.identification.chunked import Evaluation
+from elastocal.identification.descent import Objective, descend
+from elastocal.identification.triangle import Triangle
+
+
+def objective_of(residual, jacobian, p, lower=-np.inf, upper=np.inf, tie=np.inf):
+    def evaluate(u):
+        e = residual(u)
+        if not np.isfinite(e).all():
+            raise ElastocalError("no equilibrium")
+        return Evaluation(e, Triangle.of(-jacobian(u), e))
+
+    limits = (np.full(p, float(lower)), np.full(p, float(upper)))
+    return Objective(evaluate, np.full(p, float(tie)), np.zeros(p), *limits)
+
+
+def rosenbrock(u):
+    return np.array([10 * (u[1] - u[0] ** 2), 1 - u[0], 0.0])
+
+
+def rosenbrock_slope(u):
+    return np.array([[-20 * u[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
+
+
+def test_descent_through_a_curved_valley():
+    found = descend(objective_of(rosenbrock, rosenbrock_slope, 2), np.array([-1.2, 1.0]), 1e-12, 99)
+    assert found.converged
+    np.testing.assert_allclose(found.u, [1, 1], atol=1e-10)
+
+
+def test_descent_turns_back_where_there_is_no_prediction():
+    """1/u − 2 has none below zero, where the full step from 3 leads."""
+
+    def residual(u):
+        return np.array([1 / u[0] - 2.0, 0.0]) if u[0] > 0 else np.array([np.nan, 0.0])
+
+    def slope(u):
+        return np.array([[-1 / u[0] ** 2], [0.0]])
+
+    found = descend(objective_of(residual, slope, 1), np.array([3.0]), 1e-12, 99)
+    assert found.converged and found.u[0] == pytest.approx(0.5, rel=1e-9)
+
+
+def test_descent_within_bounds_and_ties_is_the_minimum():
+    rng = np.random.default_rng(4)
+    A, y = rng.normal(size=(30, 4)), rng.normal(size=30) * 4
+    objective = objective_of(lambda u: y - A @ u, lambda u: -A, 4, -0.2, 0.3, tie=0.5)
+    found = descend(objective, np.zeros(4), 1e-12, 20)
+    expected = lsq_linear(np.vstack([A, 2 * np.eye(4)]), np.append(y, np.zeros(4)), (-0.2, 0.3),
+                          method="bvls", tol=1e-14)  # fmt: skip
+    assert 0 < (np.abs(expected.active_mask) > 0).sum() < 4
+    np.testing.assert_allclose(found.u, expected.x, atol=1e-9)
+
+
+def test_descent_says_when_it_has_not_arrived():
+    found = descend(objective_of(rosenbrock, rosenbrock_slope, 2), np.array([-1.2, 1.0]), 1e-12, 3)
+    assert not found.converged and found.evaluations == 3 and "step limit" in found.reason

@@ -1,0 +1,80 @@
+"""A triangle stands for all rows, also where they are ill-conditioned."""
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from elastocal.identification.triangle import Triangle, merge
+
+NIST = Path(__file__).parent / "nist"
+CERTIFIED = json.loads((NIST / "certified.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(("name", "digits"), [("Longley", 9), ("Filip", 6), ("Wampler5", 6)])
+def test_an_ill_conditioned_problem_keeps_its_digits(name, digits):
+    """Condition numbers to 5e9 (columns scaled) enter once.  Normal equations, where they enter
+    squared, lose all digits of Filip; parts of five rows are smaller than the triangle itself."""
+    certified = CERTIFIED[name]
+    rows = np.loadtxt(NIST / f"{name}.csv", delimiter=",", skiprows=1)
+    y, predictors = rows[:, 0], rows[:, 1:]
+    columns = [np.ones((len(y), 1))] if 0 in certified["powers"] else []
+    B = np.hstack(columns + [predictors**k for k in certified["powers"] if k > 0])
+    pieces = [slice(a, a + 5) for a in range(0, len(y), 5)]
+    triangle = merge(Triangle.of(B[piece], y[piece]) for piece in pieces)
+    scale = 1 / np.linalg.norm(B, axis=0)
+    x, std = np.array(certified["x"]), np.array(certified["std"])
+    assert (np.abs(triangle.step(scale) / x - 1) < 10.0**-digits).all()
+    sigma = triangle.rest / np.sqrt(len(y) - len(x))
+    found = sigma * np.sqrt(np.diag(triangle.cofactor(scale)))
+    assert (np.abs(found / std - 1) < 10.0**-digits).all()
+    if name == "Filip":
+        scaled = B * scale
+        normal = scale * np.linalg.lstsq(scaled.T @ scaled, scaled.T @ y, rcond=None)[0]
+        assert (np.abs(normal / x - 1) > 0.1).any()
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    rows=st.integers(1, 400), p=st.integers(1, 6), cuts=st.integers(1, 9), seed=st.integers(0, 99)
+)
+def test_a_triangle_stands_for_its_rows(rows, p, cuts, seed):
+    """Products, norms, subsets of columns and minimiser are those of the rows, however cut."""
+    rng = np.random.default_rng(seed)
+    B, e = rng.normal(size=(rows, p)) * 10.0 ** rng.uniform(-3, 3, p), rng.normal(size=rows)
+    edges = np.linspace(0, rows, cuts + 1).astype(int)
+    triangle = merge(Triangle.of(B[a:b], e[a:b]) for a, b in pairwise(edges) if b > a)
+    norm = np.linalg.norm(B, axis=0)
+    assert triangle.rows == rows and triangle.rss == pytest.approx(e @ e, rel=1e-12)
+    np.testing.assert_allclose(triangle.R.T @ triangle.R, B.T @ B, rtol=0,
+                               atol=1e-12 * np.outer(norm, norm).max())  # fmt: skip
+    np.testing.assert_allclose(triangle.R.T @ triangle.projected, B.T @ e,
+                               atol=1e-11 * norm.max() * np.linalg.norm(e))  # fmt: skip
+    chosen = np.flatnonzero(rng.random(p) < 0.6)
+    some = triangle.of_columns(chosen)
+    assert some.rss == pytest.approx(e @ e, rel=1e-12)
+    np.testing.assert_allclose(some.R.T @ some.R, B[:, chosen].T @ B[:, chosen], rtol=0,
+                               atol=1e-12 * np.outer(norm, norm).max())  # fmt: skip
+    if rows > 2 * p:
+        x = np.linalg.lstsq(B / norm, e, rcond=None)[0] / norm
+        np.testing.assert_allclose(triangle.step(1 / norm) * norm, x * norm, rtol=1e-8, atol=1e-10)
+        left = np.linalg.norm(e - B @ x)
+        assert triangle.rest == pytest.approx(left, rel=1e-8, abs=1e-12 * np.linalg.norm(e))
+
+
+def test_a_tall_matrix_whose_solution_is_known():
+    B = np.random.default_rng(0).normal(size=(5003, 7))
+    triangle = Triangle.of(B, B[:, 0])
+    np.testing.assert_allclose(triangle.R.T @ triangle.R, B.T @ B, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(triangle.step(np.ones(7)), np.eye(7)[0], atol=1e-13)
+
+
+def test_a_direction_without_data_is_left_where_it_is():
+    """Two equal columns share the step by their sizes; a zero column stays at zero."""
+    B = np.ones((9, 3)) * [1.0, 1.0, 0.0]
+    step = Triangle.of(B, np.full(9, 5.0)).step(np.array([2.0, 1.0, 1.0]))
+    np.testing.assert_allclose(step, [4.0, 1.0, 0.0], atol=1e-14)
