@@ -1,0 +1,1 @@
+"""Noise models whose variances are estimated from the residuals, and intervals that know it."""

@@ -1,0 +1,59 @@
+"""The default estimate: faulty readings set apart, noise model chosen, x by its weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.errors import ElastocalError
+from elastocal.identification.variance.choose import NoiseFit, estimate_noise
+from elastocal.identification.variance.judge import beyond_noise
+from elastocal.identification.variance.readings import Readings
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
+ROUNDS = 12
+FEWEST_GOOD = 0.5
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The noise found from the `good` readings (N,); the others lie beyond it."""
+
+    noise: NoiseFit
+    good: Mask
+
+
+def settle(readings: Readings, kind: str = "auto", good: Mask | None = None) -> Verdict:
+    """Noise and good readings that agree with each other, starting from `good` (default all).
+
+    The noise model is fitted to the good readings, every reading is judged by the error of its
+    prediction from them (false-alarm rate 1 % for the whole table), and so on.  Starting from
+    all, errors that hide each other may stay: start from a robust fit.  A set that comes back
+    after others ends the search: readings that were good at any time of that round are kept.
+    """
+    good = np.ones(len(readings), dtype=bool) if good is None else good
+    noise = estimate_noise(readings.take(good), kind)
+    seen = [good]
+    for _ in range(ROUNDS):
+        updated = ~beyond_noise(noise, readings, good, FALSE_ALARM)
+        if np.array_equal(updated, good) or updated.mean() < FEWEST_GOOD:
+            break
+        again = next((k for k, mask in enumerate(seen) if np.array_equal(mask, updated)), None)
+        if again is not None:
+            updated = np.logical_or.reduce(seen[again:])
+        try:
+            noise = estimate_noise(readings.take(updated), noise.kind)
+        except ElastocalError:
+            break  # so few readings cannot judge the others
+        good = updated
+        if again is not None:
+            break
+        seen.append(good)
+    if len(seen) > 1 and kind == "auto":
+        noise = estimate_noise(readings.take(good), kind)
+    return Verdict(noise, good)

@@ -1,0 +1,107 @@
+"""The reduced restricted likelihood is that of all rows, to the last term."""
+
+import numpy as np
+import pytest
+from identification.variance.dense import Table, dense, readings
+
+from elastocal.identification.variance.blocks import stacks
+from elastocal.identification.variance.likelihood import evaluate, slope
+from elastocal.identification.variance.shared import shared_effects
+from elastocal.identification.variance.structure import STRUCTURES
+
+TABLES = {
+    "size 1": Table(size=1, configurations=5, markers=3, repeats=3, p=3),
+    "size 3": Table(),
+    "size 6": Table(size=6, configurations=4, markers=1, repeats=3, p=5),
+    "loads": Table(configurations=4, loads=2, markers=2, repeats=3, p=5),
+    "no repeats": Table(markers=3, repeats=1, unbalanced=False),
+    "balanced": Table(unbalanced=False),
+}
+CASES = [
+    (table, name)
+    for table in TABLES
+    for name in STRUCTURES
+    if TABLES[table].size == 3 or name not in ("marker", "polar")
+]
+
+
+def at_random(table, name, share, seed=0):
+    """A state at random θ, and the dense model there; units are metres."""
+    r = readings(TABLES[table], seed)
+    structure = STRUCTURES[name](r)
+    effects = shared_effects(structure.cells, r.size, share)
+    rng = np.random.default_rng(seed + 1)
+    theta = np.exp(rng.normal(size=len(structure.names) + len(effects)))
+    theta *= 1.0 if name == "stated" else 1e-10
+    theta[len(structure.names) :] = 1e-10 * np.exp(rng.normal(size=len(effects)))
+    stacked = stacks(structure, effects)
+    whole = dense(name, r, structure.names, [e.name for e in effects], theta)
+    return structure, stacked, theta, whole
+
+
+@pytest.mark.parametrize("share", [False, True], ids=["alone", "shared"])
+@pytest.mark.parametrize(("table", "name"), CASES)
+def test_state_is_that_of_all_rows(table, name, share):
+    structure, stacked, theta, whole = at_random(table, name, share)
+    state = evaluate(structure, stacked, theta)
+    assert state.log_likelihood == pytest.approx(whole.log_likelihood, rel=1e-10)
+    np.testing.assert_allclose(state.x, whole.x, rtol=1e-8, atol=1e-8 * np.abs(whole.x).max())
+    np.testing.assert_allclose(state.Phi, whole.Phi, rtol=1e-8, atol=1e-9 * whole.Phi.max())
+
+
+@pytest.mark.parametrize("share", [False, True], ids=["alone", "shared"])
+@pytest.mark.parametrize(("table", "name"), CASES)
+def test_score_and_information_are_those_of_all_rows(table, name, share):
+    structure, stacked, theta, whole = at_random(table, name, share, seed=10)
+    found = slope(structure, evaluate(structure, stacked, theta))
+    size = np.sqrt(np.diag(whole.information))
+    np.testing.assert_allclose(found.score / size, whole.score / size, rtol=1e-8, atol=1e-8)
+    shape = np.outer(size, size)
+    np.testing.assert_allclose(found.information / shape, whole.information / shape, atol=1e-9)
+    np.testing.assert_allclose(found.observed / shape, whole.observed / shape, rtol=1e-8, atol=1e-8)
+    assert found.told.all()
+
+
+@pytest.mark.parametrize(("table", "name"), CASES)
+def test_score_is_the_slope_of_the_likelihood_and_observed_information_its_own(table, name):
+    structure, stacked, theta, _ = at_random(table, name, True, seed=20)
+    at = slope(structure, evaluate(structure, stacked, theta))
+    size = np.sqrt(np.diag(at.information))
+    for k in range(len(theta)):
+        h = 1e-4 * theta[k] * np.eye(len(theta))[k]
+        up, down = (evaluate(structure, stacked, theta + d) for d in (h, -h))
+        gain = (up.log_likelihood - down.log_likelihood) / 2e-4
+        assert gain == pytest.approx(theta[k] * at.score[k], rel=1e-5, abs=1e-5)
+        change = slope(structure, up).score - slope(structure, down).score
+        row = -change / 2e-4 / theta[k]
+        np.testing.assert_allclose(
+            row / size / size[k], at.observed[k] / size / size[k], atol=1e-5 * max(1, size[k])
+        )
+
+
+def test_information_is_the_mean_outer_product_of_scores():
+    """E[s sᵀ] over data drawn from the model, within five standard errors of 2000 draws."""
+    structure, stacked, theta, whole = at_random("balanced", "axis", True)
+    rng = np.random.default_rng(5)
+    L = np.linalg.cholesky(whole.V)
+    P, draws = whole.P, L @ rng.normal(size=(len(L), 2000))
+    Pe = P @ draws
+    scores = np.array(
+        [0.5 * ((Pe * (V @ Pe)).sum(axis=0) - np.trace(P @ V)) for V in whole.parts]
+    )  # at each draw; test_score… ties the package's score to this formula
+    information = slope(structure, evaluate(structure, stacked, theta)).information
+    products = scores[:, None] * scores[None]
+    error = products.std(axis=2) / np.sqrt(2000)
+    assert (np.abs(products.mean(axis=2) - information) < 5 * error).all()
+
+
+def test_the_stacks_are_cut_small_enough_without_changing_anything(monkeypatch):
+    structure, stacked, theta, _ = at_random("loads", "groups", True)
+    whole = slope(structure, evaluate(structure, stacked, theta))
+    monkeypatch.setattr("elastocal.identification.variance.blocks.MOST_NUMBERS", 1)
+    effects = shared_effects(structure.cells, 3)
+    cut = stacks(structure, effects)
+    assert len(cut) > len(stacked)
+    found = slope(structure, evaluate(structure, cut, theta))
+    np.testing.assert_allclose(found.score, whole.score, rtol=1e-9)
+    np.testing.assert_allclose(found.information, whole.information, rtol=1e-9)
