@@ -13,6 +13,7 @@ from pathlib import Path
 from prepare import HERE, prepare
 
 # label, cell, data, test data, options
+KEEP, DROP = ("--outliers", "keep"), ("--outliers", "drop")
 RUNS: tuple[tuple[str, str, str, str | None, tuple[str, ...]], ...] = (
     ("UR5, 1000 poses", "ur5.toml", "ur5_grid.csv", "ur5_random.csv", ()),
     ("WAM, 216 poses", "wam.toml", "wam_grid.csv", "wam_random.csv", ()),
@@ -21,7 +22,16 @@ RUNS: tuple[tuple[str, str, str, str | None, tuple[str, ...]], ...] = (
     ("iiwa 7, scales and compliance of joint 2", "iiwa7_joint2.toml", "iiwa7.csv", None, ()),
     ("iiwa 7, scales and all compliances", "iiwa7.toml", "iiwa7.csv", None, ()),
     ("IRB 120 by cable, as is", "irb120.toml", "irb120.csv", None, ()),
-    ("IRB 120 by cable, faulty left out", "irb120.toml", "irb120.csv", None, ("--drop-outliers",)),
+    (
+        "IRB 120 by cable, faulty left out",
+        "irb120.toml",
+        "irb120.csv",
+        None,
+        (
+            "--outliers",
+            "drop",
+        ),
+    ),
 )
 HEADER = (
     "| run | fitted | nominal rms | fit rms | held-out rms | test mean | test max | left out |\n"

@@ -71,7 +71,7 @@ def test_equals_refits_of_an_arm(effects, stated):
     truth = true_values(model, rng)
     forces = [[0, 0, 0], [50, 0, -200]]
     table = measured(model, table_at(random_poses(chain, 20, 3), forces), truth, sigma, rng)
-    result = identify(model, table)
+    result = identify(model, table, Options(method="wls" if stated else "ols"))
     kept = np.array([model.names.index(name) for name in result.determined])
     seen = result.observations
     sizes = model.sizes(model.regressor(table, result.x).B)

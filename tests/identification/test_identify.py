@@ -257,7 +257,7 @@ def test_pose_observation(stated):
     plan = table_at(random_poses(chain, 30, 3))
     table = simulate(true, replace(plan, rotation=np.zeros((30, 3))), truth, rng)
     result = identify(model, table)
-    assert result.noise["kind"] == ("axis" if stated else "component")
+    assert result.noise["kind"] == ("stated" if stated else "independent")
     if stated:  # s² · dof is χ²(dof)
         low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], result.dof)
         assert low < result.noise["ratio_to_stated"] ** 2 * result.dof < high
@@ -462,11 +462,11 @@ PARAMETER_KEYS = {"name", "value", "unit", "std", "ci95", "identifiable", "combi
 
 
 @lru_cache
-def some_result():
+def some_result(options=None):
     model, table, truth = springs_case()
     other = measured(model, table_at(random_poses(model.chain, 20, 9)), truth, SIGMA,
                      np.random.default_rng(9))  # fmt: skip
-    return identify(model, table, test=other)
+    return identify(model, table, options, test=other)
 
 
 def test_json_has_the_keys_of_the_format():
@@ -503,7 +503,7 @@ def test_json_of_a_result_with_infinities_is_still_json():
 
 
 def test_t_intervals_and_covariance_belong_together():
-    result = some_result()
+    result = some_result(Options(method="ols"))
     assert result.dof == len(result.residual) - len(result.determined)
     std = np.sqrt(np.diag(result.covariance))
     t = stats.t.ppf(0.975, result.dof)

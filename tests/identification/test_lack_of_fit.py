@@ -8,7 +8,7 @@ from scipy import stats
 from support.calibration import cell_of, planar_chain, table_at
 from support.cells import random_poses
 
-from elastocal.identification.identify import identify
+from elastocal.identification.identify import Options, identify
 from elastocal.identification.lack_of_fit import lack_of_fit
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
@@ -61,12 +61,26 @@ def test_p_values_are_uniform_where_nothing_lacks():
 
 def test_a_configuration_effect_is_told():
     model, table = campaign(3, effect=1e-4)
-    result = identify(model, table)
+    result = identify(model, table, Options(method="ols"))
     found = result.noise["lack_of_fit"]
     # The effect's variance is 4 times a reading's; means of 4 readings carry it whole.
     assert found["p"] < 1e-6 and 5 < found["F"] < 50
     assert any(w.startswith(SENTENCE) for w in result.warnings)
     json.dumps(result.to_json(), allow_nan=False)
+
+
+def test_the_default_counts_with_a_configuration_effect():
+    """The same table: the effect is in the noise model, so intervals are wider and nobody warns."""
+    model, table = campaign(3, effect=1e-4)
+    plain, result = identify(model, table, Options(method="ols")), identify(model, table)
+    assert result.noise["kind"].endswith("+configuration")
+    assert result.noise["lack_of_fit"]["p"] < 1e-6
+    assert not any(w.startswith(SENTENCE) for w in result.warnings)
+    assert np.trace(result.covariance) > 2 * np.trace(plain.covariance)
+    (common,) = (
+        v for v in result.noise["variances"] if v["name"] == "common to each configuration"
+    )
+    assert 50 < common["sigma_um"] < 200  # 100 µm, from a handful of configurations
 
 
 def test_a_clean_campaign_is_left_in_peace():

@@ -271,7 +271,7 @@ def test_identify_states_the_covariance_that_its_estimates_have():
     squared = []
     for _ in range(25):
         result = identify(model, simulate(model, plan, truth, rng))
-        assert result.method == "wls" and len(result.determined) == len(truth)
+        assert result.method == "reml" and len(result.determined) == len(truth)
         d = result.x - truth
         squared.append(d @ np.linalg.solve(result.covariance, d))
     p, dof = len(truth), result.dof

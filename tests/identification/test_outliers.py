@@ -52,7 +52,7 @@ def rows_of(outliers):
 
 def false_alarms(model, tables, poses):
     return sum(
-        bool(identify(model, clean_table(model, seed, poses)[0]).outliers) for seed in range(tables)
+        bool(identify(model, clean_table(model, seed, poses)[0]).faulty) for seed in range(tables)
     )
 
 
@@ -80,7 +80,7 @@ def test_a_tenth_of_gross_errors_is_found_and_little_else(seed):
     model = Model(planar_chain(), cell_of(GEOMETRY))
     table, _, rng = clean_table(model, seed, 60)
     wrong, bad = with_gross_errors(table, rng, 0.1)
-    found = rows_of(identify(model, wrong).outliers)
+    found = rows_of(identify(model, wrong).faulty)
     assert set(bad) <= set(found)
     assert len(found) <= len(bad) + 1
 
@@ -93,8 +93,8 @@ def test_errors_among_several_load_states_and_markers():
     plan = table_at(random_poses(model.chain, 15, 3), markers=("M1", "M2"))
     table, bad = with_gross_errors(measured(model, plan, truth, SIGMA, rng), rng, 0.1)
     result = identify(model, table)
-    assert np.array_equal(rows_of(result.outliers), bad)
-    for o in result.outliers:
+    assert np.array_equal(rows_of(result.faulty), bad)
+    for o in result.faulty:
         i = o.line - 2
         assert o.marker == ("M1", "M2")[table.marker[i]]
         assert o.configuration == str(table.configuration[i] + 1)
@@ -105,7 +105,7 @@ def test_error_and_ratio_of_a_faulty_reading():
     model = Model(planar_chain(), cell_of(PLACED))
     table, _, _ = clean_table(model, 5, 30)
     table.position[11] += [0.0, 8e-3, 0.0]
-    (outlier,) = identify(model, table).outliers
+    (outlier,) = identify(model, table).faulty
     assert outlier.line == 13
     assert outlier.residual == pytest.approx(8e-3, abs=5 * SIGMA)
     # scale from a median over 29 readings of 3 components: within a third
@@ -139,7 +139,7 @@ def distance_block(seed, share, shift):
 def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
     """The cable slipped for 48 of 120 rows, by 100 σ and more: all of them, at most one other."""
     model, table, block, truth = distance_block(seed, 0.4, shift)
-    result = identify(model, table, Options(drop_outliers=True))
+    result = identify(model, table, Options(faulty="drop"))
     found = rows_of(result.excluded)
     assert set(block) <= set(found) and len(found) <= len(block) + 1
     assert blocks([o.line for o in result.excluded])[0] == (block[0] + 2, block[-1] + 2)
@@ -155,7 +155,7 @@ def test_dropping_equals_never_having_had_them(seed):
     model = Model(planar_chain(), cell_of(PLACED))
     table, _, rng = clean_table(model, seed, 40)
     wrong, bad = with_gross_errors(table, rng, 0.15, high=0.01)
-    dropped = identify(model, wrong, Options(drop_outliers=True))
+    dropped = identify(model, wrong, Options(faulty="drop"))
     good = np.setdiff1d(np.arange(40), bad)
     never = identify(model, table.take(good))
     assert np.array_equal(rows_of(dropped.excluded), bad)
@@ -172,19 +172,19 @@ def test_errors_of_decimetres_do_not_end_the_identification():
     model = Model(planar_chain(), cell_of(PLACED))
     table, _, rng = clean_table(model, 0, 40)
     wrong, bad = with_gross_errors(table, rng, 0.15)
-    assert np.array_equal(rows_of(identify(model, wrong).outliers), bad)
+    assert np.array_equal(rows_of(identify(model, wrong).faulty), bad)
 
 
 def test_nothing_is_left_out_in_silence():
     model = Model(planar_chain(), cell_of(PLACED))
     table, _, rng = clean_table(model, 7, 40)
     wrong, bad = with_gross_errors(table, rng, 0.05)
-    kept = identify(model, wrong)
+    kept = identify(model, wrong, Options(faulty="keep"))
     assert np.array_equal(rows_of(kept.outliers), bad) and kept.excluded == ()
     assert len(kept.residual) == 120 and len(kept.residual_table()) == 40
     assert any(w.startswith("2 readings lie beyond what the noise explains") for w in kept.warnings)
-    assert any("--drop-outliers leaves them out and says so" in w for w in kept.warnings)
-    dropped = identify(model, wrong, Options(drop_outliers=True))
+    assert any("--outliers drop leaves them out" in w for w in kept.warnings)
+    dropped = identify(model, wrong, Options(faulty="drop"))
     assert np.array_equal(rows_of(dropped.excluded), bad) and dropped.outliers == ()
     assert len(dropped.residual) == 114
     assert not {row["line"] - 2 for row in dropped.residual_table()} & set(bad)
@@ -197,7 +197,7 @@ def test_nothing_is_left_out_in_silence():
 def test_a_clean_table_is_used_whole_with_and_without_dropping():
     model = Model(planar_chain(), cell_of(PLACED))
     table, _, _ = clean_table(model, 8, 30)
-    a, b = identify(model, table), identify(model, table, Options(drop_outliers=True))
+    a, b = identify(model, table), identify(model, table, Options(faulty="drop"))
     assert a.excluded == b.excluded == a.outliers == b.outliers == ()
     assert a.dof == b.dof
     np.testing.assert_allclose(a.x, b.x, rtol=1e-9, atol=1e-12)
@@ -217,7 +217,7 @@ def test_stated_sigmas_count():
     position[3] = exact.position[3] + [3e-3, 0, 0]
     position[20] = exact.position[20] + [1e-3, 0, 0]
     result = identify(model, replace(plan, sigma=sigma, position=position))
-    assert rows_of(result.outliers).tolist() == [20]
+    assert rows_of(result.faulty).tolist() == [20]
 
 
 def test_outliers_are_found_under_a_given_covariance_too():
@@ -225,7 +225,7 @@ def test_outliers_are_found_under_a_given_covariance_too():
     table, _, _ = clean_table(model, 10, 30)
     table.position[4] += 0.02
     options = Options(weights="covariance", covariance=SIGMA**2 * np.eye(90))
-    assert rows_of(identify(model, table, options).outliers).tolist() == [4]
+    assert rows_of(identify(model, table, options).faulty).tolist() == [4]
 
 
 # --- the trimmed fit ------------------------------------------------------------------------

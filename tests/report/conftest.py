@@ -64,7 +64,7 @@ def make_case(
     table = replace(table, position=position)
     rotation = np.asarray(table.rotation) + 3e-5 * rng.normal(size=(len(table), 3))
     table = replace(table, rotation=rotation)
-    return Case(identify(model, table, Options(drop_outliers=drop)), truth)
+    return Case(identify(model, table, Options(faulty="drop" if drop else "keep")), truth)
 
 
 @pytest.fixture(scope="session")

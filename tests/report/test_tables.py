@@ -128,7 +128,8 @@ def test_summary_in_words(case: Any) -> None:
     lines = summary_lines(case.result, case.truth)
     text = "\n".join(lines)
     assert "48 position readings in 12 configurations, 2 markers (table)" in text
-    assert "tracker sigma [30.0, 30.0, 30.0] µm" in text
+    assert "weights estimated by restricted likelihood" in text
+    assert "Noise model: " in text
     assert f"Degrees of freedom: {case.result.dof}" in lines
     assert "held-out poses" in text
     assert "times the stated noise" in text
@@ -139,7 +140,7 @@ def test_summary_in_words(case: Any) -> None:
 def test_rotations_and_unstated_noise(pose: Any, bare: Any) -> None:
     assert "rotations" in "\n".join(summary_lines(pose.result))
     text = "\n".join(summary_lines(bare.result))
-    assert "ordinary least squares" in text
+    assert "restricted likelihood" in text
     assert "No noise was stated" in text
     assert "Warning: 1 reading" in text
 

@@ -16,7 +16,8 @@ from elastocal.report.html import write_report
 @pytest.fixture(autouse=True)
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Writing does not depend on what the figures show, and drawing takes its time."""
-    names = ("errors", "held_out", "by_configuration", "against_joints", "histogram")
+    names = ("errors", "held_out", "by_configuration", "against_joints", "histogram", "scores",
+             "groups", "histograms")  # fmt: skip
     monkeypatch.setattr(html, "_figures", lambda *_: dict.fromkeys(names, "<svg></svg>"))
 
 

@@ -69,7 +69,7 @@ def test_the_faulty_block_of_the_cable_data_is_found(folder):
     """A shift by some 4 mm over lines 142 to 507, seen by the tool itself."""
     as_is = identified(folder, "irb120.toml", "irb120.csv")
     assert as_is["excluded"] == [] and len(as_is["outliers"]) > 300
-    clean = identified(folder, "irb120.toml", "irb120.csv", "--drop-outliers")
+    clean = identified(folder, "irb120.toml", "irb120.csv", "--outliers", "drop")
     left_out = {o["line"] for o in clean["excluded"]}
     assert len(left_out & set(range(142, 508))) > 350 and len(left_out) < 400
     assert clean["heldout_rms_um"] < 620 < as_is["heldout_rms_um"]

@@ -1,5 +1,11 @@
 """The command line: elastocal VERB CELL [DATA] [options]."""
 
+import os
+
+# Many small matrices: a second thread of the linear algebra library only waits for the first.
+# It must be said before numpy is loaded, and the user's own setting wins.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from elastocal.cli import demo, identify, simulate  # noqa: F401  (registers the commands)
 from elastocal.cli.app import app
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from elastocal.manipulator.model import Model
     from elastocal.measurements import Measurements
 
-WEIGHTS = ("auto", "none", "rows", "axis", "polar", "covariance")
-
 
 @app.command()
 @reporting_errors
@@ -42,9 +40,29 @@ def identify(
     residuals: Annotated[
         Path | None, typer.Option(help="Write residuals of every reading as CSV.")
     ] = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="auto (reml), reml, ols, wls, eq14, eq14-residual, huber, tukey, l1, student-t."
+        ),
+    ] = "auto",
+    noise: Annotated[
+        str,
+        typer.Option(
+            help="Noise that reml estimates: auto, independent, axis, marker, groups, polar, "
+            "stated; with +configuration for what a configuration's readings share."
+        ),
+    ] = "auto",
     weights: Annotated[
         str,
-        typer.Option(help="auto, none (ordinary least squares), rows, axis, polar, covariance."),
+        typer.Option(help="Stated noise to take as it is: none, rows, axis, polar, covariance."),
+    ] = "auto",
+    intervals: Annotated[
+        str,
+        typer.Option(
+            help="auto, classical, hc0 to hc4, cr0 to cr3 (by configuration), wild, bootstrap, "
+            "profile."
+        ),
     ] = "auto",
     covariance: Annotated[
         Path | None, typer.Option(help="Noise covariance in m² (CSV without header, or .npy).")
@@ -56,9 +74,14 @@ def identify(
     bounded: Annotated[
         bool, typer.Option("--bounded", help="Keep parameters inside their physical bounds.")
     ] = False,
-    drop_outliers: Annotated[
-        bool, typer.Option("--drop-outliers", help="Leave faulty readings out; they are listed.")
-    ] = False,
+    outliers: Annotated[
+        str,
+        typer.Option(
+            help="Readings beyond the noise: auto (leave out, unless they are a tenth or more), "
+            "drop, keep. They are listed in any case."
+        ),
+    ] = "auto",
+    jobs: Annotated[int, typer.Option(help="Processes of a bootstrap; -1 for all cores.")] = 1,
     seed: Seed = 0,
     as_json: Json = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
@@ -68,23 +91,31 @@ def identify(
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
     """
     from elastocal.cli.results import write_results
-    from elastocal.identification.identify import Options
     from elastocal.identification.identify import identify as run
+    from elastocal.identification.noise import WeightKind
+    from elastocal.identification.options import Options
 
-    if weights not in WEIGHTS:
-        raise InputError(f"--weights takes one of {', '.join(WEIGHTS)}; found '{weights}'")
+    if weights not in get_args(WeightKind):
+        raise InputError(
+            f"--weights takes one of {', '.join(get_args(WeightKind))}; found '{weights}'"
+        )
+    # What can be wrong with the options is told before any file is read.
+    chosen = Options(
+        method=method,  # type: ignore[arg-type]
+        noise=noise,
+        weights=weights,  # type: ignore[arg-type]
+        covariance=None if covariance is None else _read_covariance(covariance),
+        intervals=intervals,  # type: ignore[arg-type]
+        fixed=tuple(fix or ()),
+        bounded=bounded,
+        faulty=outliers,  # type: ignore[arg-type]
+        seed=seed,
+        jobs=jobs,
+    )
     check_outputs(output, report, residuals)
     with progress_line(quiet) as progress:
         progress("reading")
         model, tables = _load(cell, [data] if test is None else [data, test])
-        chosen = Options(
-            weights=weights,  # type: ignore[arg-type]
-            covariance=None if covariance is None else _read_covariance(covariance),
-            fixed=tuple(fix or ()),
-            bounded=bounded,
-            drop_outliers=drop_outliers,
-            seed=seed,
-        )
         result = run(model, tables[0], chosen, None if test is None else tables[1], progress)
         inputs = [p for p in (cell, data, test, covariance) if p is not None]
         write_results(result, output, report, residuals, inputs, seed=seed)

@@ -10,6 +10,7 @@ from scipy import linalg
 from elastocal.identification.outliers import blocks
 from elastocal.identification.result import IdentificationResult, Outlier
 from elastocal.identification.solve import Solution
+from elastocal.identification.variance.choose import SHARED
 
 FEW_DOF_PER_PARAMETER = 1.0
 ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
@@ -59,9 +60,9 @@ def _few_poses(result: IdentificationResult) -> list[str]:
 def _conditioning(result: IdentificationResult, solution: Solution) -> list[str]:
     kept = solution.reduction.kept
     # Unit columns: what is judged is how far they are from parallel, not their units.
-    scaled = solution.problem.weights.apply(solution.fit.B)
+    scaled = solution.fit.triangle.R
     scaled = scaled / np.linalg.norm(scaled, axis=0)
-    _, singular, Vt = linalg.svd(linalg.qr(scaled, mode="r")[0][: len(kept)])
+    _, singular, Vt = linalg.svd(scaled[: len(kept)])
     if singular[0] <= ILL_CONDITIONED * singular[-1]:
         return []
     worst = np.argsort(-np.abs(Vt[-1]))[:3]
@@ -86,14 +87,15 @@ def _noise(result: IdentificationResult) -> list[str]:
 
 def _lack_of_fit(result: IdentificationResult) -> list[str]:
     found = result.noise["lack_of_fit"]
-    if found is None or found["p"] > LACK_OF_FIT:
-        return []
+    if found is None or found["p"] > LACK_OF_FIT or str(result.noise["kind"]).endswith(SHARED):
+        return []  # shared effects in the noise model: the intervals count with them
     return [
         f"Configurations scatter more than their repeats (lack of fit: F = {found['F']:.2f} on "
         f"{found['dof_between']} and {found['dof_pure']} degrees of freedom, p = {found['p']:.1g}):"
         " the arm does not come back to the same place, or an effect is missing. The intervals "
-        "take all readings for independent and are too narrow; measure more configurations "
-        "rather than more repeats."
+        "take all readings for independent and are too narrow: use the default method, whose noise "
+        "model has this scatter, or intervals by cr2; measure more configurations rather than more "
+        "repeats."
     ]
 
 
@@ -136,8 +138,8 @@ def _outliers(result: IdentificationResult) -> list[str]:
     if result.outliers:
         lines = _lines(result.outliers)
         found.append(
-            f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains ({lines}). "
-            "Check them; --drop-outliers leaves them out and says so."
+            f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains ({lines}) "
+            "and had a part in the fit. Check them; --outliers drop leaves them out."
         )
         if len(result.outliers) > MANY * len(result.observations.lead):
             found.append(
@@ -148,7 +150,8 @@ def _outliers(result: IdentificationResult) -> list[str]:
     if result.excluded:
         lines = _lines(result.excluded)
         found.append(
-            f"{_count(result.excluded, 'was', 'were')} left out as faulty ({lines}); all are "
-            "listed in the result under 'excluded'."
+            f"{_count(result.excluded, 'was', 'were')} left out as faulty ({lines}): the "
+            "noise does not explain them. All are listed in the result under 'excluded'; "
+            "--outliers keep fits them too."
         )
     return found

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from elastocal.identification.advice import warnings_for
 from elastocal.identification.heldout import rms_3d
-from elastocal.identification.lack_of_fit import lack_of_fit
-from elastocal.identification.linear import solve_weighted
+from elastocal.identification.intervals import Intervals
+from elastocal.identification.methods import Found
+from elastocal.identification.noise_summary import noise_summary
 from elastocal.identification.result import (
     Combination,
     Estimate,
@@ -28,40 +25,24 @@ CORRELATED = 0.9
 
 
 def summarise(
-    model: Model,
-    solution: Solution,
-    outliers: tuple[Outlier, ...],
-    excluded: tuple[Outlier, ...],
+    model: Model, whole: Solution, found: Found, beyond: tuple[Outlier, ...]
 ) -> IdentificationResult:
-    """Estimates with 95 % t intervals from cov(X̂) = s² (BᵀW²B)⁻¹ (eq. 7 and 13).
+    """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
-    s² is the weighted residual's mean square per degree of freedom, also where the noise was
-    stated: a stated sigma that the residuals contradict is not believed.
+    `beyond` are the readings beyond the noise: set apart where the method did so, else only listed.
     """
-    problem, reduction, final = solution.problem, solution.reduction, solution.fit
-    kept = reduction.kept
-    B = problem.weights.apply(final.B)
-    linear = solve_weighted(B, final.whitened, scale=solution.sizes[kept])
+    solution, final = found.solution, found.solution.fit
+    kept = solution.reduction.kept
     sigma = residual_sigma(final, len(kept))
-    dof = len(final.whitened) - len(kept)
-    covariance = sigma**2 * linear.cofactor
-    std = np.sqrt(np.diag(covariance))
-    half = float(stats.t.ppf(0.975, dof)) * std
-    estimates, combinations = _estimates(model, solution, std, half)
+    estimates, combinations = _estimates(model, solution, found.intervals)
     determined = tuple(model.names[c] for c in kept)
-    seen = problem.observations
-    misfit = lack_of_fit(seen, final.whitened, len(kept))
-    noise: dict[str, Any] = {
-        "kind": problem.weights.kind,
-        "description": problem.weights.description,
-        "sigma_um": None if problem.weights.absolute else sigma * 1e6,
-        "ratio_to_stated": sigma if problem.weights.absolute else None,
-        "lack_of_fit": None if misfit is None else asdict(misfit),
-    }
+    seen = solution.problem.observations
+    set_apart = len(seen.lead) < len(whole.problem.observations.lead)
+    covariance = found.intervals.covariance.matrix
     result = IdentificationResult(
         model=model,
-        method="ols" if problem.weights.kind == "none" else "wls",
-        noise=noise,
+        method=found.method,
+        noise=noise_summary(found, sigma),
         estimates=estimates,
         combinations=combinations,
         x=final.x,
@@ -72,30 +53,31 @@ def summarise(
         residual=final.residual,
         held_out=solution.heldout,
         sigma=sigma,
-        dof=dof,
+        dof=len(final.whitened) - len(kept),
         residual_rms=rms_3d(final.residual, seen.size),
         heldout_rms=rms_3d(solution.heldout, seen.size),
         nominal_rms=solution.nominal_rms,
         converged=final.converged,
         reason=final.reason,
-        outliers=outliers,
-        excluded=excluded,
+        outliers=() if set_apart else beyond,
+        excluded=beyond if set_apart else (),
         warnings=(),
     )
     return warnings_for(result, solution)
 
 
 def _estimates(
-    model: Model, solution: Solution, std: Array, half: Array
+    model: Model, solution: Solution, intervals: Intervals
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     reduction, x = solution.reduction, solution.fit.x
+    std, dof = intervals.covariance.std, intervals.covariance.dof
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []
     for k, c in enumerate(reduction.kept):
         parameter = model.parameters[c]
         terms = reduction.terms(k, solution.sizes, std[k])
-        value, ci = float(x[c]), (float(x[c] - half[k]), float(x[c] + half[k]))
+        value, ci = float(x[c]), (float(intervals.ci95[k, 0]), float(intervals.ci95[k, 1]))
         for d in terms:
             partners[d].append(parameter.name)
         names = tuple(model.names[d] for d in terms)
@@ -110,7 +92,7 @@ def _estimates(
         else:
             found[int(c)] = Estimate(
                 parameter.name, parameter.unit, parameter.nominal, value, value,
-                float(std[k]), ci,
+                float(std[k]), ci, float(dof[k]),
             )  # fmt: skip
     invisible = set(reduction.invisible.tolist())
     for d in reduction.dropped:

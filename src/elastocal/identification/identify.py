@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.identification.checks import check_rows, check_table, fixed_and_free
+from elastocal.identification.chunked import residual_at
 from elastocal.identification.estimates import summarise
 from elastocal.identification.heldout import rms_3d
-from elastocal.identification.noise import WeightKind, scaled_by_component, weights_for
+from elastocal.identification.methods import run_method
+from elastocal.identification.noise import Weights, scaled_by_component, weights_for
+from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
+from elastocal.identification.partition import partition
 from elastocal.identification.result import IdentificationResult, TestErrors
 from elastocal.identification.solve import Problem, Progress, Solution, solve
 from elastocal.identification.start import start_values
@@ -21,23 +25,7 @@ from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class Options:
-    """How to identify.
-
-    `weights`: auto, none (OLS), rows, axis, polar or covariance (then `covariance` (rows, rows)
-    in m²).  `fixed`: names of parameters held at their start.  `bounded`: keep parameters inside
-    their physical bounds.  `drop_outliers`: leave readings out that the fit itself finds to be
-    faulty (they are listed in the result either way).  `seed`: of the multi-start.
-    """
-
-    weights: WeightKind = "auto"
-    covariance: Array | None = None
-    fixed: tuple[str, ...] = ()
-    bounded: bool = False
-    drop_outliers: bool = False
-    seed: int = 0
+__all__ = ["Options", "identify"]
 
 
 def identify(
@@ -47,10 +35,11 @@ def identify(
     test: Measurements | None = None,
     progress: Progress = lambda message: None,
 ) -> IdentificationResult:
-    """Nonlinear weighted least squares from nothing but the nominal arm (eq. 9 and 10).
+    """Parameters with intervals from nothing but the nominal arm and a table.
 
     Start by registration, a first fit weakly tied to it, choice of a minimal complete set of
-    parameters, final fit of that set, held-out check by configurations, t intervals.
+    parameters, search for faulty readings; then the method: by default weights from a noise model
+    whose variances restricted likelihood estimates, and intervals that know they are estimated.
 
     Raises InputError for data that contradict robot or cell, InsufficientDataError where the
     data cannot determine the model.
@@ -75,14 +64,12 @@ def identify(
 
     progress("looking for faulty readings")
     faulty, clean = find_faulty(whole, refit)
-    found = describe(whole, clean, faulty)
-    if options.drop_outliers and faulty.any():
+    if 0 < faulty.mean() < 1:
         clean = refit(~faulty, final=True)
+    found = run_method(whole, clean, faulty, options, progress)
     progress("intervals and held-out residuals")
-    if options.drop_outliers:
-        result = summarise(model, clean, (), found)
-    else:
-        result = summarise(model, whole, found, ())
+    beyond = describe(whole, found.solution, ~found.good)
+    result = summarise(model, whole, found, beyond)
     return result if test is None else replace(result, test=_test_errors(model, result.x, test))
 
 
@@ -99,10 +86,11 @@ def _solution(
     progress: Progress,
     try_wider: bool = True,
 ) -> Solution:
-    weights = weights_for(seen, model.cell.tracker, options.weights, options.covariance)
+    kind = "none" if options.method == "ols" else options.weights
+    weights = weights_for(seen, model.cell.tracker, kind, options.covariance)
     problem = Problem(model, seen, weights, x0, free, options.bounded)
     solution = solve(problem, progress, try_wider)
-    if seen.kind == "pose" and weights.kind == "none" and options.weights == "auto":
+    if seen.kind == "pose" and weights.kind == "none" and kind == "auto":
         # Without stated noise, metres and radians get their relative weight from a first fit.
         parts = solution.fit.residual.reshape(-1, 6)
         sigma = np.repeat([parts[:, :3].std(), parts[:, 3:].std()], 3)
@@ -113,7 +101,8 @@ def _solution(
 
 def _test_errors(model: Model, x: Array, table: Measurements) -> TestErrors:
     seen = observe(table, model.observe)
-    error = seen.value - model.predict(table, x, seen)
+    parts = partition(seen, Weights("none", None, False, ""), len(model.parameters))
+    error = residual_at(model, parts, x)
     length = np.linalg.norm(error.reshape(-1, seen.size)[:, :3], axis=1)
     rms = rms_3d(error, seen.size)
     return TestErrors(rms, float(length.mean()), float(length.max()), len(length))

@@ -55,21 +55,33 @@ def weights_for(
         return _given(seen, covariance)
     if chosen == "none":
         return Weights("none", None, False, "unit weights (ordinary least squares)")
+    blocks, text = stated_covariance(seen, tracker, chosen)
+    kind_used = "axis" if seen.kind == "distance" else chosen
+    if seen.kind != "deflection":  # every observation is a reading of its own
+        return Weights(kind_used, block_diagonal(inverse_factor(blocks)), True, text)
+    mix = sparse.kron(seen.combine, sparse.eye_array(seen.size), format="csr")
+    covariance_rows = sparse.csr_array(mix @ block_diagonal(blocks) @ mix.T)
+    return Weights(kind_used, whitener(covariance_rows), True, text)
+
+
+def stated_covariance(seen: Observations, tracker: Tracker, kind: str) -> tuple[Array, str]:
+    """Stated covariance (n_rows, size, size) of every table row, and where it comes from.
+
+    Raises InputError where the cell or the table does not state what this needs.
+    """
     if seen.kind == "distance":
         need(tracker.distance_sigma is not None, "distances need [tracker] distance_um")
         sigma = float(tracker.distance_sigma or 1.0)
-        whiten = sparse.csr_array(sparse.eye_array(len(seen.value)) / sigma)
-        return Weights("axis", whiten, True, f"distance sigma {sigma * 1e6:.3g} µm from the cell")
-    blocks, text = position_covariance(seen.table, tracker, chosen)
+        text = f"distance sigma {sigma * 1e6:.3g} µm from the cell"
+        return np.full((len(seen.table), 1, 1), sigma**2), text
+    blocks, text = position_covariance(seen.table, tracker, kind)
     if seen.kind == "pose":
         need(tracker.rotation_sigma is not None, "poses need [tracker] rotation_urad")
         full = np.zeros((len(seen.table), 6, 6))
         full[:, :3, :3] = blocks
         full[:, 3:, 3:] = np.eye(3) * float(tracker.rotation_sigma or 1.0) ** 2
         blocks = full
-    mix = sparse.kron(seen.combine, sparse.eye_array(seen.size), format="csr")
-    covariance_rows = sparse.csr_array(mix @ _block_diagonal(blocks) @ mix.T)
-    return Weights(chosen, _whitener(covariance_rows), True, text)
+    return blocks, text
 
 
 def scaled_by_component(seen: Observations, sigma: Array) -> Weights:
@@ -103,16 +115,30 @@ def _given(seen: Observations, covariance: Array | None) -> Weights:
         bool(np.isfinite(matrix).all()) and np.allclose(matrix, matrix.T, rtol=1e-9),
         "the covariance must be finite and symmetric",
     )
-    return Weights("covariance", _whitener(sparse.csr_array(matrix)), True, "given covariance")
+    return Weights("covariance", whitener(sparse.csr_array(matrix)), True, "given covariance")
 
 
-def _block_diagonal(blocks: Array) -> sparse.csr_array:
+def block_diagonal(blocks: Array) -> sparse.csr_array:
+    """Blocks (n, d, d) along the diagonal; their zeros are not stored."""
     n, d, _ = blocks.shape
-    pattern = sparse.bsr_array((blocks, np.arange(n), np.arange(n + 1)), shape=(n * d, n * d))
-    return sparse.csr_array(pattern)
+    block, i, j = np.nonzero(blocks)
+    counts = np.bincount(block * d + i, minlength=n * d)
+    indptr = np.concatenate([[0], np.cumsum(counts)])
+    return sparse.csr_array((blocks[block, i, j], block * d + j, indptr), shape=(n * d, n * d))
 
 
-def _whitener(covariance: sparse.csr_array) -> sparse.csr_array:
+def inverse_factor(blocks: Array) -> Array:
+    """L⁻¹ of each block (n, d, d) = L Lᵀ."""
+    try:
+        factor = np.linalg.cholesky(blocks)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "the noise covariance is not positive definite; check sigmas and covariance"
+        ) from None
+    return np.linalg.solve(factor, np.broadcast_to(np.eye(blocks.shape[1]), factor.shape))
+
+
+def whitener(covariance: sparse.csr_array) -> sparse.csr_array:
     """L⁻¹ of the Cholesky factor, block by block over groups of correlated rows."""
     count, label = sparse.csgraph.connected_components(covariance, directed=False)
     order = np.argsort(label, kind="stable")
@@ -125,13 +151,7 @@ def _whitener(covariance: sparse.csr_array) -> sparse.csr_array:
         i, j = members[:, :, None], members[:, None, :]
         i, j = np.broadcast_arrays(i, j)
         dense = np.asarray(covariance[i.ravel(), j.ravel()]).reshape(i.shape)
-        try:
-            factor = np.linalg.cholesky(dense)
-        except np.linalg.LinAlgError:
-            raise InputError(
-                "the noise covariance is not positive definite; check sigmas and covariance"
-            ) from None
-        inverse = np.linalg.solve(factor, np.broadcast_to(np.eye(size), factor.shape))
+        inverse = inverse_factor(dense)
         keep = np.tril(np.ones((size, size), dtype=bool))
         rows.append(i[:, keep].ravel())
         columns.append(j[:, keep].ravel())

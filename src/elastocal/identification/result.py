@@ -18,7 +18,9 @@ SCHEMA = "elastocal/identification/1"
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter.  `value`, `std` and `ci95` are None unless the data determine it alone.
+    """One parameter.  `value`, `std`, `ci95` are None unless the data determine it alone.
+
+    `dof` are the degrees of freedom of the t distribution behind `ci95`, infinite for a normal one.
 
     `held` is the value the fitted model uses for it: the estimate where there is one, else the
     value at which it was kept or the share of a combination that was put on it.  It is needed
@@ -32,6 +34,7 @@ class Estimate:
     value: float | None = None
     std: float | None = None
     ci95: tuple[float, float] | None = None
+    dof: float | None = None
     combined_with: tuple[str, ...] = ()
     note: str = ""
 
@@ -120,6 +123,11 @@ class IdentificationResult:
     excluded: tuple[Outlier, ...]
     warnings: tuple[str, ...]
     test: TestErrors | None = None
+
+    @property
+    def faulty(self) -> tuple[Outlier, ...]:
+        """Readings beyond the noise, whether they had a part in the fit or were set apart."""
+        return self.outliers + self.excluded
 
     def estimate(self, name: str) -> Estimate:
         """The estimate of one parameter by name; KeyError lists what exists."""
@@ -215,11 +223,18 @@ class IdentificationResult:
 
 def _estimate_json(e: Estimate) -> dict[str, Any]:
     return {
-        "name": e.name, "value": e.value, "unit": e.unit, "std": e.std,
-        "ci95": None if e.ci95 is None else list(e.ci95), "identifiable": e.identifiable,
+        "name": e.name, "value": e.value, "unit": e.unit,
+        "std": None if e.std is None else _finite(e.std),
+        "ci95": None if e.ci95 is None else [_finite(v) for v in e.ci95],
+        "dof": None if e.dof is None else _finite(e.dof), "identifiable": e.identifiable,
         "combined_with": list(e.combined_with), "nominal": e.nominal, "held": e.held,
         "note": e.note,
     }  # fmt: skip
+
+
+def _finite(value: float) -> float | None:
+    """None for an interval without an end, and for the infinite dof of a normal distribution."""
+    return value if np.isfinite(value) else None
 
 
 def _um(value: float) -> float | None:

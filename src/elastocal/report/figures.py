@@ -12,12 +12,11 @@ from elastocal.report.residuals import (
     reach,
     rms_by_pose,
     running_mean,
-    standardised,
 )
-from elastocal.report.svg import FAINT, INK, SERIES, dots, drawn
+from elastocal.report.svg import FAINT, SERIES, dots, drawn
 from elastocal.report.units import length
 from elastocal.report.verdict import rms_by_kind
-from elastocal.report.words import printable
+from elastocal.report.words import short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +37,7 @@ def by_configuration(residuals: Residuals) -> str:
             _configuration_panel(axes, residuals, k)
         panels[-1].set_xlabel("configuration")
         every = range(0, len(residuals.labels), -(-len(residuals.labels) // MOST_LABELS))
-        names = [_short(residuals.labels[i]) for i in every]
+        names = [short_name(residuals.labels[i]) for i in every]
         turn = 90 if max(map(len, names)) > 3 else 0
         panels[-1].set_xticks(list(every), names, rotation=turn)
         if 1 < len(residuals.markers) <= len(SERIES):
@@ -62,37 +61,12 @@ def _configuration_panel(axes: Axes, residuals: Residuals, k: int) -> None:
     else:
         for m, name in enumerate(residuals.markers):
             at = residuals.shown[residuals.marker[residuals.shown] == m]
-            dots(axes, residuals.pose[at] + shift[m], values[at], SERIES[m], size, _short(name))
+            dots(axes, residuals.pose[at] + shift[m], values[at], SERIES[m], size, short_name(name))
     axes.grid(axis="x", visible=False)
     axes.set_xlim(-0.7, len(residuals.labels) - 0.3)
     axes.set_ylabel(f"{residuals.components[k]} in {residuals.units[k]}")
     alike = [i for i, unit in enumerate(residuals.units) if unit == residuals.units[k]]
     _limit(axes, values, reach(residuals.value[:, alike]))
-
-
-def histogram(result: IdentificationResult) -> str:
-    """Standardised residuals with the normal curve they should follow."""
-    z = standardised(result)
-    z = z[np.isfinite(z)]
-    edges = np.linspace(-5, 5, int(np.clip(2 * len(z) ** (1 / 3), 11, 61)))
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        inner = z[np.abs(z) <= 5]
-        weight = 1 / (max(len(z), 1) * (edges[1] - edges[0]))
-        axes.hist(
-            inner, edges.tolist(), weights=np.full(len(inner), weight), color=SERIES[1], alpha=0.55
-        )
-        grid = np.linspace(-5, 5, 201)
-        curve = np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi)
-        axes.plot(grid, curve, color=INK, linewidth=1.2, label="normal distribution")
-        axes.set_xlabel("residual / its standard deviation")
-        axes.set_ylabel("density")
-        axes.legend(loc="upper right", fontsize=8)
-        if beyond := len(z) - len(inner):
-            _remark(axes, f"{beyond} beyond ±5")
-
-    return drawn(draw, WIDTH / 2, 2.9, "Histogram of standardised residuals with a normal curve")
 
 
 def against_joints(result: IdentificationResult, residuals: Residuals) -> str:
@@ -185,8 +159,3 @@ def _limit(axes: Axes, values: np.ndarray, height: float) -> None:
 
 def _remark(axes: Axes, text: str) -> None:
     axes.text(0.01, 0.97, text, transform=axes.transAxes, va="top", fontsize=8)
-
-
-def _short(name: str, most: int = 12) -> str:
-    text = printable(name)
-    return text if len(text) <= most else text[: most - 1] + "…"

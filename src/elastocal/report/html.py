@@ -11,17 +11,27 @@ from typing import Any
 
 from elastocal import __version__
 from elastocal.files import atomic_write_text, open_input
+from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.result import IdentificationResult, Outlier
-from elastocal.report.residuals import Residuals, residuals_of
+from elastocal.report.method import intervals_line, method_and_weights
+from elastocal.report.noise import (
+    candidate_rows,
+    does_noise_explain_it,
+    group_name,
+    ratio,
+    shape_line,
+    size_rows,
+)
+from elastocal.report.residuals import Residuals, residuals_of, summary_of
 from elastocal.report.rows import combination_rows, parameter_rows
 from elastocal.report.units import length, significant
 from elastocal.report.verdict import (
     correlation_lines,
     coverage_line,
-    does_noise_explain_it,
     error_line,
+    held_lines,
     how_well_it_predicts,
-    method_and_weights,
+    noise_lines,
     readings,
     what_was_identified,
 )
@@ -89,11 +99,12 @@ def digests(inputs: Mapping[str, str] | Iterable[str | Path] | None) -> dict[str
 def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, Any]:
     from markupsafe import Markup
 
-    residuals = residuals_of(result)
+    residuals, summary = residuals_of(result), summary_of(result)
     verdict = [
         ("Identified", what_was_identified(result)),
         ("Prediction", how_well_it_predicts(result)),
         ("Noise", does_noise_explain_it(result)),
+        *held_lines(result),
     ]
     if truth:
         verdict.append(("Truth", coverage_line(result, truth)))
@@ -106,9 +117,10 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
         "compared": truth is not None,
         "verdict": verdict,
         "readings": readings(result),
-        "weights": _sentence(method_and_weights(result)),
-        "noise": does_noise_explain_it(result),
+        "method": _sentence(method_and_weights(result)),
+        "intervals": _sentence(f"intervals are {intervals_line(result)}"),
         "dof": result.dof,
+        **_noise(result, summary),
         "error_line": _sentence(error_line(result)),
         "warnings": [printable(w) for w in result.warnings],
         "parameters": parameter_rows(result, truth),
@@ -119,20 +131,52 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
         "excluded": [_faulty(o) for o in result.excluded],
         "most_faulty": MOST_FAULTY,
         "n_markers": len(residuals.markers),
-        "figures": {name: Markup(svg) for name, svg in _figures(result, residuals).items()},
+        "figures": {
+            name: Markup(svg) for name, svg in _figures(result, residuals, summary).items()
+        },
         **_thinning(residuals),
     }
 
 
-def _figures(result: IdentificationResult, residuals: Residuals) -> dict[str, str]:
-    from elastocal.report import figures
-
+def _noise(result: IdentificationResult, summary: ResidualSummary | None) -> dict[str, Any]:
+    """Sentences and rows of the section on noise."""
+    sentences = [text for label, text in noise_lines(result) if label != "Residuals"]
+    deviating = () if summary is None else summary.deviating
     return {
+        "noise_sentences": sentences,
+        "shape": None if summary is None else shape_line(summary),
+        "sizes": size_rows(result.noise),
+        "candidates": candidate_rows(result.noise),
+        "deviating": [(group_name(by, g), g.n, ratio(g), f"{g.p_holm:.1g}") for by, g in deviating],
+        "held_out_scatter": _held_out_scatter(summary),
+    }
+
+
+def _held_out_scatter(summary: ResidualSummary | None) -> str:
+    """Held-out residuals over the noise model, empty where they are not known."""
+    if summary is None or summary.whole.held_out_mean_square is None:
+        return ""
+    size = significant(summary.whole.held_out_mean_square**0.5)
+    return f"In held-out configurations the scatter is {size} times that of the noise model."
+
+
+def _figures(
+    result: IdentificationResult, residuals: Residuals, summary: ResidualSummary | None
+) -> dict[str, str]:
+    from elastocal.report import figures, noise_figures
+
+    distribution = {} if summary is None else {
+        "histogram": noise_figures.histogram(summary),
+        "scores": noise_figures.scores(summary),
+        "groups": noise_figures.scatter_by_group(summary),
+        "histograms": noise_figures.histograms_by_group(summary),
+    }  # fmt: skip
+    return {
+        **distribution,
         "errors": figures.errors(result),
         "held_out": figures.held_out(result, residuals),
         "by_configuration": figures.by_configuration(residuals),
         "against_joints": figures.against_joints(result, residuals),
-        "histogram": figures.histogram(result),
     }
 
 

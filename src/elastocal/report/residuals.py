@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.identification.noise import weights_for
+from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
 from elastocal.identification.result import IdentificationResult
 from elastocal.manipulator.observation import COMPONENTS
 
@@ -67,11 +68,19 @@ def residuals_of(result: IdentificationResult) -> Residuals:
     )
 
 
+def summary_of(result: IdentificationResult) -> ResidualSummary | None:
+    """The result's own summary of its whitened residuals, else one of the standardised ones."""
+    own: ResidualSummary | None = getattr(result, "residual_summary", None)
+    if own is not None:
+        return own
+    return summarise_residuals(result.observations, standardised(result), absolute=False)
+
+
 def standardised(result: IdentificationResult) -> Array:
-    """Weighted residuals (rows,) over their standard deviation; unweighted where the weights
-    came from a matrix that the result does not hold."""
+    """Weighted residuals (rows,) over their standard deviation; unweighted where the result does
+    not hold the weights: those of a given matrix or of an estimated noise."""
     seen, kind = result.observations, result.noise["kind"]
-    if kind in ("rows", "axis", "polar"):
+    if result.method == "wls" and kind in ("rows", "axis", "polar"):
         whitened = weights_for(seen, result.model.cell.tracker, kind).apply(result.residual)
         return np.asarray(whitened) / result.sigma
     parts = result.residual.reshape(-1, seen.size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from elastocal.identification.result import Combination, Estimate, IdentificationResult
@@ -135,6 +136,8 @@ def _bar(
     if e.value is None or e.ci95 is None:
         return None
     half = (e.ci95[1] - e.ci95[0]) / 2
+    if not math.isfinite(half):  # an interval without an end
+        return None
     if compared:
         return None if true is None else bar_from_truth(e.value, half, true)
     return None if nominal is None else bar_from_nominal(e.value, half, nominal)

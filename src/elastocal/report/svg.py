@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 from collections.abc import Callable
@@ -84,7 +85,18 @@ def drawn(draw: Draw, width: float, height: float, title: str) -> str:
     text = re.sub(r"<svg [^>]*viewBox=\"([^\"]*)\"[^>]*>", _head(title, width), text, count=1)
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, variable)
-    return text
+    return _numbered(text, title)
+
+
+def _numbered(text: str, title: str) -> str:
+    """Ids by order and title: matplotlib's hash the layout, whose last bits differ between runs."""
+    prefix = hashlib.sha256(title.encode()).hexdigest()[:8]
+    number: dict[str, int] = {}
+
+    def name(match: re.Match[str]) -> str:
+        return f"{match[1]}f{prefix}-{number.setdefault(match[2], len(number))}"
+
+    return re.sub(r'(id="|#)([a-z][0-9a-f]{10})\b', name, text)
 
 
 def _head(title: str, width: float) -> str:

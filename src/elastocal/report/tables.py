@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal.identification.result import Combination, Estimate, IdentificationResult
+from elastocal.report.noise import candidate_rows, size_rows
 from elastocal.report.rows import texts
 from elastocal.report.units import display, plain
 from elastocal.report.verdict import summary_lines
@@ -24,7 +25,13 @@ from elastocal.report.words import (
     undetermined_lines,
 )
 
-__all__ = ["combination_table", "parameter_table", "print_result", "summary_lines"]
+__all__ = [
+    "combination_table",
+    "noise_tables",
+    "parameter_table",
+    "print_result",
+    "summary_lines",
+]
 
 NARROW = 80  # columns; below, each number shares one column with its interval and unit
 WIDE = 110  # columns; from here on a note fits beside the numbers
@@ -77,6 +84,28 @@ def combination_table(
     return table
 
 
+def noise_tables(result: IdentificationResult) -> list[Table]:
+    """Sizes of the estimated noise, and the noise models tried with their criterion over the best.
+
+    A table that would have a single row is left out: the summary says it.
+    """
+    tables = []
+    if len(sizes := size_rows(result.noise)) > 1:
+        table = _plain("Noise, standard deviations", "part")
+        table.add_column("size", justify="right", overflow="fold")
+        for row in sizes:
+            table.add_row(*map(Text, row))
+        tables.append(table)
+    if len(candidates := candidate_rows(result.noise)) > 1:
+        table = _plain("Noise models tried", "noise model")
+        table.add_column("variances", justify="right", overflow="fold")
+        table.add_column("criterion over best", justify="right", overflow="fold")
+        for candidate in candidates:
+            table.add_row(*map(Text, candidate))
+        tables.append(table)
+    return tables
+
+
 def print_result(
     console: Console, result: IdentificationResult, truth: Truth | None = None
 ) -> None:
@@ -90,6 +119,8 @@ def print_result(
         console.print(combination_table(result, truth, brief))
     for line in undetermined_lines(result):
         console.print(Text(line, style="dim"))
+    for table in noise_tables(result):
+        console.print(table)
     console.print()
     for line in summary_lines(result, truth):
         label, colon, rest = line.partition(": ")
@@ -98,15 +129,7 @@ def print_result(
 
 
 def _table(title: str, first: str, truth: Truth | None, brief: bool) -> Table:
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-    )
-    table.add_column(first, overflow="fold")
+    table = _plain(title, first)
     if brief:
         table.add_column("value ± 95 %", overflow="fold")
     else:
@@ -117,6 +140,19 @@ def _table(title: str, first: str, truth: Truth | None, brief: bool) -> Table:
         if not brief:
             table.add_column("truth", justify="right", overflow="fold")
         table.add_column("in 95 %", overflow="fold")
+    return table
+
+
+def _plain(title: str, first: str) -> Table:
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+    )
+    table.add_column(first, overflow="fold")
     return table
 
 

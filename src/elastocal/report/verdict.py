@@ -1,13 +1,24 @@
-"""The result in sentences: what was identified, how well it predicts, whether noise explains it."""
+"""The result in sentences: what was identified, how well it predicts, and all in a few lines."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from scipy import stats
 
 from elastocal.identification.result import IdentificationResult
+from elastocal.report.method import (
+    constraints_line,
+    intervals_line,
+    method_and_weights,
+    prior_line,
+)
+from elastocal.report.noise import (
+    does_noise_explain_it,
+    noise_model_line,
+    repeats_line,
+    shape_line,
+)
 from elastocal.report.units import length, significant
 from elastocal.report.words import (
     ABSORBED,
@@ -87,28 +98,6 @@ def how_well_it_predicts(result: IdentificationResult) -> str:
     return text
 
 
-def does_noise_explain_it(result: IdentificationResult) -> str:
-    """Residual against stated noise, judged by the χ² distribution of its mean square."""
-    ratio = result.noise.get("ratio_to_stated")
-    if ratio is None:
-        sigma = result.noise.get("sigma_um")
-        size = "" if sigma is None or result.method != "ols" else (
-            f"; the residual amounts to {length(sigma * 1e-6)} per coordinate"
-        )  # fmt: skip
-        return f"No noise was stated, so nothing says how small the residual should be{size}."
-    low, high = np.sqrt(stats.chi2.ppf([0.025, 0.975], result.dof) / result.dof)
-    band = f"chance alone gives {low:.2f} to {high:.2f}"
-    size = f"{significant(ratio)} times the stated noise; {band}"
-    if ratio > high:
-        return (
-            f"The residual is larger than the stated noise explains ({size}): something is "
-            "unmodelled, or the noise is larger than stated."
-        )
-    if ratio < low:
-        return f"The residual is smaller than the stated noise ({size}): it was stated too large."
-    return f"The residual agrees with the stated noise ({size})."
-
-
 def nominal_arm(result: IdentificationResult) -> str:
     placed = any(p.effect in ("base_frame", "marker_position") for p in result.model.parameters)
     return "nominal arm (base and markers placed)" if placed else "nominal arm"
@@ -152,12 +141,6 @@ def readings(result: IdentificationResult) -> str:
     )
 
 
-def method_and_weights(result: IdentificationResult) -> str:
-    if result.noise["kind"] == "none":
-        return "ordinary least squares, all readings weighted alike"
-    return f"weighted least squares, {printable(str(result.noise['description']))}"
-
-
 def correlation_lines(result: IdentificationResult, most: int = MOST_CORRELATIONS) -> list[str]:
     lines = []
     for a, b, r in result.correlations[:most]:
@@ -172,6 +155,23 @@ def coverage_line(result: IdentificationResult, truth: Truth) -> str:
     return f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
 
 
+def noise_lines(result: IdentificationResult) -> list[tuple[str, str]]:
+    """Label and sentence: estimated noise model, repeats, shape of the residuals."""
+    summary = getattr(result, "residual_summary", None)
+    found = [
+        ("Noise model", noise_model_line(result)),
+        ("Repeats", repeats_line(result)),
+        ("Residuals", None if summary is None else shape_line(summary)),
+    ]
+    return [(label, text) for label, text in found if text is not None]
+
+
+def held_lines(result: IdentificationResult) -> list[tuple[str, str]]:
+    """Label and sentence: what constraints and prior put into the estimates."""
+    found = [("Constraints", constraints_line(result)), ("Prior", prior_line(result))]
+    return [(label, text) for label, text in found if text is not None]
+
+
 def summary_lines(result: IdentificationResult, truth: Truth | None = None) -> list[str]:
     """The result in words, one statement per line, warnings last."""
     lines = [
@@ -183,6 +183,9 @@ def summary_lines(result: IdentificationResult, truth: Truth | None = None) -> l
         f"Prediction: {how_well_it_predicts(result)}",
         f"Noise: {does_noise_explain_it(result)}",
     ]
+    lines += [f"{label}: {text}" for label, text in noise_lines(result)]
+    lines.append(f"Intervals: {intervals_line(result)}")
+    lines += [f"{label}: {text}" for label, text in held_lines(result)]
     if truth:
         lines.append(f"Truth: {coverage_line(result, truth)}")
     if pairs := correlation_lines(result):

@@ -17,6 +17,12 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
+def short_name(name: str, most: int = 12) -> str:
+    """A printable name that fits a figure's axis."""
+    text = printable(name)
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
 def standings(result: IdentificationResult) -> dict[str, str]:
     """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, INVISIBLE or FIXED."""
     first = {next(iter(c.terms)) for c in result.combinations}

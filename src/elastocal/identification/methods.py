@@ -1,0 +1,141 @@
+"""The methods: from a first fit to the final one, its noise and its intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from elastocal.errors import InputError
+from elastocal.identification import published
+from elastocal.identification.adaptive import adapt, refined
+from elastocal.identification.covariance.estimate import Covariance
+from elastocal.identification.heldout import held_out_residual
+from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
+from elastocal.identification.noise import Weights
+from elastocal.identification.options import ROBUST, Options
+from elastocal.identification.robust.nonlinear import robust_fit
+from elastocal.identification.solve import Progress, Solution
+from elastocal.identification.variance.choose import NoiseFit
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A larger share of readings beyond the noise is no accident of measuring: an effect that the model
+# lacks looks like that.  Setting them apart would hide it.
+MOST_SET_ASIDE = 0.1
+
+
+@dataclass(frozen=True)
+class Found:
+    """The final fit, its intervals, the noise where it was estimated, and the good readings."""
+
+    method: str
+    solution: Solution
+    intervals: Intervals
+    noise: NoiseFit | None
+    good: Mask
+
+
+def run_method(
+    whole: Solution, clean: Solution, faulty: Mask, options: Options, progress: Progress
+) -> Found:
+    """Carry out `options.method` from the fit to all observations and that to the good ones."""
+    method = options.resolved
+    if method == "reml" and not whole.problem.large:
+        return _reml(whole, clean, options, progress)
+    if method in ROBUST:
+        return _robust(method, clean, whole, options)
+    drop = _set_aside(faulty, options)
+    solution, good = (clean, ~faulty) if drop else (whole, np.ones_like(faulty))
+    if method in ("eq14", "eq14-residual"):
+        return _published(method, whole, solution, good, options, progress)
+    kind = "ols" if solution.problem.weights.kind == "none" else "wls"
+    intervals = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
+    return Found(kind, solution, intervals, None, good)
+
+
+def _set_aside(faulty: Mask, options: Options) -> bool:
+    if options.faulty == "auto":
+        return bool(0 < faulty.mean() <= MOST_SET_ASIDE)
+    return options.faulty == "drop" and bool(faulty.any())
+
+
+def _reml(whole: Solution, clean: Solution, options: Options, progress: Progress) -> Found:
+    found = adapt(whole, clean, options.noise, False, progress)
+    if not found.good.all() and not _set_aside(~found.good, options):
+        found = replace(adapt(whole, whole, options.noise, True, progress), good=found.good)
+    intervals = intervals_of(
+        found.solution, options.intervals, found.noise, options.seed, options.jobs
+    )
+    return Found("reml", found.solution, intervals, found.noise, found.good)
+
+
+def _published(
+    method: str, whole: Solution, start: Solution, good: Mask, options: Options, progress: Progress
+) -> Found:
+    """Eq. (14) on the linearised model, and a fit of the exact one with the weights it ends at."""
+    progress("iterating the weights of eq. (14)")
+    seen, fit = start.problem.observations, start.fit
+    group = None
+    if method == "eq14":
+        key = seen.configuration[:, None] * seen.size + np.arange(seen.size)
+        group = np.unique(key.ravel(), return_inverse=True)[1].ravel()
+    size = start.sizes[fit.columns]
+    last = published.eq14(fit.B * size, fit.residual, group)[-1]
+    text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
+    weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)
+    solution = refined(whole, start, good, weights)
+    if options.intervals != "auto":
+        return Found(method, solution, intervals_of(solution, options.intervals, None), None, good)
+    covariance = Covariance(
+        "eq13", last.covariance * np.outer(size, size), np.full(len(size), np.inf),
+        "as published, eq. (13) with the σ of eq. (14): not corrected for estimated weights",
+    )  # fmt: skip
+    x = solution.fit.x[fit.columns]
+    return Found(method, solution, Intervals(covariance, covariance.interval(x, LEVEL)), None, good)
+
+
+def _robust(method: str, clean: Solution, whole: Solution, options: Options) -> Found:
+    """A robust fit of all readings in the parameters that the good ones determine."""
+    if whole.problem.bounded or whole.problem.large:
+        raise InputError(
+            f"the method {method} takes no bounds and no table of this size; use the default "
+            "method, which sets faulty readings apart"
+        )
+    if options.intervals not in ("auto", "cr3"):
+        raise InputError(
+            f"the method {method} has intervals of its own: 'auto' for independent readings, "
+            "'cr3' where readings of a configuration depend on each other"
+        )
+    problem, kept = whole.problem, clean.reduction.kept
+    seen = problem.observations
+    found = robust_fit(problem.fit_of(kept, clean.fit.x, clean.sizes), method, None, options.seed)  # type: ignore[arg-type]
+    clustered = options.intervals == "cr3"
+    covariance = found.clustered(seen.configuration) if clustered else found.covariance()
+    fit = replace(
+        clean.fit, x=found.x, residual=found.residual, whitened=found.whitened,
+        converged=found.converged, steps=found.steps,
+        problem=problem.fit_of(kept, found.x, clean.sizes),
+        reason=clean.fit.reason if found.converged else "the robust steps did not settle",
+    )  # fmt: skip
+    # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
+    share = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), seen.size))
+    whiten = sparse.csr_array(sparse.diags_array(share))
+    if problem.weights.whiten is not None:
+        whiten = sparse.csr_array(whiten @ problem.weights.whiten)
+    heldout = held_out_residual(
+        fit.B,
+        found.residual,
+        replace(problem.weights, whiten=whiten),
+        seen.configuration,
+        seen.size,
+    )
+    solution = replace(
+        clean, problem=replace(problem, x0=clean.problem.x0), fit=fit, heldout=heldout
+    )
+    x = found.x[kept]
+    intervals = Intervals(covariance, covariance.interval(x, LEVEL))
+    return Found(method, solution, intervals, None, np.ones(len(seen.lead), dtype=bool))

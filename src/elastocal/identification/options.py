@@ -1,0 +1,90 @@
+"""How to identify: method, noise, intervals, what is held, what becomes of faulty readings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.errors import InputError
+from elastocal.identification.constrained.constraints import Constraints
+from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.identification.intervals import KINDS as INTERVALS
+from elastocal.identification.intervals import IntervalKind
+from elastocal.identification.noise import WeightKind
+from elastocal.identification.variance.choose import KINDS as NOISES
+from elastocal.nearest import did_you_mean
+
+Method = Literal[
+    "auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "tukey", "l1", "student-t"
+]
+FaultyReadings = Literal["auto", "drop", "keep"]
+METHODS = get_args(Method)
+ROBUST = ("huber", "tukey", "l1", "student-t")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to identify.
+
+    `method`: auto is reml, weights estimated by restricted likelihood, unless `weights` names
+    stated ones; ols is eq. (6), wls eq. (10) with stated noise, eq14 and eq14-residual the
+    published weights with σ by group or from each residual; huber, tukey (MM), l1, student-t are
+    robust.  `noise`: the model whose variances reml estimates (variance.choose.KINDS).
+    `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
+    `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
+    `bounded`: keep parameters inside their physical bounds.  `constraints` and `prior`: a
+    constrained or regularised fit on top of the method's weights.  `faulty`: readings beyond the
+    noise are set apart (auto: unless they are too many to be reading errors), always, or never;
+    they are listed in the result in any case.  `seed`: of multi-start, searches and bootstraps;
+    `jobs`: processes of a bootstrap.
+    """
+
+    method: Method = "auto"
+    noise: str = "auto"
+    weights: WeightKind = "auto"
+    covariance: NDArray[np.float64] | None = None
+    intervals: IntervalKind = "auto"
+    fixed: tuple[str, ...] = ()
+    bounded: bool = False
+    constraints: Constraints | None = None
+    prior: GaussianPrior | None = None
+    faulty: FaultyReadings = "auto"
+    seed: int = 0
+    jobs: int = 1
+
+    def __post_init__(self) -> None:
+        for name, value, valid in (
+            ("method", self.method, METHODS),
+            ("noise model", self.noise, NOISES),
+            ("kind of intervals", self.intervals, INTERVALS),
+            ("way with faulty readings", self.faulty, get_args(FaultyReadings)),
+        ):
+            if value not in valid:
+                raise InputError(
+                    f"there is no {name} '{value}'{did_you_mean(value, valid)}; there are "
+                    f"{', '.join(valid)}"
+                )
+        if self.noise != "auto" and self.resolved != "reml":
+            raise InputError(
+                f"the noise model '{self.noise}' is estimated by the method reml; "
+                f"{self.resolved} takes its weights from elsewhere"
+            )
+        if self.method == "wls" and self.weights == "none":
+            raise InputError("the method wls needs weights; for none, choose the method ols")
+        stated = self.weights != "auto" or self.covariance is not None
+        if stated and self.weights != "none" and self.resolved not in ("wls", *ROBUST):
+            raise InputError(
+                f"the method {self.resolved} does not take stated weights; choose the method wls"
+            )
+
+    @property
+    def resolved(self) -> str:
+        """The method that auto stands for."""
+        if self.method != "auto":
+            return self.method
+        if self.weights == "auto" and self.covariance is None:
+            return "reml"
+        return "ols" if self.weights == "none" else "wls"

@@ -1,0 +1,155 @@
+"""How the numbers came about, in words: method, intervals, active constraints, prior."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from elastocal.identification.result import IdentificationResult
+from elastocal.report.units import display, plain
+from elastocal.report.words import printable
+
+MOST_NAMED = 6
+MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
+
+METHODS = {
+    "reml": "generalised least squares, weights estimated by restricted likelihood (REML)",
+    "ols": "ordinary least squares, all readings weighted alike",
+    "wls": "weighted least squares",
+    "eq14": "weighted least squares as published, weights of eq. (14) with σ by group, iterated",
+    "eq14-residual": (
+        "weighted least squares as published, weights of eq. (14) from each residual, iterated; "
+        "it acts like a robust fit, and its stated intervals are far too narrow"
+    ),
+    "huber": "robust M-estimate with Huber's loss, which limits the pull of far readings",
+    "tukey": "robust MM-estimate with Tukey's biweight, which gives far readings no weight at all",
+    "l1": "least sum of residual lengths (L1), the robust relative of the median",
+    "student-t": "maximum likelihood under Student-t noise, which expects some far readings",
+    "constrained": "least squares under constraints or with a prior",
+}
+# What the weights are is said by the method itself, or by the line on the noise model.
+SAID = {"reml", "ols", "eq14", "eq14-residual"}
+
+INTERVALS = {
+    "kenward-roger": (
+        "t intervals of Kenward and Roger, which count with the weights being estimated; they "
+        "assume the noise model and normal noise"
+    ),
+    "classical": (
+        "t intervals that take the readings for independent (after weighting) and the size of the "
+        "noise from the residual, also where it was stated"
+    ),
+    "clustered": (
+        "robust to correlation within a configuration; they assume independent configurations"
+    ),
+    "wild": (
+        "wild cluster bootstrap over configurations; assumes only that these are independent, "
+        "not equal or normal noise"
+    ),
+    "bootstrap": (
+        "parametric bootstrap: noise drawn from the model and everything estimated anew; assumes "
+        "the noise model, not that estimates are normal"
+    ),
+    "profile": (
+        "profile of the sum of squares, which follows the curvature of the model and may be "
+        "lopsided; assumes independent normal noise"
+    ),
+    "eq7": "as published, eq. (7): equal, independent noise of the residual's size",
+    "eq8": "as published, eq. (8): independent noise whose σ are taken for known",
+    "eq11": "as published, eq. (11): independent noise whose σ are taken for known",
+    "eq13": (
+        "as published, eq. (13): weights taken for known although they come from the same "
+        "residuals, which makes the intervals too narrow"
+    ),
+}
+HC = (
+    "robust to unequal noise ({}): every reading may have a variance of its own; they assume "
+    "independent readings"
+)
+CR = (
+    "cluster-robust ({}): readings of a configuration may be correlated in any way; they assume "
+    "independent configurations"
+)
+ROBUST = "asymptotic covariance of the robust estimate ({}); assumes independent readings"
+
+
+def method_of(result: IdentificationResult) -> str:
+    return str(result.method).replace("_", "-")
+
+
+def method_and_weights(result: IdentificationResult) -> str:
+    """The method, and the weights where the method does not say them."""
+    method, noise = method_of(result), result.noise
+    text = METHODS.get(method, printable(method))
+    if method in SAID or noise["kind"] == "none":
+        return text
+    return f"{text}, {printable(str(noise['description']))}"
+
+
+def interval_kind(result: IdentificationResult) -> str:
+    found: dict[str, Any] = result.noise.get("intervals") or {"kind": "classical"}
+    return str(found["kind"]).lower()
+
+
+def takes_configurations_as_a_whole(result: IdentificationResult) -> bool:
+    """Whether the intervals hold where the readings of a configuration are correlated."""
+    kind = interval_kind(result)
+    return kind in ("wild", "clustered") or kind.startswith("cr")
+
+
+def intervals_line(result: IdentificationResult) -> str:
+    """Which kind of interval, and what it assumes."""
+    kind = interval_kind(result)
+    if kind in INTERVALS:
+        return INTERVALS[kind]
+    if kind.startswith(("hc", "cr")):
+        return (HC if kind.startswith("hc") else CR).format(printable(kind.upper()))
+    if kind in ("h1", "h2", "h3"):
+        return ROBUST.format(kind.upper())
+    description = result.noise["intervals"].get("description", "")
+    return printable(f"{kind}: {description}" if description else kind)
+
+
+def constraints_line(result: IdentificationResult) -> str | None:
+    """Which constraints hold with equality, and that their parameters' intervals rest on them."""
+    active = tuple(getattr(result, "active", None) or ())
+    if not active:
+        return None
+    units = {p.name: p.unit for p in result.model.parameters}
+    texts = []
+    for a in active[:MOST_NAMED]:
+        if a.kind == "semidefinite":
+            texts.append(f"{printable(a.label)} (semidefinite)")
+            continue
+        value, unit = a.value, ""
+        if len(a.names) == 1 and a.names[0] in units:
+            value, unit = display(a.value, units[a.names[0]])
+            unit = f" {unit}"
+        text = f"{printable(a.label)} ({a.kind}{'' if a.kind == 'equality' else ' bound'}"
+        texts.append(f"{text} {plain(value)}{unit})")
+    more = len(active) - len(texts)
+    text = "; ".join([*texts, *([f"and {more} more"] if more else [])])
+    bound = any(a.kind != "equality" for a in active)
+    want = "; the data alone would go beyond the bounds" if bound else ""
+    return f"Held by constraints: {text}. Intervals take these for exact{want}."
+
+
+def prior_line(result: IdentificationResult) -> str | None:
+    """Parameters that owe more than half of their information to the prior."""
+    shares: dict[str, float] = getattr(result, "prior_share", None) or {}
+    if not shares:
+        return None
+    mostly = sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n])
+    if not mostly:
+        largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
+        return f"No estimate is mostly prior (largest share {_percent(largest)})."
+    named = ", ".join(f"{printable(n)} {_percent(shares[n])}" for n in mostly[:MOST_NAMED])
+    more = len(mostly) - MOST_NAMED
+    text = f"Mostly prior, share of the information: {named}" + (
+        f", and {more} more" if more > 0 else ""
+    )
+    return f"{text}. These data say little about them; poses that load them more would."
+
+
+def _percent(share: float) -> str:
+    """Never 100 % where the data say anything."""
+    return f"{min(100 * share, 99.9):.3g} %" if share < 1 else "100 %"

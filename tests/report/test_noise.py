@@ -1,0 +1,244 @@
+"""What the report says of noise, method and intervals: everything named, nothing claimed twice."""
+
+from __future__ import annotations
+
+import copy
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from elastocal.identification.intervals import KINDS as INTERVALS
+from elastocal.identification.options import METHODS
+from elastocal.identification.residual_summary import summarise_residuals
+from elastocal.identification.variance.choose import KINDS
+from elastocal.report.html import report_page
+from elastocal.report.method import (
+    constraints_line,
+    intervals_line,
+    method_and_weights,
+    prior_line,
+)
+from elastocal.report.noise import (
+    candidate_rows,
+    does_noise_explain_it,
+    kind_in_words,
+    noise_model_line,
+    repeats_line,
+    shape_line,
+    size_rows,
+)
+from elastocal.report.tables import print_result, summary_lines
+
+MISFIT = {"F": 9.31, "p": 2e-9, "dof_between": 30, "dof_pure": 200}
+AXES = [{"name": n, "sigma_um": v} for n, v in (("x", 12.0), ("y", 31.4), ("rz", 5.0))]
+TRIED = [
+    {"kind": "independent", "variances": 1, "criterion": -90.0},
+    {"kind": "axis+configuration", "variances": 4, "criterion": -104.25},
+]
+
+
+def changed(result: Any, noise: dict[str, Any] | None = None, **fields: Any) -> Any:
+    """The result with other fields, whether its class declares them yet or not."""
+    new = copy.copy(result)
+    for name, value in fields.items():
+        object.__setattr__(new, name, value)
+    object.__setattr__(new, "noise", {**result.noise, **(noise or {})})
+    return new
+
+
+@pytest.fixture(scope="module")
+def noisy(case: Any) -> Any:
+    """A result with everything that the report can tell of noise."""
+    seen = case.result.observations
+    e = np.random.default_rng(0).normal(size=len(seen.value))
+    e[np.repeat(seen.configuration, 3) == 3] *= 4
+    noise = {
+        "kind": "axis+configuration",
+        "description": "one variance per axis, and a deviation common to each configuration",
+        "reason": "smallest of all",
+        "variances": [*AXES, {"name": "common to each configuration", "sigma_um": 40.0}],
+        "tried": TRIED,
+        "lack_of_fit": MISFIT,
+        "intervals": {"kind": "kenward-roger", "description": "adjusted"},
+    }
+    label = "joint2.compliance ≥ 0"
+    active = (
+        SimpleNamespace(label=label, kind="lower", names=("joint2.compliance",), value=0.0,
+                        multiplier=1.0),
+    )  # fmt: skip
+    share = {"joint4.offset": 0.83, "joint5.offset": 0.2, "joint6.offset": float("nan")}
+    return changed(
+        case.result, noise, method="reml", active=active, prior_share=share,
+        residual_summary=summarise_residuals(seen, e),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if m != "auto"] + ["constrained"])
+def test_every_method_has_words_of_its_own(case: Any, method: str) -> None:
+    text = method_and_weights(changed(case.result, method=method))
+    assert len(text) > len(method) + 10
+    others = {method_and_weights(changed(case.result, method=m)) for m in METHODS if m != method}
+    assert text not in others
+    assert method_and_weights(changed(case.result, method=method.replace("-", "_"))) == text
+
+
+def test_stated_weights_are_named_with_the_method(case: Any) -> None:
+    noise = {"kind": "axis", "description": "tracker sigma 10 µm"}
+    text = method_and_weights(changed(case.result, noise, method="wls"))
+    assert text == "weighted least squares, tracker sigma 10 µm"
+    ols = method_and_weights(changed(case.result, {"kind": "none"}, method="ols"))
+    assert ols == "ordinary least squares, all readings weighted alike"
+
+
+@pytest.mark.parametrize(
+    "kind", [k for k in (*INTERVALS, "kenward-roger", "H2", "clustered", "eq8") if k != "auto"]
+)
+def test_every_kind_of_interval_says_what_it_assumes(case: Any, kind: str) -> None:
+    given = {"intervals": {"kind": kind, "description": "in other words"}}
+    text = intervals_line(changed(case.result, given))
+    assert "in other words" not in text
+    assert re.search("assume|take|known|independent", text)
+    unknown = {"intervals": {"kind": "new", "description": "in other words"}}
+    assert intervals_line(changed(case.result, unknown)) == "new: in other words"
+
+
+def test_lack_of_fit_says_what_follows_for_the_intervals(case: Any) -> None:
+    def line(p: float, kind: str, intervals: str = "classical") -> str | None:
+        noise = {"lack_of_fit": {**MISFIT, "p": p}, "kind": kind, "intervals": {"kind": intervals}}
+        return repeats_line(changed(case.result, noise))
+
+    assert "agree" in (line(0.4, "axis") or "")
+    assert "too narrow" in (line(1e-9, "axis") or "")
+    for text in (line(1e-9, "axis+configuration"), line(1e-9, "axis", "CR2"),
+                 line(1e-9, "axis", "wild")):  # fmt: skip
+        assert text is not None
+        assert "include it" in text
+        assert "too narrow" not in text
+        assert "F = 9.31 on 30 and 200 degrees of freedom, p < 1e-6" in (text)
+        assert "does not come back" in text.replace("\n", " ")
+    assert repeats_line(changed(case.result, {"lack_of_fit": None})) is None
+
+
+def test_sizes_are_all_named_or_told_by_their_extremes() -> None:
+    assert size_rows({"variances": AXES}) == [
+        ("x", "12.0 µm"), ("y", "31.4 µm"), ("rz", "5.00 µrad"),
+    ]  # fmt: skip
+    many = [{"name": f"configuration {k}", "sigma_um": 10.0 + k} for k in range(91)]
+    rows = size_rows({"variances": [*many, {"name": "common to each cell", "sigma_um": 7.0}]})
+    assert rows == [
+        ("median of 91", "55.0 µm"),
+        ("smallest (configuration 0)", "10.0 µm"),
+        ("largest (configuration 90)", "100 µm"),
+        ("common to each cell", "7.00 µm"),
+    ]
+    factor = {"name": "factor", "sigma_um": None, "factor": 1.25}
+    assert size_rows({"variances": [factor]}) == [("factor", "1.25")]
+    assert size_rows({}) == []
+
+
+def test_candidates_are_ranked_by_their_criterion() -> None:
+    assert candidate_rows({"tried": TRIED}) == [
+        ("one size per axis + deviations of a configuration", "4", "0.0"),
+        ("equal noise", "1", "14.2"),
+    ]
+    words = [kind_in_words(kind) for kind in KINDS if kind != "auto"]
+    assert len(set(words)) == len(words)
+    assert not set(words) & set(KINDS)
+
+
+def test_estimated_noise_is_judged_against_the_stated_one(case: Any) -> None:
+    def line(ratio: float | None, method: str) -> str:
+        given = {"ratio_to_stated": ratio, "sigma_um": 25.0}
+        return does_noise_explain_it(changed(case.result, given, method=method))
+
+    assert "agrees" in line(1.0, "reml")
+    assert "follow the noise that the readings show" in line(3.0, "reml")
+    assert "follow" not in line(3.0, "wls")
+    assert "too large" in line(0.2, "reml")
+    assert "25.0 µm per coordinate" in line(None, "ols")
+    assert "estimated from the readings" in line(None, "reml")
+
+
+def test_shape_of_the_residuals_in_words(case: Any) -> None:
+    seen, rng = case.result.observations, np.random.default_rng(1)
+    n = len(seen.value)
+
+    def line(e: np.ndarray) -> str:
+        found = summarise_residuals(seen, e / e.std())
+        assert found is not None
+        return shape_line(found)
+
+    normal = line(rng.normal(size=n))
+    assert "agree with a normal distribution" in normal
+    assert "No group of readings scatters" in normal
+    assert "far readings are more frequent" in line(rng.standard_t(2, size=n))
+    assert "lean to one side" in line(rng.exponential(size=n) ** 0.7)
+    assert "far readings are rarer" in line(rng.uniform(-1, 1, size=n))
+
+
+def test_constraints_and_prior(noisy: Any, case: Any) -> None:
+    assert "joint2.compliance ≥ 0 (lower bound 0 µrad/(N·m))" in (constraints_line(noisy) or "")
+    prior = prior_line(noisy) or ""
+    assert "joint4.offset 83 %" in prior
+    assert "joint5" not in prior
+    assert "largest share 20 %" in (prior_line(changed(noisy, prior_share={"a": 0.2})) or "")
+    assert constraints_line(case.result) is None
+    assert prior_line(case.result) is None
+
+
+@pytest.mark.parametrize("width", [40, 80, 120])
+def test_terminal_has_tables_and_all_lines(noisy: Any, width: int) -> None:
+    console = Console(width=width, force_terminal=False)
+    with console.capture() as capture:
+        print_result(console, noisy)
+    text = capture.get()
+    assert max(map(len, text.splitlines())) <= width
+    joined = "".join(text.split())
+    for piece in ("31.4µm", "5.00µrad", "equalnoise", "14.2"):
+        assert piece in joined
+    labels = [line.partition(":")[0] for line in summary_lines(noisy)]
+    assert labels.index("Noise") < labels.index("Noise model") < labels.index("Repeats")
+    assert {"Residuals", "Intervals", "Constraints", "Prior"} <= set(labels)
+
+
+def test_page_has_a_section_on_noise(noisy: Any) -> None:
+    page = report_page(noisy)
+    section = page[page.index("<h2>Noise</h2>") : page.index("<h2>Correlations")]
+    for piece in ("restricted likelihood", "31.4 µm", "common to each configuration", "14.2",
+                  "the intervals include it", "Kenward and Roger", "scatters unlike",
+                  "configuration 4"):  # fmt: skip
+        assert piece in section
+    assert section.count("<figure>") == 4
+    verdict = page[: page.index("<h2>Parameters")]
+    assert "joint2.compliance ≥ 0" in verdict
+    assert "Mostly prior" in verdict
+    assert len(set(re.findall(r'\bid="([^"]*)"', page))) == len(re.findall(r'\bid="', page))
+
+
+def test_names_from_the_result_are_text(noisy: Any) -> None:
+    script = "<script>\x1b[31m"
+    sizes = [{"name": script, "sigma_um": 1.0}]
+    tried = [{"kind": script, "variances": 1, "criterion": float(k)} for k in range(2)]
+    noise = {"variances": sizes, "tried": tried, "description": script, "reason": script}
+    page = report_page(changed(noisy, noise))
+    assert "<script" not in page
+    assert "\x1b" not in page
+    assert "\x1b" not in "\n".join(summary_lines(changed(noisy, noise)))
+
+
+def test_without_residuals_the_page_has_no_distribution(case: Any) -> None:
+    nothing = changed(case.result, residual=np.zeros_like(case.result.residual), residual_rms=0.0)
+    page = report_page(changed(nothing, residual_summary=None))
+    assert page.count("<figure>") == 4
+    assert noise_model_line(changed(case.result, {"variances": [], "reason": None})) is None
+
+
+def test_interval_without_an_end_has_no_bar(case: Any) -> None:
+    e = copy.copy(case.result.estimates[0])
+    object.__setattr__(e, "ci95", (-np.inf, np.inf))
+    page = report_page(changed(case.result, estimates=(e, *case.result.estimates[1:])))
+    assert "nan" not in page[page.index("<h2>Parameters") : page.index("<h2>Combinations")]
