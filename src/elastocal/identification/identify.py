@@ -66,7 +66,7 @@ def identify(
     faulty, clean = find_faulty(whole, refit)
     if 0 < faulty.mean() < 1:
         clean = refit(~faulty, final=True)
-    found = run_method(whole, clean, faulty, options, progress)
+    found = run_method(whole, clean, faulty, refit, options, progress)
     progress("intervals and held-out residuals")
     beyond = describe(whole, found.solution, ~found.good)
     result = summarise(model, whole, found, beyond)

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from elastocal.errors import InputError
 from elastocal.identification import published
-from elastocal.identification.adaptive import adapt, refined
+from elastocal.identification.adaptive import Refit, adapt, adapt_all, refined
 from elastocal.identification.covariance.estimate import Covariance
 from elastocal.identification.heldout import held_out_residual
 from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
@@ -40,12 +40,20 @@ class Found:
 
 
 def run_method(
-    whole: Solution, clean: Solution, faulty: Mask, options: Options, progress: Progress
+    whole: Solution,
+    clean: Solution,
+    faulty: Mask,
+    refit: Refit,
+    options: Options,
+    progress: Progress,
 ) -> Found:
-    """Carry out `options.method` from the fit to all observations and that to the good ones."""
+    """Carry out `options.method` from the fit to all observations and that to the good ones.
+
+    `clean` is the fit to the observations that are not `faulty` (N,), `refit` makes another such.
+    """
     method = options.resolved
     if method == "reml" and not whole.problem.large:
-        return _reml(whole, clean, options, progress)
+        return _reml(whole, clean, faulty, refit, options, progress)
     if method in ROBUST:
         return _robust(method, clean, whole, options)
     drop = _set_aside(faulty, options)
@@ -63,10 +71,17 @@ def _set_aside(faulty: Mask, options: Options) -> bool:
     return options.faulty == "drop" and bool(faulty.any())
 
 
-def _reml(whole: Solution, clean: Solution, options: Options, progress: Progress) -> Found:
-    found = adapt(whole, clean, options.noise, False, progress)
+def _reml(
+    whole: Solution,
+    clean: Solution,
+    faulty: Mask,
+    refit: Refit,
+    options: Options,
+    progress: Progress,
+) -> Found:
+    found = adapt(whole, clean, faulty, refit, options.noise, progress)
     if not found.good.all() and not _set_aside(~found.good, options):
-        found = replace(adapt(whole, whole, options.noise, True, progress), good=found.good)
+        found = replace(adapt_all(whole, options.noise, progress), good=found.good)
     intervals = intervals_of(
         found.solution, options.intervals, found.noise, options.seed, options.jobs
     )
@@ -87,7 +102,7 @@ def _published(
     last = published.eq14(fit.B * size, fit.residual, group)[-1]
     text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
     weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)
-    solution = refined(whole, start, good, weights)
+    solution = refined(whole, start, start.fit.x, good, weights)
     if options.intervals != "auto":
         return Found(method, solution, intervals_of(solution, options.intervals, None), None, good)
     covariance = Covariance(

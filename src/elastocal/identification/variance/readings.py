@@ -83,7 +83,8 @@ class Cells:
 
     With the covariance θ S_i of reading i in a cell, the weighted mean ȳ = U Σ S_i⁻¹ y_i with
     U = (Σ S_i⁻¹)⁻¹ and the scatter about it are sufficient: ȳ varies by θ U plus whatever all
-    repeats share, the scatter by θ alone with (repeats − 1) · size degrees of freedom.
+    repeats share, the scatter by θ alone with (repeats − 1) · size degrees of freedom.  Repeats
+    are taken to have one B; where theirs differ a little, the mean stands for all.
     `B` (C, size, p), `e` (C, size), `unit` U (C, size, size), `dof` (C,) repeats − 1, `scatter`
     (C, size, size), `log_offset`: Σ log|S_i| − log|U| over all cells, which the likelihood needs.
     """

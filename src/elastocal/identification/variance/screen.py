@@ -15,16 +15,17 @@ OWN_SCALE = 6  # readings that a group needs for a median and a scale of its own
 LIMIT = 5.0  # robust standard deviations; the verdict that follows takes back what it can explain
 
 
-def screen(readings: Readings, residual: Array) -> Mask:
+def screen(readings: Readings, residual: Array, good: Mask | None = None) -> Mask:
     """Readings (N,) whose residual (N, size) from a robust fit lies with the others.
 
     Each component is compared with the median and the median absolute deviation of its
     configuration (under its load), where that holds enough readings; else with zero and the
-    deviation of the whole table.  Where noise is stated, residuals count in units of it.
+    deviation of the `good` readings (N,) of the whole table (default all).  Where noise is stated,
+    residuals count in units of it.
     """
     if readings.stated is not None:
         residual = residual / np.sqrt(np.diagonal(readings.stated, axis1=1, axis2=2))
-    table = _scale(np.abs(residual))
+    table = _scale(np.abs(residual if good is None else residual[good]))
     deviation, scale = np.abs(residual), np.broadcast_to(table, residual.shape).copy()
     key = np.column_stack([readings.configuration, readings.load])
     _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
