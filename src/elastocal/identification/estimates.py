@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from elastocal.identification.advice import warnings_for
 from elastocal.identification.heldout import rms_3d
 from elastocal.identification.intervals import Intervals
 from elastocal.identification.methods import Found
 from elastocal.identification.noise_summary import noise_summary
+from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
 from elastocal.identification.result import (
     Combination,
     Estimate,
@@ -62,8 +64,23 @@ def summarise(
         outliers=() if set_apart else beyond,
         excluded=beyond if set_apart else (),
         warnings=(),
+        residual_summary=_residual_summary(solution),
     )
     return warnings_for(result, solution)
+
+
+def _residual_summary(solution: Solution) -> ResidualSummary | None:
+    """The whitened residuals against what the noise model says of them."""
+    problem, fit = solution.problem, solution.fit
+    leverage = None
+    if not problem.large:
+        R = fit.triangle.R[: len(fit.columns)]
+        Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
+        leverage = np.minimum((Q**2).sum(axis=0), 1.0)
+    return summarise_residuals(
+        problem.observations, fit.whitened, leverage, problem.weights.apply(solution.heldout),
+        absolute=problem.weights.absolute,
+    )  # fmt: skip
 
 
 def _estimates(

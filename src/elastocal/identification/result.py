@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import COMPONENTS, Observations
 
@@ -123,6 +124,7 @@ class IdentificationResult:
     excluded: tuple[Outlier, ...]
     warnings: tuple[str, ...]
     test: TestErrors | None = None
+    residual_summary: ResidualSummary | None = None
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
@@ -214,6 +216,9 @@ class IdentificationResult:
             "test_mean_um": None if self.test is None else _um(self.test.mean),
             "test_max_um": None if self.test is None else _um(self.test.maximum),
             "noise": self.noise,
+            "residual_summary": (
+                None if self.residual_summary is None else self.residual_summary.to_json()
+            ),
             "converged": self.converged,
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
