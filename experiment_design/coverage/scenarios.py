@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +137,12 @@ class Setting:
         weighted = np.linalg.solve(V, self.B[rows])
         Phi = np.linalg.inv(self.B[rows].T @ weighted)
         return Phi @ (weighted.T @ e[rows]), np.sqrt(np.diag(Phi))
+
+
+@lru_cache(maxsize=2)
+def setting(scenario: Scenario) -> Setting:
+    """The scenario's setting, kept: chunks of one scenario follow each other."""
+    return Setting(scenario)
 
 
 def _positions() -> np.ndarray:

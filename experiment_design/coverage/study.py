@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import argparse
 import os
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, delayed
 from rich.progress import Progress
-from scenarios import SCENARIOS, Scenario, Setting
+from scenarios import SCENARIOS, Scenario, Setting, setting
 from tables import report
 
 from elastocal.identification.covariance.cluster import cluster_robust
@@ -35,11 +34,6 @@ METHODS = (
     "default", "oracle", "OLS, CR2", "OLS, eq. (8)", "eq. (14) by group",
     "eq. (14) per residual", "Tukey MM",
 )  # fmt: skip
-
-
-@lru_cache(maxsize=2)
-def setting(scenario: Scenario) -> Setting:
-    return Setting(scenario)
 
 
 def estimates(s: Setting, replicate: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from elastocal.errors import InputError
+from elastocal.identification.cluster_by_parts import cluster_by_parts, worth_clustering
 from elastocal.identification.covariance.cluster import cluster_robust
 from elastocal.identification.covariance.estimate import Covariance
 from elastocal.identification.covariance.heteroscedastic import hc
@@ -47,7 +48,8 @@ def intervals_of(
 ) -> Intervals:
     """Intervals of the solution's fitted parameters.
 
-    auto: those of the estimated noise (Kenward–Roger), where there is one, else classical;
+    auto: those of the estimated noise (Kenward–Roger), where there is one, else classical, or in
+    a large table with several readings per configuration cr1;
     classical: s²(BᵀW²B)⁻¹ with t (eq. 7, 13); hc…, cr…: sandwich, clusters being configurations;
     wild: bootstrap of those; bootstrap: parametric, with the noise estimated in each draw;
     profile: of the nonlinear sum of squares.
@@ -59,13 +61,17 @@ def intervals_of(
     x = fit.x[fit.columns]
     if kind == "auto" and noise is not None:
         return _by_t(noise.covariance, x)
+    problem = solution.problem
+    clustered = problem.large and worth_clustering(problem.parts, len(x))
+    if (kind == "cr1" and problem.large) or (kind == "auto" and clustered):
+        return _by_t(cluster_by_parts(fit, problem.parts), x)
     classical = _classical(solution)
     if kind in ("auto", "classical"):
         return _by_t(classical, x)
-    if solution.problem.large:
+    if problem.large:
         raise InputError(
             f"--intervals {kind} needs B as a whole, which a table of this size does not allow; "
-            "use classical"
+            "use cr1 or classical"
         )
     size = solution.sizes[fit.columns]
     B, e = solution.problem.weights.apply(fit.B * size), fit.whitened

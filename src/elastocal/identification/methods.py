@@ -56,7 +56,8 @@ def run_method(
         return _reml(whole, clean, faulty, refit, options, progress)
     if method in ROBUST:
         return _robust(method, clean, whole, options)
-    drop = _set_aside(faulty, options)
+    # As published, every reading counts; and at equal weights noisy readings look faulty.
+    drop = _set_aside(faulty, options) and (method in ("wls", "reml") or options.faulty == "drop")
     solution, good = (clean, ~faulty) if drop else (whole, np.ones_like(faulty))
     if method in ("eq14", "eq14-residual"):
         return _published(method, whole, solution, good, options, progress)

@@ -39,6 +39,11 @@ def noise_summary(found: Found, sigma: float) -> dict[str, Any]:
     }
     if found.noise is not None:
         summary |= _estimated(found.noise)
+    elif found.solution.problem.large:
+        summary["reason"] = (
+            "the table is too large for a choice among noise models; stated noise, or equal noise "
+            "where none is stated, is scaled to the residual"
+        )
     return summary
 
 
@@ -69,13 +74,8 @@ def _estimated(noise: NoiseFit) -> dict[str, Any]:
 
 
 def _ratio_to_stated(found: Found, sigma: float) -> float | None:
-    """Root mean square of the residual in units of the stated noise, per degree of freedom.
-
-    Ordinary least squares was asked to know nothing of it.
-    """
+    """Root mean square of the residual in units of the stated noise, per degree of freedom."""
     solution = found.solution
-    if found.method == "ols":
-        return None
     if found.method == "wls" and solution.problem.weights.absolute:
         return sigma
     try:

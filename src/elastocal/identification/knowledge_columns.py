@@ -1,0 +1,134 @@
+"""Which parameters a fit with constraints and a prior has, and its constraints on these alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.errors import require
+from elastocal.identification.constrained.constraints import (
+    Bounds,
+    Constraints,
+    Entry,
+    LinearEquality,
+    SemidefiniteMatrix,
+    combination,
+)
+from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.identification.solve import Solution
+from elastocal.nearest import listed, quoted
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Share of a column that others must leave over for readings, prior and equalities to tell it from
+# them.  B is exact to 1e-15; what a weak prior adds to a dependent column is a smaller share yet.
+TOLD_APART = 1e-6
+
+
+def fitted_columns(
+    solution: Solution, std: Array, constraints: Constraints, prior: GaussianPrior | None
+) -> IntArray:
+    """Indices of the parameters to fit under the constraints and the prior, ascending.
+
+    These are the kept parameters of the solution (and those that bounds held); the free ones that
+    the prior or an equality names, for that is knowledge of themselves; and, of the parameters
+    that are known only together with one of these, as many as can now be told apart from it: with
+    a prior on k, readings of k + d are knowledge of d.  Bounds and matrices make nothing
+    estimable: they act on the fitted parameters, with all others held where the fit held them.
+
+    `std` (kept,) is that of the solution's estimates.  Raises InputError for a name that is no
+    parameter, or a prior on a parameter that is held fixed.
+    """
+    problem, reduction = solution.problem, solution.reduction
+    names, free = problem.model.names, set(problem.free.tolist())
+    constraints.resolve(names)
+    wanted = {name for e in constraints.equalities for name, factor in e.terms.items() if factor}
+    if prior is not None:
+        prior.rows(names)
+        fixed = [quoted(n) for n in prior.names if names.index(n) not in free]
+        require(
+            not fixed,
+            f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the "
+            "fixing",
+        )
+        wanted |= set(prior.names)
+    named = {names.index(n) for n in wanted} & free
+    columns = {*reduction.kept.tolist(), *reduction.at_bound.tolist(), *named}
+    if not named:
+        return np.array(sorted(columns), dtype=np.int64)
+    partners: dict[int, None] = {}
+    for k, c in enumerate(reduction.kept.tolist()):
+        if c in named:
+            partners |= dict.fromkeys(reduction.terms(k, solution.sizes, std[k]))
+    for d in partners:
+        if d not in columns and _told_apart(solution, sorted(columns), d, constraints, prior):
+            columns.add(d)
+    return np.array(sorted(columns), dtype=np.int64)
+
+
+def _told_apart(
+    solution: Solution,
+    columns: list[int],
+    new: int,
+    constraints: Constraints,
+    prior: GaussianPrior | None,
+) -> bool:
+    """Whether readings, prior and equalities together tell `new` from the columns."""
+    problem, seen = solution.problem, solution.problem.observations
+    chosen = np.array([*columns, new])
+    at = problem.model.regressor(seen.table, solution.fit.x, chosen, seen)
+    parts = [problem.weights.apply(at.B)]
+    if prior is not None:
+        rows = prior.rows(problem.model.names)[0][:, chosen]
+        e = solution.fit.whitened
+        parts.append(float(np.sqrt(e @ e / len(e))) * rows)
+    J = np.vstack(parts) * solution.sizes[chosen]
+    A = constraints.resolve(problem.model.names).A[:, chosen] * solution.sizes[chosen]
+    J = np.vstack([J, A / np.maximum(np.abs(A).max(axis=1, initial=0.0), 1e-300)[:, None]])
+    lengths = np.linalg.norm(J, axis=0)
+    J = J / np.where(lengths > 0, lengths, 1.0)
+    left = J[:, -1] - J[:, :-1] @ np.linalg.lstsq(J[:, :-1], J[:, -1], rcond=None)[0]
+    return bool(lengths[-1] > 0 and np.linalg.norm(left) > TOLD_APART)
+
+
+def own_bounds(solution: Solution) -> Constraints:
+    """The bounds that the effects of a bounded problem state themselves."""
+    if not solution.problem.bounded:
+        return Constraints()
+    parameters = solution.problem.model.parameters
+    return Constraints(
+        tuple(
+            Bounds(p.name, p.lower, p.upper)
+            for p in parameters
+            if np.isfinite(p.lower) or np.isfinite(p.upper)
+        )
+    )
+
+
+def on_columns(stated: Constraints, held: Mapping[str, float]) -> Constraints:
+    """The constraints on the other parameters where those in `held` have these values.
+
+    A constraint on held parameters alone is left out; `constrained_fit` has checked that it holds.
+    """
+    equalities = []
+    for e in stated.equalities:
+        terms = {n: c for n, c in e.terms.items() if n not in held}
+        if any(terms.values()):
+            value = e.value - sum(c * held[n] for n, c in e.terms.items() if n in held)
+            equalities.append(LinearEquality(terms, value, str(e)))
+    matrices = []
+    for m in stated.matrices:
+        rows = tuple(tuple(_entry(entry, held) for entry in row) for row in m.entries)
+        if any(name for row in rows for entry in row for name in combination(entry)):
+            matrices.append(SemidefiniteMatrix(m.label, rows))
+    bounds = tuple(b for b in stated.bounds if b.name not in held)
+    return Constraints(bounds, tuple(equalities), tuple(matrices))
+
+
+def _entry(entry: Entry, held: Mapping[str, float]) -> Entry:
+    terms = combination(entry)
+    constant = terms.pop("", 0.0) + sum(c * held[n] for n, c in terms.items() if n in held)
+    return {n: c for n, c in terms.items() if n not in held} | {"": constant}
