@@ -87,7 +87,10 @@ def _told_apart(
         parts.append(float(np.sqrt(e @ e / len(e))) * rows)
     J = np.vstack(parts) * solution.sizes[chosen]
     A = constraints.resolve(problem.model.names).A[:, chosen] * solution.sizes[chosen]
-    J = np.vstack([J, A / np.maximum(np.abs(A).max(axis=1, initial=0.0), 1e-300)[:, None]])
+    A = A[A.any(axis=1)]
+    # An equality is exact: it counts as much as anything that the readings tell.
+    A *= np.linalg.norm(J, axis=0).max() / np.linalg.norm(A, axis=1)[:, None]
+    J = np.vstack([J, A])
     lengths = np.linalg.norm(J, axis=0)
     J = J / np.where(lengths > 0, lengths, 1.0)
     left = J[:, -1] - J[:, :-1] @ np.linalg.lstsq(J[:, :-1], J[:, -1], rcond=None)[0]

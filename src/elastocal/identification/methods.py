@@ -30,7 +30,10 @@ MOST_SET_ASIDE = 0.1
 
 @dataclass(frozen=True)
 class Found:
-    """The final fit, its intervals, the noise where it was estimated, and the good readings."""
+    """The final fit, its intervals, and the noise where it was estimated.
+
+    Readings that are not `good` (N,) lie beyond the noise; they may still have a part in the fit.
+    """
 
     method: str
     solution: Solution
@@ -55,10 +58,10 @@ def run_method(
     if method == "reml" and not whole.problem.large:
         return _reml(whole, clean, faulty, refit, options, progress)
     if method in ROBUST:
-        return _robust(method, clean, whole, options)
+        return _robust(method, clean, whole, ~faulty, options)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
     drop = _set_aside(faulty, options) and (method in ("wls", "reml") or options.faulty == "drop")
-    solution, good = (clean, ~faulty) if drop else (whole, np.ones_like(faulty))
+    solution, good = (clean if drop else whole), ~faulty
     if method in ("eq14", "eq14-residual"):
         return _published(method, whole, solution, good, options, progress)
     kind = "ols" if solution.problem.weights.kind == "none" else "wls"
@@ -103,7 +106,8 @@ def _published(
     last = published.eq14(fit.B * size, fit.residual, group)[-1]
     text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
     weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)
-    solution = refined(whole, start, start.fit.x, good, weights)
+    kept = good if len(seen.lead) < len(good) else np.ones_like(good)
+    solution = refined(whole, start, start.fit.x, kept, weights)
     if options.intervals != "auto":
         return Found(method, solution, intervals_of(solution, options.intervals, None), None, good)
     covariance = Covariance(
@@ -114,7 +118,7 @@ def _published(
     return Found(method, solution, Intervals(covariance, covariance.interval(x, LEVEL)), None, good)
 
 
-def _robust(method: str, clean: Solution, whole: Solution, options: Options) -> Found:
+def _robust(method: str, clean: Solution, whole: Solution, good: Mask, options: Options) -> Found:
     """A robust fit of all readings in the parameters that the good ones determine."""
     if whole.problem.bounded or whole.problem.large:
         raise InputError(
@@ -154,4 +158,4 @@ def _robust(method: str, clean: Solution, whole: Solution, options: Options) -> 
     )
     x = found.x[kept]
     intervals = Intervals(covariance, covariance.interval(x, LEVEL))
-    return Found(method, solution, intervals, None, np.ones(len(seen.lead), dtype=bool))
+    return Found(method, solution, intervals, None, good)

@@ -23,6 +23,7 @@ Method = Literal[
 FaultyReadings = Literal["auto", "drop", "keep"]
 METHODS = get_args(Method)
 ROBUST = ("huber", "tukey", "l1", "student-t")
+WITH_KNOWLEDGE = ("auto", "bootstrap", "profile")
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Options:
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
     `bounded`: keep parameters inside their physical bounds.  `constraints` and `prior`: a
-    constrained or regularised fit on top of the method's weights.  `faulty`: readings beyond the
+    constrained or regularised fit on top of the method's weights (knowledge_fit).  `faulty`: readings beyond the
     noise are set apart (auto: unless they are too many to be reading errors), always, or never;
     they are listed in the result in any case.  `seed`: of multi-start, searches and bootstraps;
     `jobs`: processes of a bootstrap.
@@ -79,6 +80,26 @@ class Options:
             raise InputError(
                 f"the method {self.resolved} does not take stated weights; choose the method wls"
             )
+        if self.knows:
+            self._check_knowledge()
+
+    def _check_knowledge(self) -> None:
+        if self.resolved in ROBUST and self.resolved != "huber":
+            raise InputError(
+                f"the method {self.resolved} takes neither constraints nor a prior; use huber, or "
+                "the default method, which sets faulty readings apart"
+            )
+        valid = ("auto", "bootstrap") if self.resolved == "huber" else WITH_KNOWLEDGE
+        if self.intervals not in valid:
+            raise InputError(
+                f"--intervals {self.intervals} knows of neither constraints nor a prior; with "
+                f"these and this method there are {', '.join(valid)}"
+            )
+
+    @property
+    def knows(self) -> bool:
+        """Whether anything is stated beyond the readings."""
+        return self.prior is not None or self.constraints not in (None, Constraints())
 
     @property
     def resolved(self) -> str:

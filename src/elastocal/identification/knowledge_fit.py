@@ -1,0 +1,169 @@
+"""The method's fit again under constraints and with a prior: one more step on its weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from elastocal.errors import InputError
+from elastocal.identification.constrained.constraints import Constraints
+from elastocal.identification.constrained.minimise import ActiveConstraint
+from elastocal.identification.constrained.nonlinear import ConstrainedFit, constrained_fit
+from elastocal.identification.constrained.objective import Loss, loss_of
+from elastocal.identification.fit import Fit, FitProblem
+from elastocal.identification.heldout import held_out_residual
+from elastocal.identification.intervals import Intervals
+from elastocal.identification.knowledge_columns import fitted_columns, own_bounds
+from elastocal.identification.knowledge_intervals import intervals_with_knowledge
+from elastocal.identification.knowledge_local import Local
+from elastocal.identification.options import Options
+from elastocal.identification.reduction import Reduction
+from elastocal.identification.robust.scale import median_scale
+from elastocal.identification.solve import Progress, Solution, residual_sigma
+from elastocal.identification.triangle import Triangle
+
+Array = NDArray[np.float64]
+
+ROUNDING = 1e-9  # factors below this share of a typical size are no combination
+
+
+@dataclass(frozen=True)
+class KnowledgeFit:
+    """A solution under constraints and with a prior, its intervals, and what each contributed.
+
+    `prior_share` by parameter, empty without a prior; parameters that equalities fix are left
+    out.  `effective` is how many parameters the readings paid for, `leverage` (rows,) how much
+    each drew the fit to itself.
+    """
+
+    solution: Solution
+    intervals: Intervals
+    active: tuple[ActiveConstraint, ...]
+    prior_share: dict[str, float]
+    effective: int
+    leverage: Array
+
+
+def fit_with_knowledge(
+    solution: Solution, before: Intervals, options: Options, progress: Progress
+) -> KnowledgeFit:
+    """Minimise Σ ρ(W (y − h(X))) + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
+
+    W and the readings are those of the method's `solution`, σ the noise of a whitened row under
+    it, ρ squares or, for the method huber, Huber's loss.  `knowledge_columns` says what is fitted,
+    `knowledge_intervals` what the intervals are; t intervals have the degrees of freedom of
+    `before`, the method's own.
+
+    Raises InputError for constraints that contradict each other or held values, names that are no
+    parameters, and tables too large to hold B; InsufficientDataError where an equality names a
+    parameter that readings, prior and equalities do not determine.
+    """
+    problem = solution.problem
+    if problem.large:
+        raise InputError(
+            "constraints and priors need B as a whole, which a table of this size does not allow: "
+            "fit a part of the table, or --bounded for the physical bounds alone"
+        )
+    constraints = (options.constraints or Constraints()) + own_bounds(solution)
+    prior, name = options.prior, "huber" if options.resolved == "huber" else "squares"
+    size = problem.observations.size if name == "huber" else 1
+    sigma = _noise(solution, name, size)
+    columns = fitted_columns(solution, before.covariance.std, constraints, prior)
+    posed = replace(problem, bounded=False).fit_of(columns, solution.fit.x, solution.sizes)
+    progress("fitting under constraints" if prior is None else "fitting with the prior")
+    found = constrained_fit(posed, constraints, prior=prior, loss=name, sigma=sigma)  # type: ignore[arg-type]
+    loss: Loss = loss_of(name, size, sigma)  # type: ignore[arg-type]
+    local = Local.at(posed, found, constraints, prior, loss, sigma)
+    progress("intervals under constraints" if prior is None else "intervals with the prior")
+    intervals = intervals_with_knowledge(
+        posed, found, local, constraints, prior, _dof(solution, before, columns),
+        options.intervals, options.seed, options.jobs,
+    )  # fmt: skip
+    shares = {} if prior is None else dict(zip(found.names, local.prior_share, strict=True))
+    known = replace(
+        solution,
+        fit=_as_fit(posed, found, local),
+        reduction=_reduction(solution, found, local),
+        heldout=_held_out(solution, found, local),
+    )
+    return KnowledgeFit(
+        known, intervals, found.active,
+        {n: float(s) for n, s in shares.items() if np.isfinite(s)},
+        round(local.effective), local.leverage,
+    )  # fmt: skip
+
+
+def _noise(solution: Solution, loss: str, size: int) -> float:
+    """σ of a whitened row: of the residual, or for Huber's loss of its median length."""
+    fit = solution.fit
+    if loss == "squares":
+        return residual_sigma(fit, len(fit.columns))
+    lengths = np.linalg.norm(fit.whitened.reshape(-1, size), axis=1)
+    return max(median_scale(lengths, size), 1e-12)
+
+
+def _dof(solution: Solution, before: Intervals, columns: NDArray[np.int64]) -> Array:
+    """The method's degrees of freedom (columns,); its fewest for a parameter that it held."""
+    known = dict(zip(solution.fit.columns.tolist(), before.covariance.dof.tolist(), strict=True))
+    fewest = min(known.values())
+    return np.array([known.get(c, fewest) for c in columns.tolist()])
+
+
+def _as_fit(problem: FitProblem, found: ConstrainedFit, local: Local) -> Fit:
+    """As the fit of a method; its triangle has prior and equalities as further rows.
+
+    Without them a parameter that no reading shows would leave it singular; equalities weigh as
+    much as the readings of a parameter do.
+    """
+    A = local.system.A * local.unit
+    rows = np.vstack([local.B, local.P, A / np.linalg.norm(A, axis=1)[:, None] / local.unit])
+    rest = np.concatenate([local.e, local.lack, np.zeros(len(A))])
+    return Fit(
+        found.x, found.residual, found.whitened, Triangle.of(rows, rest), found.converged,
+        found.reason, found.steps, replace(problem, x=found.x),
+    )  # fmt: skip
+
+
+def _reduction(solution: Solution, found: ConstrainedFit, local: Local) -> Reduction:
+    """What is fitted, what is held, and how a held parameter's error would move the estimates.
+
+    A parameter that an active constraint holds back does not move: it stands for itself.
+    """
+    before, problem = solution.reduction, solution.problem
+    seen, columns = problem.observations, found.columns
+    dropped = np.setdiff1d(before.dropped, columns)
+    at = problem.model.regressor(seen.table, found.x, dropped, seen)
+    K = local.loss.root(problem.weights.apply(at.B), local.e)
+    mixing = local.on_face @ (local.K.T @ K)
+    share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
+    mixing[share < ROUNDING] = 0.0
+    return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))
+
+
+def _held_out(solution: Solution, found: ConstrainedFit, local: Local) -> Array:
+    """Residual (rows,) of each configuration under a fit to the others and the prior.
+
+    Linearised, with the active constraints kept active and Huber's weights as they are.
+    """
+    if not local.face.shape[1]:
+        return found.residual
+    seen, weights = solution.problem.observations, solution.problem.weights
+    # The prior's rows go with no configuration, so that they are never left out.
+    more = -len(local.P) % seen.size
+    P = np.vstack([local.P, np.zeros((more, len(local.x)))])
+    own = seen.configuration.max() + 1 + np.arange(len(P) // seen.size)
+    whiten = sparse.diags_array(np.sqrt(local.loss.weights(local.e)))
+    if weights.whiten is not None:
+        whiten = whiten @ weights.whiten
+    both = sparse.block_diag([whiten, sparse.eye_array(len(P))], format="csr")
+    held = held_out_residual(
+        np.vstack([found.B, P]) @ local.face,
+        np.concatenate([found.residual, local.lack, np.zeros(more)]),
+        replace(weights, whiten=sparse.csr_array(both)),
+        np.concatenate([seen.configuration, own]),
+        seen.size,
+    )
+    return held[: len(found.residual)]
