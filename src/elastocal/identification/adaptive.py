@@ -19,7 +19,7 @@ from elastocal.manipulator.observation import subset
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Refit = Callable[[Mask], Solution]
+Refit = Callable[[Mask, bool], Solution]  # of these observations, with wider sets tried
 
 ROUNDS = 6
 RESTARTS = 3
@@ -52,7 +52,7 @@ def adapt(
         if np.array_equal(found.good, good):
             break
         good = found.good
-        start = whole if good.all() else refit(good)
+        start = whole if good.all() else refit(good, True)
     return found
 
 

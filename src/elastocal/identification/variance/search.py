@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.variance.choose import NoiseFit, estimate_noise
-from elastocal.identification.variance.judge import beyond_noise
+from elastocal.identification.variance.judge import beyond_noise, own_noise
 from elastocal.identification.variance.readings import Readings
 
 Array = NDArray[np.float64]
@@ -35,25 +36,43 @@ def settle(readings: Readings, kind: str = "auto", good: Mask | None = None) -> 
     prediction from them (false-alarm rate 1 % for the whole table), and so on.  Starting from
     all, errors that hide each other may stay: start from a robust fit.  A set that comes back
     after others ends the search: readings that were good at any time of that round are kept.
+
+    Faulty readings that are taken back bend the fit, so that more of them seem to fit.  Where the
+    better half of all readings is left worse explained than by an earlier set, beyond what chance
+    allows, that set stands.
     """
     good = np.ones(len(readings), dtype=bool) if good is None else good
     noise = estimate_noise(readings.take(good), kind)
-    seen = [good]
+    own: Array = np.linalg.inv(own_noise(noise.fit, readings)[0])
+    visited = [(_misfit(noise, readings, own), good, noise)]
     for _ in range(ROUNDS):
         updated = ~beyond_noise(noise, readings, good, FALSE_ALARM)
         if np.array_equal(updated, good) or updated.mean() < FEWEST_GOOD:
             break
-        again = next((k for k, mask in enumerate(seen) if np.array_equal(mask, updated)), None)
+        masks = [mask for _, mask, _ in visited]
+        again = next((k for k, mask in enumerate(masks) if np.array_equal(mask, updated)), None)
         if again is not None:
-            updated = np.logical_or.reduce(seen[again:])
+            updated = np.logical_or.reduce(masks[again:])
         try:
             noise = estimate_noise(readings.take(updated), noise.kind)
         except ElastocalError:
             break  # so few readings cannot judge the others
         good = updated
+        visited.append((_misfit(noise, readings, own), good, noise))
         if again is not None:
             break
-        seen.append(good)
-    if len(seen) > 1 and kind == "auto":
+    last, best = visited[-1], min(visited, key=lambda v: v[0])
+    half = (len(readings) // 2 + 1) * readings.size
+    if last[0] > best[0] * stats.f.isf(FALSE_ALARM, half, half):
+        last = best
+    _, good, noise = last
+    if len(visited) > 1 and kind == "auto":
         noise = estimate_noise(readings.take(good), kind)
     return Verdict(noise, good)
+
+
+def _misfit(noise: NoiseFit, readings: Readings, precision: Array) -> float:
+    """Sum of the smaller half of the squared residuals, in units of `precision` (N, size, size)."""
+    r = readings.e - readings.B @ noise.x
+    squared = np.einsum("ni,nij,nj->n", r, precision, r)
+    return float(np.sort(squared)[: len(squared) // 2 + 1].sum())
