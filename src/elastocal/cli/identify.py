@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -21,6 +22,7 @@ from elastocal.cli.app import (
 from elastocal.errors import InputError
 
 if TYPE_CHECKING:
+    from elastocal.identification.knowledge import Knowledge
     from elastocal.manipulator.model import Model
     from elastocal.measurements import Measurements
 
@@ -74,6 +76,17 @@ def identify(
     bounded: Annotated[
         bool, typer.Option("--bounded", help="Keep parameters inside their physical bounds.")
     ] = False,
+    knowledge: Annotated[
+        Path | None,
+        typer.Option(help="What is known besides: priors, bounds, equalities (TOML)."),
+    ] = None,
+    physical: Annotated[
+        bool,
+        typer.Option(
+            "--physical",
+            help="Demand what physics does: no negative compliance, none gains energy.",
+        ),
+    ] = False,
     outliers: Annotated[
         str,
         typer.Option(
@@ -112,12 +125,16 @@ def identify(
         seed=seed,
         jobs=jobs,
     )
+    known = _read_knowledge(knowledge, physical)
     check_outputs(output, report, residuals)
     with progress_line(quiet) as progress:
         progress("reading")
         model, tables = _load(cell, [data] if test is None else [data, test])
+        if known is not None:
+            constraints, prior = known.of(model)
+            chosen = replace(chosen, constraints=constraints, prior=prior)
         result = run(model, tables[0], chosen, None if test is None else tables[1], progress)
-        inputs = [p for p in (cell, data, test, covariance) if p is not None]
+        inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
         write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
         typer.echo(json.dumps(result.to_json(), indent=1))
@@ -151,6 +168,16 @@ def _load(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]
     ]
     names: tuple[str, ...] = tuple(dict.fromkeys(m for t in tables for m in t.marker_names))
     return Model.from_cell(cell, names), tables
+
+
+def _read_knowledge(path: Path | None, physical: bool) -> Knowledge | None:
+    """What the file and the flag state together; None where neither was given."""
+    from elastocal.identification.knowledge import Knowledge, read_knowledge
+
+    if path is None:
+        return Knowledge(physical=True, source="--physical") if physical else None
+    known = read_knowledge(path)
+    return replace(known, physical=known.physical or physical)
 
 
 def _read_covariance(path: Path) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
@@ -35,7 +37,8 @@ def summarise(
     """
     solution, final = found.solution, found.solution.fit
     kept = solution.reduction.kept
-    sigma = residual_sigma(final, len(kept))
+    spent = len(kept) if found.effective is None else found.effective
+    sigma = residual_sigma(final, spent)
     estimates, combinations = _estimates(model, solution, found.intervals)
     determined = tuple(model.names[c] for c in kept)
     seen = solution.problem.observations
@@ -55,7 +58,7 @@ def summarise(
         residual=final.residual,
         held_out=solution.heldout,
         sigma=sigma,
-        dof=len(final.whitened) - len(kept),
+        dof=len(final.whitened) - spent,
         residual_rms=rms_3d(final.residual, seen.size),
         heldout_rms=rms_3d(solution.heldout, seen.size),
         nominal_rms=solution.nominal_rms,
@@ -64,16 +67,21 @@ def summarise(
         outliers=() if set_apart else beyond,
         excluded=beyond if set_apart else (),
         warnings=(),
-        residual_summary=_residual_summary(solution),
+        residual_summary=_residual_summary(solution, found.leverage),
+        active=found.active,
+        prior_share=found.prior_share,
     )
-    return warnings_for(result, solution)
+    result = warnings_for(result, solution)
+    return replace(result, warnings=found.warnings + result.warnings)
 
 
-def _residual_summary(solution: Solution) -> ResidualSummary | None:
-    """The whitened residuals against what the noise model says of them."""
+def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSummary | None:
+    """The whitened residuals against what the noise model says of them.
+
+    `leverage` (rows,) of the fit, where it is not that of its B alone.
+    """
     problem, fit = solution.problem, solution.fit
-    leverage = None
-    if not problem.large:
+    if leverage is None and not problem.large:
         R = fit.triangle.R[: len(fit.columns)]
         Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
         leverage = np.minimum((Q**2).sum(axis=0), 1.0)
@@ -133,7 +141,9 @@ def _estimates(
 def _correlations(covariance: Array, names: tuple[str, ...]) -> tuple[tuple[str, str, float], ...]:
     """Pairs with |ρ| over 0.9, strongest first."""
     std = np.sqrt(np.diag(covariance))
-    rho = covariance / np.outer(std, std)
+    known = np.outer(std, std)
+    # A value that equalities fix varies with nothing.
+    rho = np.divide(covariance, known, out=np.zeros_like(known), where=known > 0)
     i, j = np.triu_indices(len(names), k=1)
     strong = [(a, b) for a, b in zip(i, j, strict=True) if abs(rho[a, b]) > CORRELATED]
     strong.sort(key=lambda ab: -abs(rho[ab]))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import require
+from elastocal.errors import InsufficientDataError, require
 from elastocal.identification.constrained.constraints import (
     Bounds,
     Constraints,
@@ -17,14 +17,15 @@ from elastocal.identification.constrained.constraints import (
     combination,
 )
 from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.identification.selection import WORTH_A_COLUMN
 from elastocal.identification.solve import Solution
 from elastocal.nearest import listed, quoted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Share of a column that others must leave over for readings, prior and equalities to tell it from
-# them.  B is exact to 1e-15; what a weak prior adds to a dependent column is a smaller share yet.
+# Share of a column that others must leave over: B is exact to 1e-15, but a base that is tilted by
+# some µrad already tells its turn from that of joint 1.
 TOLD_APART = 1e-6
 
 
@@ -36,65 +37,72 @@ def fitted_columns(
     These are the kept parameters of the solution (and those that bounds held); the free ones that
     the prior or an equality names, for that is knowledge of themselves; and, of the parameters
     that are known only together with one of these, as many as can now be told apart from it: with
-    a prior on k, readings of k + d are knowledge of d.  Bounds and matrices make nothing
-    estimable: they act on the fitted parameters, with all others held where the fit held them.
+    a prior on k, readings of k + d are knowledge of d.  Told apart is what readings, prior and
+    equalities determine better than its typical size, as in the choice of the kept parameters.
+    Bounds and matrices make nothing known: they act on the fitted parameters, with all others
+    held where the fit held them.
 
     `std` (kept,) is that of the solution's estimates.  Raises InputError for a name that is no
-    parameter, or a prior on a parameter that is held fixed.
+    parameter, or a prior on a parameter that is held fixed; InsufficientDataError where an
+    equality names a parameter that stays undetermined.
     """
     problem, reduction = solution.problem, solution.reduction
     names, free = problem.model.names, set(problem.free.tolist())
     constraints.resolve(names)
-    wanted = {name for e in constraints.equalities for name, factor in e.terms.items() if factor}
+    tied = {name for e in constraints.equalities for name, factor in e.terms.items() if factor}
+    priors = set() if prior is None else set(prior.names)
     if prior is not None:
         prior.rows(names)
-        fixed = [quoted(n) for n in prior.names if names.index(n) not in free]
-        require(
-            not fixed,
-            f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the "
-            "fixing",
-        )
-        wanted |= set(prior.names)
-    named = {names.index(n) for n in wanted} & free
+    fixed = [quoted(n) for n in sorted(priors) if names.index(n) not in free]
+    require(
+        not fixed,
+        f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
+    )
+    named = {names.index(n) for n in tied | priors} & free
     columns = {*reduction.kept.tolist(), *reduction.at_bound.tolist(), *named}
-    if not named:
-        return np.array(sorted(columns), dtype=np.int64)
+
+    def told_apart(c: int) -> bool:
+        return _told_apart(solution, [*sorted(columns - {c}), c], constraints, prior)
+
+    new = {names.index(n) for n in tied - priors} & free - set(reduction.kept.tolist())
+    unknown = [quoted(names[c]) for c in sorted(new) if not told_apart(c)]
+    if unknown:
+        raise InsufficientDataError(
+            f"readings, prior and equalities do not determine {listed(unknown)}, which an equality "
+            "names; hold it (--fix) or state a prior for it, or drop the equality"
+        )
     partners: dict[int, None] = {}
     for k, c in enumerate(reduction.kept.tolist()):
         if c in named:
             partners |= dict.fromkeys(reduction.terms(k, solution.sizes, std[k]))
     for d in partners:
-        if d not in columns and _told_apart(solution, sorted(columns), d, constraints, prior):
+        if d not in columns and told_apart(d):
             columns.add(d)
     return np.array(sorted(columns), dtype=np.int64)
 
 
 def _told_apart(
-    solution: Solution,
-    columns: list[int],
-    new: int,
-    constraints: Constraints,
-    prior: GaussianPrior | None,
+    solution: Solution, columns: list[int], constraints: Constraints, prior: GaussianPrior | None
 ) -> bool:
-    """Whether readings, prior and equalities together tell `new` from the columns."""
-    problem, seen = solution.problem, solution.problem.observations
-    chosen = np.array([*columns, new])
+    """Whether readings, prior and equalities tell the last of the columns from the others."""
+    problem, seen, e = solution.problem, solution.problem.observations, solution.fit.whitened
+    chosen = np.array(columns)
+    size, names = solution.sizes[chosen], problem.model.names
     at = problem.model.regressor(seen.table, solution.fit.x, chosen, seen)
-    parts = [problem.weights.apply(at.B)]
+    sigma = max(float(np.sqrt(e @ e / len(e))), 1e-12)
+    J = problem.weights.apply(at.B) * size / sigma
     if prior is not None:
-        rows = prior.rows(problem.model.names)[0][:, chosen]
-        e = solution.fit.whitened
-        parts.append(float(np.sqrt(e @ e / len(e))) * rows)
-    J = np.vstack(parts) * solution.sizes[chosen]
-    A = constraints.resolve(problem.model.names).A[:, chosen] * solution.sizes[chosen]
+        J = np.vstack([J, prior.rows(names)[0][:, chosen] * size])
+    A = constraints.resolve(names).A[:, chosen] * size
     A = A[A.any(axis=1)]
-    # An equality is exact: it counts as much as anything that the readings tell.
+    # An equality is exact: it counts as much as the most that anything else tells.
     A *= np.linalg.norm(J, axis=0).max() / np.linalg.norm(A, axis=1)[:, None]
     J = np.vstack([J, A])
     lengths = np.linalg.norm(J, axis=0)
     J = J / np.where(lengths > 0, lengths, 1.0)
     left = J[:, -1] - J[:, :-1] @ np.linalg.lstsq(J[:, :-1], J[:, -1], rcond=None)[0]
-    return bool(lengths[-1] > 0 and np.linalg.norm(left) > TOLD_APART)
+    off = float(np.linalg.norm(left))
+    return off > TOLD_APART and off * lengths[-1] > WORTH_A_COLUMN
 
 
 def own_bounds(solution: Solution) -> Constraints:

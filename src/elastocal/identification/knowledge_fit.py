@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import sparse, stats
 
 from elastocal.errors import InputError
 from elastocal.identification.constrained.constraints import Constraints
@@ -24,10 +24,12 @@ from elastocal.identification.reduction import Reduction
 from elastocal.identification.robust.scale import median_scale
 from elastocal.identification.solve import Progress, Solution, residual_sigma
 from elastocal.identification.triangle import Triangle
+from elastocal.nearest import listed
 
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-9  # factors below this share of a typical size are no combination
+CONTRADICTED = 0.001  # false-alarm rate of a sentence that doubts what the user knows
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class KnowledgeFit:
 
     `prior_share` by parameter, empty without a prior; parameters that equalities fix are left
     out.  `effective` is how many parameters the readings paid for, `leverage` (rows,) how much
-    each drew the fit to itself.
+    each drew the fit to itself.  `warnings` say where the readings contradict the knowledge.
     """
 
     solution: Solution
@@ -45,6 +47,7 @@ class KnowledgeFit:
     prior_share: dict[str, float]
     effective: int
     leverage: Array
+    warnings: tuple[str, ...]
 
 
 def fit_with_knowledge(
@@ -92,7 +95,7 @@ def fit_with_knowledge(
     return KnowledgeFit(
         known, intervals, found.active,
         {n: float(s) for n, s in shares.items() if np.isfinite(s)},
-        round(local.effective), local.leverage,
+        round(local.effective), local.leverage, _contradiction(solution, before, found, local),
     )  # fmt: skip
 
 
@@ -103,6 +106,32 @@ def _noise(solution: Solution, loss: str, size: int) -> float:
         return residual_sigma(fit, len(fit.columns))
     lengths = np.linalg.norm(fit.whitened.reshape(-1, size), axis=1)
     return max(median_scale(lengths, size), 1e-12)
+
+
+def _contradiction(
+    solution: Solution, before: Intervals, found: ConstrainedFit, local: Local
+) -> tuple[str, ...]:
+    """A sentence where the objective grew by more than noise explains (F-test), for squares.
+
+    Rows of the prior and active constraints count as degrees of freedom, less the parameters they
+    made estimable.  At active bounds the true distribution is smaller (χ̄²): the test is cautious.
+    """
+    stated = len(local.P) + len(found.active) - (len(found.columns) - len(solution.fit.columns))
+    if stated < 1 or not local.loss.quadratic:
+        return ()
+    grown = found.objective - float(solution.fit.whitened @ solution.fit.whitened)
+    dof = max(float(before.covariance.dof.min()), 1.0)
+    F = max(grown, 0.0) / (stated * local.sigma**2)
+    p = float(stats.f.sf(F, stated, dof) if np.isfinite(dof) else stats.chi2.sf(F * stated, stated))
+    if p > CONTRADICTED:
+        return ()
+    what = [f"'{a.label}'" for a in found.active]
+    what += ["the prior"] if len(local.P) else []
+    return (
+        f"The readings contradict {listed(what, 6)}: without, they are fitted better than noise "
+        f"explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). Check "
+        "names, units and signs of what is stated, and whether the model lacks an effect.",
+    )
 
 
 def _dof(solution: Solution, before: Intervals, columns: NDArray[np.int64]) -> Array:

@@ -62,8 +62,8 @@ def intervals_with_knowledge(
         name, text = _posterior(prior, local)
         covariance = Covariance(name, matrix, dof, text)
         ci95 = covariance.interval(local.x, LEVEL)
-        ends = local.system.lower[:, None], local.system.upper[:, None]
-        return Intervals(covariance, np.clip(ci95, *ends))
+        lower, upper = local.system.lower[:, None], local.system.upper[:, None]
+        return Intervals(covariance, np.clip(ci95, lower, upper))
     names = problem.model.names
     held = {n: float(v) for n, v in zip(names, found.x, strict=True) if n not in local.names}
     if kind == "bootstrap":

@@ -101,12 +101,13 @@ class Local:
     @cached_property
     def cofactor(self) -> Array:
         """(NᵀKᵀK N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
-        return self._within(self.equalities)
+        half = self._half(self.equalities)
+        return half.T @ half
 
     @cached_property
     def on_face(self) -> Array:
         """The same with every active constraint taken for an equality."""
-        return self._within(self.face)
+        return self._half_on_face.T @ self._half_on_face
 
     @property
     def covariance(self) -> Array:
@@ -122,12 +123,12 @@ class Local:
     @property
     def effective(self) -> float:
         """How many parameters' worth the readings determine: tr(cofactor KᵀK) on the face."""
-        return self.face.shape[1] - float(np.einsum("ki,ij,kj", self.P, self.on_face, self.P))
+        return self.face.shape[1] - float(((self._half_on_face @ self.P.T) ** 2).sum())
 
     @property
     def leverage(self) -> Array:
         """Diagonal (rows,) of K cofactor Kᵀ on the face, at most 1."""
-        return np.minimum(np.einsum("ri,ij,rj->r", self.K, self.on_face, self.K, optimize=True), 1)
+        return np.minimum(((self.K @ self._half_on_face.T) ** 2).sum(axis=1), 1.0)
 
     @cached_property
     def triangle(self) -> tuple[Array, Array]:
@@ -139,9 +140,14 @@ class Local:
         z = np.linalg.lstsq(R.T, gradient, rcond=None)[0]
         return R / self.unit, z + R @ (self.x / self.unit)
 
-    def _within(self, basis: Array) -> Array:
+    @cached_property
+    def _half_on_face(self) -> Array:
+        return self._half(self.face)
+
+    def _half(self, basis: Array) -> Array:
+        """H (q, columns) with HᵀH the cofactor within the basis (columns, q)."""
         rows = np.vstack([self.K, self.P]) @ basis
         R = linalg.qr(rows, mode="r")[0][: basis.shape[1]]
         half = linalg.solve_triangular(R, basis.T, trans="T") if R.size else basis.T
         half[:, np.linalg.norm(half / self.unit, axis=0) <= PINNED] = 0.0
-        return np.asarray(half.T @ half)
+        return np.asarray(half)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,11 @@ from scipy import sparse
 from elastocal.errors import InputError
 from elastocal.identification import published
 from elastocal.identification.adaptive import Refit, adapt, adapt_all, refined
+from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.covariance.estimate import Covariance
 from elastocal.identification.heldout import held_out_residual
 from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
+from elastocal.identification.knowledge_fit import fit_with_knowledge
 from elastocal.identification.noise import Weights
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.robust.nonlinear import robust_fit
@@ -32,7 +34,11 @@ MOST_SET_ASIDE = 0.1
 class Found:
     """The final fit, its intervals, and the noise where it was estimated.
 
-    Readings that are not `good` (N,) lie beyond the noise; they may still have a part in the fit.
+    Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
+    fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
+    many parameters the readings paid for (`effective`), `leverage` (rows,), and `warnings` where
+    the readings contradict them; in a fit to readings alone effective and leverage follow from
+    the solution.
     """
 
     method: str
@@ -40,6 +46,11 @@ class Found:
     intervals: Intervals
     noise: NoiseFit | None
     good: Mask
+    active: tuple[ActiveConstraint, ...] = ()
+    prior_share: dict[str, float] = field(default_factory=dict)
+    effective: int | None = None
+    leverage: Array | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def run_method(
@@ -53,7 +64,28 @@ def run_method(
     """Carry out `options.method` from the fit to all observations and that to the good ones.
 
     `clean` is the fit to the observations that are not `faulty` (N,), `refit` makes another such.
+    Constraints and prior come last, on the weights and the readings that the method ends with.
     """
+    if not options.knows:
+        return _by_readings(whole, clean, faulty, refit, options, progress)
+    alone = replace(options, constraints=None, prior=None, intervals="auto")
+    found = _by_readings(whole, clean, faulty, refit, alone, progress)
+    known = fit_with_knowledge(found.solution, found.intervals, options, progress)
+    return Found(
+        "constrained", known.solution, known.intervals, found.noise, found.good,
+        known.active, known.prior_share, known.effective, known.leverage, known.warnings,
+    )  # fmt: skip
+
+
+def _by_readings(
+    whole: Solution,
+    clean: Solution,
+    faulty: Mask,
+    refit: Refit,
+    options: Options,
+    progress: Progress,
+) -> Found:
+    """What the method makes of the readings alone."""
     method = options.resolved
     if method == "reml" and not whole.problem.large:
         return _reml(whole, clean, faulty, refit, options, progress)

@@ -37,10 +37,10 @@ class Options:
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
     `bounded`: keep parameters inside their physical bounds.  `constraints` and `prior`: a
-    constrained or regularised fit on top of the method's weights (knowledge_fit).  `faulty`: readings beyond the
-    noise are set apart (auto: unless they are too many to be reading errors), always, or never;
-    they are listed in the result in any case.  `seed`: of multi-start, searches and bootstraps;
-    `jobs`: processes of a bootstrap.
+    constrained or regularised fit on top of the method's weights (knowledge_fit).  `faulty`:
+    readings beyond the noise are set apart (auto: unless they are too many to be reading errors),
+    always, or never; they are listed in the result in any case.  `seed`: of multi-start, searches
+    and bootstraps; `jobs`: processes of a bootstrap.
     """
 
     method: Method = "auto"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import COMPONENTS, Observations
@@ -99,6 +100,9 @@ class IdentificationResult:
     `residual` (rows,) observed minus predicted in m (rad); `held_out` the same with each
     configuration predicted by a fit to the others.  `sigma` is the residual's standard
     deviation per whitened row (in m where unit weights were used), with `dof` degrees of freedom.
+    `active` are the constraints that hold with equality; `prior_share` says by parameter what
+    share of its information the prior gave, 0 to 1 (empty without a prior; parameters that
+    equalities fix are left out).
     """
 
     model: Model
@@ -125,6 +129,8 @@ class IdentificationResult:
     warnings: tuple[str, ...]
     test: TestErrors | None = None
     residual_summary: ResidualSummary | None = None
+    active: tuple[ActiveConstraint, ...] = ()
+    prior_share: dict[str, float] = field(default_factory=dict)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
@@ -219,6 +225,12 @@ class IdentificationResult:
             "residual_summary": (
                 None if self.residual_summary is None else self.residual_summary.to_json()
             ),
+            "active": [
+                {"label": a.label, "kind": a.kind, "parameters": list(a.names),
+                 "value": a.value, "multiplier": a.multiplier}
+                for a in self.active
+            ],
+            "prior_share": self.prior_share,
             "converged": self.converged,
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],

@@ -43,7 +43,7 @@ def settle(readings: Readings, kind: str = "auto", good: Mask | None = None) -> 
     """
     good = np.ones(len(readings), dtype=bool) if good is None else good
     noise = estimate_noise(readings.take(good), kind)
-    own: Array = np.linalg.inv(own_noise(noise.fit, readings)[0])
+    own = np.asarray(np.linalg.inv(own_noise(noise.fit, readings)[0]), dtype=np.float64)
     visited = [(_misfit(noise, readings, own), good, noise)]
     for _ in range(ROUNDS):
         updated = ~beyond_noise(noise, readings, good, FALSE_ALARM)
