@@ -84,7 +84,7 @@ def identify(
         bool,
         typer.Option(
             "--physical",
-            help="Demand what physics does: no negative compliance, none gains energy.",
+            help="No negative compliance, no compliance matrix that yields energy.",
         ),
     ] = False,
     outliers: Annotated[

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.identification.advice import warnings_for
+from elastocal.identification.faulty_report import report_faulty
 from elastocal.identification.heldout import rms_3d
 from elastocal.identification.intervals import Intervals
 from elastocal.identification.methods import Found
@@ -29,11 +30,12 @@ CORRELATED = 0.9
 
 
 def summarise(
-    model: Model, whole: Solution, found: Found, beyond: tuple[Outlier, ...]
+    model: Model, whole: Solution, clean: Solution, found: Found, beyond: tuple[Outlier, ...]
 ) -> IdentificationResult:
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
-    `beyond` are the readings beyond the noise: set apart where the method did so, else only listed.
+    `whole` holds all readings, `clean` the fit to those that agree.  `beyond` are the readings
+    beyond the noise: set apart where the method did so, else only listed.
     """
     solution, final = found.solution, found.solution.fit
     kept = solution.reduction.kept
@@ -68,6 +70,9 @@ def summarise(
         excluded=beyond if set_apart else (),
         warnings=(),
         residual_summary=_residual_summary(solution, found.leverage),
+        faulty_report=report_faulty(
+            whole, found.solution if set_apart else clean, found.noise, found.good
+        ),
         active=found.active,
         prior_share=found.prior_share,
     )

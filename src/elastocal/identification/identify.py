@@ -69,7 +69,7 @@ def identify(
     found = run_method(whole, clean, faulty, refit, options, progress)
     progress("intervals and held-out residuals")
     beyond = describe(whole, found.solution, ~found.good)
-    result = summarise(model, whole, found, beyond)
+    result = summarise(model, whole, clean, found, beyond)
     return result if test is None else replace(result, test=_test_errors(model, result.x, test))
 
 

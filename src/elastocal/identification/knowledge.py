@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -34,7 +34,7 @@ class Knowledge:
     """
 
     physical: bool = False
-    constraints: Constraints = Constraints()  # noqa: RUF009  (frozen)
+    constraints: Constraints = field(default_factory=Constraints)
     prior: GaussianPrior | None = None
     source: str = "knowledge"
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.chunked import evaluate, residual_at
 from elastocal.identification.judgement import FALSE_ALARM, judge, verdict
+from elastocal.identification.outlier import Outlier, blocks
 from elastocal.identification.partition import part_of, sample
-from elastocal.identification.result import Outlier
 from elastocal.identification.solve import SAMPLE, Solution, is_placed, settle
 from elastocal.identification.trimmed import majority, median_scale
 
@@ -113,14 +113,3 @@ def describe(solution: Solution, fitted: Solution, faulty: Mask) -> tuple[Outlie
         )
         for k in np.flatnonzero(faulty)
     )
-
-
-def blocks(lines: list[int], gap: int = 3) -> list[tuple[int, int]]:
-    """Runs of faulty lines, (first, last), bridging gaps of up to `gap` lines."""
-    runs: list[tuple[int, int]] = []
-    for line in sorted(lines):
-        if runs and line - runs[-1][1] <= gap:
-            runs[-1] = (runs[-1][0], line)
-        else:
-            runs.append((line, line))
-    return runs

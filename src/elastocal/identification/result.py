@@ -9,13 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.identification.constrained.minimise import ActiveConstraint
+from elastocal.identification.outlier import Outlier
 from elastocal.identification.residual_summary import ResidualSummary
+from elastocal.identification.robust.report import OutlierReport
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import COMPONENTS, Observations
 
 Array = NDArray[np.float64]
 
 SCHEMA = "elastocal/identification/1"
+LOPSIDED = 0.1  # difference of the halves of an interval that one half width cannot tell
 
 
 @dataclass(frozen=True)
@@ -81,17 +84,6 @@ class TestErrors:
 
 
 @dataclass(frozen=True)
-class Outlier:
-    """A reading whose residual lies beyond what the noise explains."""
-
-    line: int
-    configuration: str
-    marker: str
-    residual: float
-    ratio: float
-
-
-@dataclass(frozen=True)
 class IdentificationResult:
     """What `identify` found.
 
@@ -129,6 +121,7 @@ class IdentificationResult:
     warnings: tuple[str, ...]
     test: TestErrors | None = None
     residual_summary: ResidualSummary | None = None
+    faulty_report: OutlierReport | None = None
     active: tuple[ActiveConstraint, ...] = ()
     prior_share: dict[str, float] = field(default_factory=dict)
 
@@ -160,8 +153,7 @@ class IdentificationResult:
         ]
         for e in self.estimates:
             if e.value is not None and e.ci95 is not None:
-                half = (e.ci95[1] - e.ci95[0]) / 2
-                lines.append(f"{e.name:32s} {e.value:13.6g} ± {half:.2g} {e.unit}")
+                lines.append(f"{e.name:32s} {e.value:13.6g} {_interval(e.value, e.ci95)} {e.unit}")
             else:
                 lines.append(f"{e.name:32s} {'–':>13s}   {e.note}")
         lines += [
@@ -231,6 +223,9 @@ class IdentificationResult:
                 for a in self.active
             ],
             "prior_share": self.prior_share,
+            "faulty_report": (
+                None if self.faulty_report is None else self.faulty_report.named(self.determined)
+            ),
             "converged": self.converged,
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
@@ -247,6 +242,14 @@ def _estimate_json(e: Estimate) -> dict[str, Any]:
         "combined_with": list(e.combined_with), "nominal": e.nominal, "held": e.held,
         "note": e.note,
     }  # fmt: skip
+
+
+def _interval(value: float, ci95: tuple[float, float]) -> str:
+    """ "± half width", or both ends of an interval that is not symmetric about the value."""
+    below, above = value - ci95[0], ci95[1] - value
+    if abs(above - below) <= LOPSIDED * max(above, below):
+        return f"± {(below + above) / 2:.2g}"
+    return f"[{ci95[0]:.3g}, {ci95[1]:.3g}]"
 
 
 def _finite(value: float) -> float | None:

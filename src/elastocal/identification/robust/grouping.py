@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from elastocal.identification.outliers import blocks
-from elastocal.identification.robust.estimate import RobustEstimate
-from elastocal.identification.robust.screening import CleanFit, GroupTest, Mask, screened
+from elastocal.identification.outlier import blocks
+from elastocal.identification.robust.screening import CleanFit, GroupTest, Mask
 
 Level = Literal["reading", "marker", "configuration", "block"]
 
@@ -37,7 +36,8 @@ def groups_of(level: Level, labels: NDArray[Any]) -> list[Group]:
 
 
 def accepted_groups(
-    found: RobustEstimate,
+    clean_fit: Callable[[Mask], CleanFit],
+    n: int,
     groups: list[Group],
     lines: NDArray[np.int64],
     adjust: dict[Level, int],
@@ -48,13 +48,13 @@ def accepted_groups(
 
     One at a time, the one that explains most first, as long as a majority is left.  `adjust`
     holds the number of tests that a p-value of each level is multiplied by; runs of `lines` (n,)
-    are tried where it has "block".
+    are tried where it has "block".  `clean_fit` makes the fit to the good ones among those (n,)
+    that are still in question.
     """
-    n = found.design.n
     active = np.ones(n, dtype=bool)
     accepted: list[tuple[Group, GroupTest, int]] = []
     while True:
-        fit = screened(found, active, false_alarm / adjust["reading"])
+        fit = clean_fit(active)
         runs = _runs(fit, active, lines) if "block" in adjust else []
         tested = _tested(fit, active, groups + runs, adjust, false_alarm)
         significant = [t for t in tested if t[1].p_value * adjust[t[0].level] < false_alarm]

@@ -15,16 +15,19 @@ it was seen in.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.errors import require
+from elastocal.identification.robust.design import Design, design
 from elastocal.identification.robust.grouping import Group, Level, accepted_groups, groups_of
-from elastocal.identification.robust.mm_estimate import mm_estimate
-from elastocal.identification.robust.screening import CleanFit, Mask
+from elastocal.identification.robust.mm_estimate import mm_of
+from elastocal.identification.robust.screening import CleanFit, Mask, screened
 
 Array = NDArray[np.float64]
 
@@ -88,6 +91,13 @@ class OutlierReport:
             "false_alarm": self.false_alarm,
         }
 
+    def named(self, names: Sequence[str]) -> dict[str, Any]:
+        """As `to_json`, with the name of the parameter that each finding moves most."""
+        found = self.to_json()
+        for entry in found["findings"]:
+            entry["moves_most"] = names[entry.pop("column")]
+        return found
+
 
 def outlier_report(
     B: ArrayLike,
@@ -98,19 +108,22 @@ def outlier_report(
     configuration: ArrayLike | None = None,
     line: ArrayLike | None = None,
     seed: int = 0,
+    good: Mask | None = None,
     false_alarm: float = FALSE_ALARM,
 ) -> OutlierReport:
     """Find what is beyond the noise in y (n·size,) ≈ B (n·size, p) x, whitened.
 
     `marker` and `configuration` (n,) labels, `line` (n,) integer line of each observation (by
     default its number); a level without labels is not tested, and neither are groups of a single
-    reading or of half the table.  `seed` fixes the search of the MM-estimate.
+    reading or of half the table.  `seed` fixes the search of the MM-estimate, `good` (n,) says
+    which observations to rely on where that is known already; then nothing is searched for, and
+    what is reported are the others, alone or as groups.
 
     Raises InputError for wrong shapes or dependent columns.
     """
     require(0 < false_alarm < 0.5, f"false_alarm lies between 0 and 0.5; found {false_alarm}")
-    found = mm_estimate(B, y, size=size, seed=seed)
-    n = found.design.n
+    problem = design(B, y, size)
+    n = problem.n
     lines = np.arange(n) if line is None else _labels("line", line, n)
     require(np.issubdtype(lines.dtype, np.integer), "line must hold integers")
     groups: list[Group] = []
@@ -125,7 +138,12 @@ def outlier_report(
         tests["block"] = n * (n + 1) // 2
     adjust = {level: count * len(tests) for level, count in tests.items()}
 
-    fit, accepted = accepted_groups(found, groups, lines, adjust, false_alarm)
+    if good is None:
+        found, limit = mm_of(problem, seed), false_alarm / adjust["reading"]
+        chosen = partial(screened, found, limit=limit)
+    else:
+        chosen = partial(_known, problem, good)
+    fit, accepted = accepted_groups(chosen, n, groups, lines, adjust, false_alarm)
     findings = []
     active = np.ones(n, dtype=bool)
     for group, test, beyond in accepted:
@@ -142,9 +160,13 @@ def outlier_report(
         findings.append(_finding(fit, alone, lines, 1, p, None))
     findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
     return OutlierReport(
-        tuple(findings), found.design.parameters(fit.z), fit.sigma, fit.dof, fit.good,
+        tuple(findings), problem.parameters(fit.z), fit.sigma, fit.dof, fit.good,
         {str(level): count for level, count in tests.items()}, false_alarm,
     )  # fmt: skip
+
+
+def _known(problem: Design, good: Mask, active: Mask) -> CleanFit:
+    return CleanFit(problem, good & active)
 
 
 def _finding(

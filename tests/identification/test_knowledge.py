@@ -1,0 +1,580 @@
+"""Constraints and priors in the whole identification, and the file that states them."""
+
+import json
+import re
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from support.calibration import binomial_band, measured, with_values
+from support.cells import DOWN, SLANTED, TABLE_2, kr270_cell, table_of
+
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError
+from elastocal.identification import partition
+from elastocal.identification.constrained.constraints import (
+    Bounds,
+    Constraints,
+    LinearEquality,
+    SemidefiniteMatrix,
+    equal,
+    non_negative,
+)
+from elastocal.identification.constrained.physical import physical_constraints
+from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.identification.identify import identify
+from elastocal.identification.knowledge import Knowledge, read_knowledge
+from elastocal.identification.knowledge_columns import on_columns
+from elastocal.identification.knowledge_intervals import degrees_of_freedom
+from elastocal.identification.options import Options
+from elastocal.manipulator.model import Model
+from elastocal.measurements import Measurements
+
+SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise
+BEARING_X, BEARING_Y = "joint2.off_axis_compliance_x", "joint2.off_axis_compliance_y"
+DOCS = Path(__file__).parents[2] / "docs" / "file-formats.md"
+
+
+@lru_cache
+def bearings() -> Model:
+    """Six drives and the bearing of joint 2, whose true compliance is zero."""
+    effects = ("joint_compliance", "off_axis_compliance:joint2")
+    return Model.from_cell(kr270_cell(effects, observe="deflection"))
+
+
+@lru_cache
+def drives(deflection_model: str = "equilibrium") -> Model:
+    """Six drives; the first cannot be seen under a vertical load."""
+    cell = kr270_cell(
+        ("joint_compliance",), observe="deflection", deflection_model=deflection_model
+    )
+    return Model.from_cell(cell)
+
+
+@lru_cache
+def placed() -> Model:
+    """An arm at a free base with an unknown marker: base.rz and joint 1 turn alike."""
+    return Model.from_cell(kr270_cell(("base_frame", "joint_offset")))
+
+
+def readings(model: Model, seed: int, force=DOWN, **values: float) -> Measurements:
+    truth = with_values(model, values)
+    plan = table_of(TABLE_2, np.asarray(force, dtype=float), both=model.observe == "deflection")
+    return measured(model, plan, truth, SIGMA / 2**0.5, np.random.default_rng(seed))
+
+
+@lru_cache
+def negative() -> Measurements:
+    """Readings whose least-squares estimate of BEARING_X is negative."""
+    return readings(bearings(), 0, SLANTED)
+
+
+@lru_cache
+def by_physics(**options):
+    return identify(
+        bearings(), negative(), Options(constraints=physical_constraints(bearings()), **options)
+    )
+
+
+def prior_of(**stated: tuple[float, float]) -> GaussianPrior:
+    names = tuple(name.replace("__", ".") for name in stated)
+    return GaussianPrior.independent(names, *zip(*stated.values(), strict=True))
+
+
+# --- physics ----------------------------------------------------------------------------------
+
+
+def test_a_negative_compliance_is_reported_at_its_bound_with_a_one_sided_interval():
+    alone = identify(bearings(), negative(), Options())
+    assert alone.estimate(BEARING_X).value < 0
+    found = by_physics()
+    at_bound = found.estimate(BEARING_X)
+    assert found.method == "constrained" and found.converged
+    assert (at_bound.value, at_bound.ci95[0]) == (0.0, 0.0) and at_bound.identifiable
+    assert 0 < at_bound.ci95[1] < 3 * at_bound.std
+    assert all(found.estimate(n).value >= 0 for n in bearings().names)
+    (active,) = found.active
+    assert (active.label, active.kind, active.names) == (f"{BEARING_X} >= 0", "lower", (BEARING_X,))
+    assert active.multiplier > 0
+    assert re.search(rf"{BEARING_X} +0 \[0, ", str(found))
+    # Whoever is not held back is where a fit without the bearing's axis has it.
+    held = identify(bearings(), negative(), Options(fixed=(BEARING_X,)))
+    np.testing.assert_allclose(found.x, held.x, rtol=1e-5, atol=1e-13)
+    assert found.heldout_rms == pytest.approx(held.heldout_rms, rel=1e-4)
+    assert found.dof == held.dof
+
+
+def test_the_profile_of_the_nonlinear_fit_agrees_where_the_model_is_nearly_linear():
+    linear, exact = by_physics(), by_physics(intervals="profile")
+    assert "linearised" in linear.noise["intervals"]["description"]
+    assert "nonlinear" in exact.noise["intervals"]["description"]
+    for one, other in zip(linear.estimates, exact.estimates, strict=True):
+        np.testing.assert_allclose(one.ci95, other.ci95, atol=0.01 * one.std)
+
+
+def test_the_bootstrap_piles_up_on_the_bound():
+    found = by_physics(intervals="bootstrap")
+    low, high = found.estimate(BEARING_X).ci95
+    assert low == 0 and 0 < high < by_physics().estimate(BEARING_X).ci95[1] * 1.1
+    for e, p in zip(found.estimates[2:6], by_physics().estimates[2:6], strict=True):
+        assert np.diff(e.ci95) == pytest.approx(np.diff(p.ci95), rel=0.2)  # 999 draws: 5 %
+
+
+def test_bounds_that_nothing_presses_on_change_nothing_but_what_lies_beyond_them():
+    table = readings(bearings(), 1, SLANTED, **{BEARING_X: 8e-8, BEARING_Y: 3e-8})
+    alone = identify(bearings(), table, Options(method="ols"))
+    found = identify(
+        bearings(), table, Options(method="ols", constraints=physical_constraints(bearings()))
+    )
+    assert found.active == ()
+    np.testing.assert_allclose(found.x, alone.x, rtol=1e-7, atol=1e-14)
+    np.testing.assert_allclose(found.covariance, alone.covariance, rtol=1e-5, atol=1e-24)
+    np.testing.assert_allclose(found.held_out, alone.held_out, atol=1e-9)
+    assert (found.dof, found.sigma) == (alone.dof, pytest.approx(alone.sigma))
+    for one, other in zip(found.estimates, alone.estimates, strict=True):
+        cut = np.maximum(other.ci95, 0.0)
+        np.testing.assert_allclose(one.ci95, cut, rtol=1e-6, atol=1e-13)
+    assert any(e.ci95[0] < 0 for e in alone.estimates)
+
+
+def test_bounded_adds_the_physical_bounds_to_what_is_stated():
+    loose = Constraints((Bounds("joint2.compliance", upper=1.0),))
+    found = identify(bearings(), negative(), Options(bounded=True, constraints=loose))
+    np.testing.assert_allclose(found.x, by_physics().x, rtol=1e-6, atol=1e-13)
+    assert [a.label for a in found.active] == [f"{BEARING_X} >= 0"]
+    assert found.estimate(BEARING_X).value == 0
+
+
+def test_huber_under_constraints_is_hubers_estimate_where_none_is_active():
+    table = readings(drives(), 3)
+    alone = identify(drives(), table, Options(method="huber"))
+    wide = non_negative("joint2.compliance")
+    found = identify(drives(), table, Options(method="huber", constraints=wide))
+    np.testing.assert_allclose(found.x, alone.x, rtol=1e-5)
+    for name in alone.determined:
+        one, other = found.estimate(name), alone.estimate(name)
+        assert one.std == pytest.approx(other.std, rel=0.05)  # ψ′ by rows here, by readings there
+
+
+def test_huber_keeps_a_shifted_reading_from_pulling_at_a_bound():
+    table = negative()
+    position = table.position.copy()
+    position[np.flatnonzero(table.force.any(axis=1))[:3]] += 2e-2
+    shifted = replace(table, position=position)
+    physics = physical_constraints(bearings())
+    found = identify(bearings(), shifted, Options(method="huber", constraints=physics))
+    truth = with_values(bearings(), {})
+    std = np.array([e.std for e in found.estimates])
+    assert found.converged and (np.abs(found.x - truth) < 5 * std).all()
+    assert (found.x >= 0).all()
+
+
+# --- priors -----------------------------------------------------------------------------------
+
+
+def test_a_prior_is_the_ridge_of_the_linear_arm():
+    """MAP in closed form on an arm that is linear in its compliances."""
+    model, table = drives("linear"), readings(drives("linear"), 4)
+    prior = prior_of(joint2__compliance=(3e-7, 5e-9), joint6__compliance=(2e-6, 2e-7))
+    alone = identify(model, table, Options(method="ols"))
+    found = identify(model, table, Options(method="ols", prior=prior))
+    columns = [model.names.index(n) for n in alone.determined]
+    at = model.regressor(table, alone.x, np.array(columns), alone.observations)
+    P = np.zeros((2, len(columns)))
+    for row, name in enumerate(prior.names):
+        P[row, alone.determined.index(name)] = 1 / np.sqrt(prior.covariance[row, row])
+    H = at.B.T @ at.B / alone.sigma**2 + P.T @ P
+    target = P @ alone.x[columns] - prior.mean / np.sqrt(np.diag(prior.covariance))
+    V = np.linalg.inv(H)
+    np.testing.assert_allclose(found.x[columns], alone.x[columns] - V @ P.T @ target, rtol=1e-7)
+    np.testing.assert_allclose(found.covariance, V, rtol=1e-6, atol=1e-8 * np.abs(V).max())
+    share = np.diag(V @ P.T @ P @ V) / np.diag(V)
+    assert list(found.prior_share) == list(alone.determined)
+    np.testing.assert_allclose(list(found.prior_share.values()), share, atol=1e-8)
+    for e, std, s in zip(
+        (found.estimate(n) for n in found.determined), np.sqrt(np.diag(V)), share, strict=True
+    ):
+        dof = alone.dof / (1 - s) ** 2
+        assert e.dof == pytest.approx(dof, rel=1e-5)
+        assert e.ci95[1] - e.value == pytest.approx(stats.t.ppf(0.975, dof) * std, rel=1e-5)
+
+
+def test_held_out_residuals_with_a_prior_are_those_of_fits_without_the_configuration():
+    model, table = drives("linear"), readings(drives("linear"), 5)
+    prior = prior_of(joint2__compliance=(3.2e-7, 3e-9))
+    found = identify(model, table, Options(method="ols", prior=prior))
+    alone = identify(model, table, Options(method="ols"))
+    out = found.observations.configuration == 4
+    rows = np.repeat(out, 3)
+    columns = np.array([model.names.index(n) for n in alone.determined])
+    at = model.regressor(table, model.nominal, columns, found.observations)
+    weight = alone.sigma / np.sqrt(prior.covariance[0, 0])
+    P = weight * np.eye(len(columns))[[alone.determined.index("joint2.compliance")]]
+    lack = weight * (prior.mean - model.nominal[1])
+    B, y = np.vstack([at.B[~rows], P]), np.concatenate([at.residual[~rows], lack])
+    step = np.linalg.lstsq(B, y, rcond=1e-16)[0]
+    expected = at.residual[rows] - at.B[rows] @ step
+    np.testing.assert_allclose(found.held_out[rows], expected, atol=1e-10)
+
+
+def test_a_prior_gives_a_number_to_what_no_reading_shows_and_says_so():
+    found = identify(
+        drives(), readings(drives(), 6), Options(prior=prior_of(joint1__compliance=(3e-7, 1e-7)))
+    )
+    e = found.estimate("joint1.compliance")
+    assert (e.value, e.std) == (pytest.approx(3e-7), pytest.approx(1e-7))
+    assert found.prior_share["joint1.compliance"] == pytest.approx(1.0)
+    assert found.prior_share["joint2.compliance"] == pytest.approx(0.0, abs=1e-9)
+    alone = identify(drives(), readings(drives(), 6), Options())
+    assert found.dof == alone.dof and found.sigma == pytest.approx(alone.sigma)
+    assert found.heldout_rms == pytest.approx(alone.heldout_rms, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "known, other", [("base.rz", "joint1.offset"), ("joint1.offset", "base.rz")]
+)
+def test_a_prior_on_one_of_a_pair_tells_the_other(known, other):
+    table = readings(placed(), 7)
+    alone = identify(placed(), table, Options())
+    assert {known, other}.isdisjoint(e.name for e in alone.estimates if e.identifiable)
+    mean, std = 2e-3, 1e-4
+    prior = GaussianPrior.independent((known,), [mean], [std])
+    found = identify(placed(), table, Options(prior=prior))
+    assert found.estimate(known).value == pytest.approx(mean, rel=1e-6)
+    # Both turn about the same axis, base.rz upwards and joint 1 downwards.
+    combined = alone.combination("base.rz")
+    sign = combined.terms["joint1.offset"]
+    expected = (
+        combined.value - sign * mean
+        if known == "joint1.offset"
+        else ((combined.value - mean) / sign)
+    )
+    e = found.estimate(other)
+    assert e.value == pytest.approx(expected, abs=2e-6)
+    assert e.std == pytest.approx(np.hypot(std, combined.std), rel=0.01)
+    assert not {known, other} & {n for c in found.combinations for n in c.terms}
+
+
+def test_a_prior_on_a_fixed_parameter_is_refused():
+    prior = prior_of(joint2__compliance=(3e-7, 1e-8))
+    options = Options(prior=prior, fixed=("joint2.compliance",))
+    with pytest.raises(InputError, match=r"'joint2\.compliance', which is held fixed"):
+        identify(drives(), readings(drives(), 0), options)
+
+
+def test_intervals_of_truths_drawn_from_the_prior_hold_them():
+    """Bayesian calibration: truth ~ prior, readings ~ truth, 95 % of intervals hold it."""
+    model, hits = drives("linear"), []
+    mean, std = model.nominal[[1, 5]], np.array([5e-9, 4e-7])
+    prior = GaussianPrior.independent(("joint2.compliance", "joint6.compliance"), mean, std)
+    rng = np.random.default_rng(0)
+    for seed in range(60):
+        drawn = mean + std * rng.normal(size=2)
+        table = readings(
+            model, seed, **{"joint2.compliance": drawn[0], "joint6.compliance": drawn[1]}
+        )
+        found = identify(model, table, Options(method="ols", prior=prior))
+        ends = [found.estimate(n).ci95 for n in prior.names]
+        hits += [low <= v <= high for (low, high), v in zip(ends, drawn, strict=True)]
+    low, high = binomial_band(len(hits), 0.95)
+    assert low <= sum(hits) <= high
+
+
+@given(st.floats(1.0, 1e4), st.floats(0.0, 1.0))
+def test_degrees_of_freedom_grow_with_the_share_of_the_prior(dof, share):
+    (found,) = degrees_of_freedom(np.array([dof]), np.array([share]))
+    assert found >= dof
+    # Satterthwaite of a sum: readings' part with dof, prior's part known.
+    if share < 0.99:
+        assert found == pytest.approx(1 / ((1 - share) ** 2 / dof), rel=1e-9)
+
+
+# --- equalities -------------------------------------------------------------------------------
+
+
+def test_an_equality_is_the_fit_in_fewer_parameters():
+    """joint2 = joint3 by adding their columns: x = T z on the linear arm."""
+    model, table = drives("linear"), readings(drives("linear"), 8)
+    found = identify(
+        model,
+        table,
+        Options(method="ols", constraints=equal("joint2.compliance", "joint3.compliance")),
+    )
+    columns = np.arange(1, 6)
+    at = model.regressor(table, model.nominal, columns, found.observations)
+    T = np.delete(np.eye(5), 1, axis=1)
+    T[1, 0] = 1.0
+    start = model.nominal[columns]
+    B, y = at.B @ T, at.residual + at.B @ start
+    z = np.linalg.solve(B.T @ B, B.T @ y)
+    np.testing.assert_allclose(found.x[columns], T @ z, rtol=1e-8)
+    e = y - B @ z
+    free = identify(model, table, Options(method="ols"))
+    covariance = free.sigma**2 * T @ np.linalg.inv(B.T @ B) @ T.T
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-6, atol=1e-24)
+    assert found.dof == len(y) - 4
+    assert found.sigma == pytest.approx(np.sqrt(e @ e / found.dof), rel=1e-9)
+
+
+def test_an_equality_with_a_known_parameter_determines_an_unseen_one():
+    table = readings(drives(), 9)
+    stated = equal("joint1.compliance", "joint3.compliance")
+    found, alone = (identify(drives(), table, Options(constraints=c)) for c in (stated, None))
+    one, other = found.estimate("joint1.compliance"), found.estimate("joint3.compliance")
+    assert one.value == pytest.approx(other.value, rel=1e-12)
+    assert other.value == pytest.approx(alone.estimate("joint3.compliance").value, rel=1e-6)
+    assert one.std == pytest.approx(other.std) and one.note == ""
+
+
+def test_a_known_value_splits_a_combination():
+    table = readings(placed(), 10)
+    known = Constraints(equalities=(LinearEquality({"joint1.offset": 1.0}, 1e-3),))
+    found, alone = (identify(placed(), table, Options(constraints=c)) for c in (known, None))
+    assert found.estimate("joint1.offset").ci95 == (1e-3, 1e-3)
+    combined, e = alone.combination("base.rz"), found.estimate("base.rz")
+    expected = combined.value - combined.terms["joint1.offset"] * 1e-3
+    assert e.value == pytest.approx(expected, abs=2e-6)
+    assert np.isfinite(found.covariance).all()
+    assert all(np.isfinite(r) for *_, r in found.correlations)
+
+
+def test_an_equality_of_what_stays_undetermined_is_refused():
+    # It repeats the combination that the readings tell; what the two share stays unknown.
+    same = Constraints(equalities=(LinearEquality({"base.rz": 1.0, "joint1.offset": -1.0}),))
+    table = readings(placed(), 11)
+    terms = identify(placed(), table, Options()).combination("base.rz").terms
+    assert terms == pytest.approx({"base.rz": 1.0, "joint1.offset": -1.0})
+    with pytest.raises(
+        InsufficientDataError, match=r"not determine 'joint1\.offset', which an equality"
+    ):
+        identify(placed(), table, Options(constraints=same))
+
+
+def test_an_equality_that_the_readings_contradict_is_doubted():
+    table = readings(drives(), 12)
+    wrong = identify(
+        drives(), table, Options(constraints=equal("joint2.compliance", "joint3.compliance"))
+    )
+    right = Constraints(
+        equalities=(LinearEquality({"joint2.compliance": 1.0}, float(drives().nominal[1])),)
+    )
+    assert any("The readings contradict 'joint2.compliance - " in w for w in wrong.warnings)
+    assert not identify(drives(), table, Options(constraints=right)).warnings
+
+
+def test_what_is_stated_and_true_is_seldom_doubted():
+    """At most 0.1 % false alarms: three in 60 would be 1 in 30000."""
+    model = drives("linear")
+    true = Constraints(
+        equalities=(LinearEquality({"joint2.compliance": 1.0}, float(model.nominal[1])),)
+    )
+    doubted = sum(
+        bool(identify(model, readings(model, s), Options(method="ols", constraints=true)).warnings)
+        for s in range(60)
+    )
+    assert doubted < 3
+
+
+def test_constraints_that_contradict_each_other_are_named():
+    stated = Constraints(
+        (Bounds("joint2.compliance", lower=1e-6),),
+        (LinearEquality({"joint2.compliance": 1.0}, 1e-7, "data sheet"),),
+    )
+    with pytest.raises(InputError, match=r"'data sheet', 'the lower bound of joint2\.compliance'"):
+        identify(drives(), readings(drives(), 0), Options(constraints=stated))
+
+
+def test_a_held_value_outside_its_bounds_is_named():
+    outside = Constraints((Bounds("joint1.compliance", lower=1e-6),))
+    with pytest.raises(InputError, match=r"joint1\.compliance is held at 3\.5e-07, outside"):
+        identify(drives(), readings(drives(), 0), Options(constraints=outside))
+
+
+def test_constraints_on_fitted_parameters_alone_say_the_same():
+    stated = Constraints(
+        (Bounds("a", 0.0), Bounds("b", 0.0)),
+        (LinearEquality({"a": 1.0, "b": 2.0}, 5.0), LinearEquality({"b": 1.0}, 2.0)),
+        (SemidefiniteMatrix("m", (("a", {"b": 0.5}), ({"b": 0.5}, "c"))),),
+    )
+    left = on_columns(stated, {"b": 2.0})
+    system, whole = left.resolve(("a", "c")), stated.resolve(("a", "b", "c"))
+    np.testing.assert_array_equal(system.A, [[1.0, 0.0]])
+    np.testing.assert_array_equal(system.b, [1.0])
+    np.testing.assert_array_equal(system.lower, [0.0, -np.inf])
+    x = np.array([3.0, 4.0])
+    np.testing.assert_array_equal(
+        system.matrices[0].at(x), whole.matrices[0].at(np.array([3.0, 2.0, 4.0]))
+    )
+
+
+def test_a_table_too_large_to_hold_b_is_refused(monkeypatch):
+    monkeypatch.setattr(partition, "LARGE", 0)
+    with pytest.raises(InputError, match="which a table of this size does not allow"):
+        identify(
+            drives(),
+            readings(drives(), 0),
+            Options(prior=prior_of(joint2__compliance=(3e-7, 1e-8))),
+        )
+
+
+# --- options ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["tukey", "l1", "student-t"])
+def test_methods_without_a_constrained_fit_say_what_to_use(method):
+    with pytest.raises(InputError, match="use huber"):
+        Options(method=method, constraints=non_negative("joint2.compliance"))
+
+
+@pytest.mark.parametrize("method, kind", [("auto", "cr2"), ("huber", "profile"), ("ols", "wild")])
+def test_intervals_that_ignore_the_knowledge_are_refused(method, kind):
+    with pytest.raises(InputError, match="there are auto, bootstrap"):
+        Options(method=method, intervals=kind, constraints=non_negative("joint2.compliance"))
+
+
+def test_stating_nothing_is_the_method_itself():
+    found = identify(drives(), readings(drives(), 0), Options(constraints=Constraints()))
+    assert found.method == "reml" and found.active == () and found.prior_share == {}
+
+
+def test_the_result_says_what_was_active_and_shared_in_json():
+    prior = prior_of(joint3__compliance=(4.2e-7, 1e-8))
+    options = Options(prior=prior, constraints=physical_constraints(bearings()))
+    text = json.dumps(identify(bearings(), negative(), options).to_json(), allow_nan=False)
+    told = json.loads(text)
+    (active,) = told["active"]
+    assert active["parameters"] == [BEARING_X] and active["kind"] == "lower"
+    assert active["value"] == 0 and active["multiplier"] > 0
+    assert 0.5 < told["prior_share"]["joint3.compliance"] < 1
+    assert told["method"] == "constrained" and told["noise"]["kind"]
+
+
+# --- the file ---------------------------------------------------------------------------------
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "knowledge.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_the_file_shown_in_the_documentation_is_read(tmp_path):
+    (block,) = re.findall(r"```toml knowledge\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.S)
+    known = read_knowledge(written(tmp_path, block))
+    assert known.physical and known.prior is not None
+    assert known.constraints.bounds and known.constraints.equalities and known.constraints.matrices
+
+
+def test_a_file_means_what_it_says(tmp_path):
+    text = """
+        physical = true
+        [prior."joint2.compliance"]
+        mean = 2.9e-7
+        std = 3e-8
+        [[bounds]]
+        parameter = "joint3.compliance"
+        upper = 1e-6
+        [[equality]]
+        terms = { "joint4.compliance" = 1, "joint5.compliance" = -1.0 }
+        label = "one drive type"
+        [[semidefinite]]
+        entries = [["joint2.off_axis_compliance_x", 0], [0, "joint2.off_axis_compliance_y"]]
+    """
+    known = read_knowledge(written(tmp_path, text))
+    constraints, prior = known.of(bearings())
+    stated = Constraints(
+        (Bounds("joint3.compliance", upper=1e-6),),
+        (
+            LinearEquality(
+                {"joint4.compliance": 1.0, "joint5.compliance": -1.0}, 0.0, "one drive type"
+            ),
+        ),
+        (SemidefiniteMatrix("matrix 1", ((BEARING_X, 0), (0, BEARING_Y))),),
+    )
+    assert constraints == physical_constraints(bearings()) + stated
+    assert prior.names == ("joint2.compliance",)
+    assert (prior.mean[0], prior.covariance[0, 0]) == (2.9e-7, 3e-8**2)
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("priors = 1", r"unknown key 'priors' \(did you mean 'prior'\?\); there are physical"),
+        ("physical = 1", "key 'physical' takes true or false; found 1"),
+        ("prior = 3", "key 'prior' takes tables by parameter"),
+        ('[prior."a"]\nmean = 1\nstdev = 2', r"\[prior\.'a'\], unknown key 'stdev' \(did you"),
+        ('[prior."a"]\nmean = 1', r"\[prior\.'a'\], key 'std' is missing; it takes a positive"),
+        ('[prior."a"]\nmean = 1\nstd = -1', "key 'std' takes a positive number.*found -1"),
+        ('[prior."a"]\nmean = nan\nstd = 1', "key 'mean' takes a finite number"),
+        ("[prior.joint2.compliance]\nmean = 1", r'in quotes: \[prior\."joint2\.compliance"\]'),
+        ('[prior]\n"a" = 3', r"\[prior\.'a'\]: key 'prior' takes tables by parameter.*found 3"),
+        ('[[bounds]]\nparameter = "a"', "state neither lower nor upper"),
+        ('[[bounds]]\nparameter = "a"\nlower = 2\nupper = 1', "leave no value"),
+        ('[[bounds]]\nparameter = "a"\nlower = 0\n[[bounds]]\nname = 1', r"\[bounds\]\] no\. 2, u"),
+        ('[bounds]\nparameter = "a"', r"key 'bounds' takes \[\[bounds\]\] tables"),
+        ("[[equality]]\nterms = {}", "key 'terms' takes factors by parameter"),
+        ("[[equality]]\nterms = { joint2.compliance = 1 }", "write full names in quotes"),
+        ('[[equality]]\nterms = { "a" = 0 }', "at least one non-zero coefficient"),
+        ('[[semidefinite]]\nentries = [["a", "b"]]', "not square"),
+        ('[[semidefinite]]\nentries = [["a", "b"], ["c", "a"]]', "not symmetric"),
+        ('[[semidefinite]]\nentries = [["a", true], [true, "a"]]', "key 'entries' takes rows"),
+        ("physical = ", "not valid TOML"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_is_told_by_file_and_key(tmp_path, text, message):
+    with pytest.raises(InputError, match=message) as error:
+        read_knowledge(written(tmp_path, text))
+    assert str(error.value).startswith(str(tmp_path / "knowledge.toml"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[prior."joint2.complience"]\nmean = 1\nstd = 1',
+        '[[bounds]]\nparameter = "joint2.complience"\nlower = 0',
+        '[[equality]]\nterms = { "joint2.complience" = 1 }',
+        '[[semidefinite]]\nentries = [["joint2.complience"]]',
+    ],
+)
+def test_a_name_that_is_no_parameter_is_told_with_the_nearest(tmp_path, text):
+    known = read_knowledge(written(tmp_path, text))
+    with pytest.raises(InputError, match=r"knowledge\.toml: .*did you mean 'joint2\.compliance'"):
+        known.of(drives())
+
+
+def test_physics_alone_needs_no_file():
+    constraints, prior = Knowledge(physical=True).of(bearings())
+    assert constraints == physical_constraints(bearings()) and prior is None
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-3, 3) | st.floats() | st.text(max_size=5),
+    lambda x: st.lists(x, max_size=3) | st.dictionaries(st.text(max_size=8), x, max_size=3),
+    max_leaves=6,
+)  # fmt: skip
+KEYS = st.sampled_from(["physical", "prior", "bounds", "equality", "semidefinite", "other"])
+
+
+def as_toml(value) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)} = {as_toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(as_toml, value)) + "]"
+    if isinstance(value, float):
+        return repr(value)
+    return '""' if value is None else json.dumps(value)
+
+
+@settings(deadline=None)
+@given(st.dictionaries(KEYS, VALUES, max_size=3))
+def test_any_content_is_read_or_refused(tmp_path_factory, content):
+    text = "\n".join(f"{key} = {as_toml(value)}" for key, value in content.items())
+    path = written(tmp_path_factory.mktemp("any"), text)
+    try:
+        assert isinstance(read_knowledge(path), Knowledge)
+    except ElastocalError as error:
+        assert str(path) in str(error)

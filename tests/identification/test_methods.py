@@ -1,0 +1,265 @@
+"""Methods, noise models and intervals by name: each does what its name says, on one arm."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from support.calibration import (
+    PLACED,
+    binomial_band,
+    cell_of,
+    measured,
+    planar_chain,
+    table_at,
+    true_values,
+)
+from support.cells import random_poses
+
+from elastocal.cell import CartesianNoise, Tracker
+from elastocal.errors import InputError
+from elastocal.identification import published
+from elastocal.identification.identify import Options, identify
+from elastocal.identification.intervals import KINDS as INTERVALS
+from elastocal.identification.options import METHODS, ROBUST
+from elastocal.identification.variance.choose import KINDS as NOISES
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import observe
+
+SIGMA = 5e-5
+MARKERS = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}
+REPEATS = 4
+
+
+@cache
+def campaign(seed=0, effect=0.0, poses=14, stated=True):
+    """Two markers, four repeats, and an error common to the readings of a configuration."""
+    noise = CartesianNoise(np.full(3, SIGMA)) if stated else None
+    tracker = Tracker(position=np.array([3.0, 1.0, 0.5]), noise=noise)
+    model = Model(planar_chain(), cell_of(PLACED, MARKERS, tracker))
+    rng = np.random.default_rng(seed)
+    truth = true_values(model, rng)
+    once = table_at(random_poses(model.chain, poses, seed), markers=("M1", "M2"))
+    n = len(once)
+    plan = once.take(np.repeat(np.arange(n), REPEATS))
+    plan = replace(plan, row=np.arange(n * REPEATS) + 2, repeat=np.tile(np.arange(REPEATS), n))
+    table = measured(model, plan, truth, SIGMA, rng)
+    common = effect * rng.normal(size=(poses, 3))
+    return model, replace(table, position=table.position + common[table.configuration]), truth
+
+
+def with_errors(table, share, seed=0):
+    """A share of the readings off by 1 to 10 mm in any direction."""
+    rng = np.random.default_rng(seed)
+    bad = rng.permutation(len(table))[: round(share * len(table))]
+    off = rng.normal(size=(len(bad), 3))
+    off *= (rng.uniform(1e-3, 1e-2, len(bad)) / np.linalg.norm(off, axis=1))[:, None]
+    position = table.position.copy()
+    position[bad] += off
+    return replace(table, position=position)
+
+
+def z(result, truth):
+    kept = [result.model.names.index(name) for name in result.determined]
+    return (result.x[kept] - truth[kept]) / np.sqrt(np.diag(result.covariance))
+
+
+# --- methods --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_finds_the_truth_and_says_its_name(method):
+    model, table, truth = campaign()
+    result = identify(model, table, Options(method=method))
+    assert result.method == ("reml" if method == "auto" else method)
+    assert result.converged and len(result.determined) == len(truth)
+    error = np.abs(z(result, truth))
+    if method == "eq14-residual":  # its stated intervals are known to be far too narrow
+        assert error.max() > 5
+    else:  # seven parameters beyond 4.5 of t on 80 or more: less than one draw in ten thousand
+        assert error.max() < 4.5
+    exact = model.predict(table, truth)
+    assert np.sqrt(np.mean((model.predict(table, result.x) - exact) ** 2)) < SIGMA
+
+
+def test_the_published_methods_are_those_of_the_paper():
+    """On the linearised model at the result, a step of the published estimator moves nothing."""
+    model, table, _ = campaign()
+    seen = observe(table, "position")
+    group = (seen.configuration[:, None] * 3 + np.arange(3)).ravel()
+    for method in ("ols", "eq14"):
+        result = identify(model, table, Options(method=method))
+        columns = np.array([model.names.index(n) for n in result.determined])
+        B = model.regressor(table, result.x, columns, seen).B
+        history = published.eq14(B, result.residual, group)
+        found = history[0 if method == "ols" else -1]
+        std = np.sqrt(np.diag(result.covariance))
+        assert (np.abs(found.x) < 1e-3 * std).all()
+        if method == "ols":
+            stated = published.ols(B, result.residual).covariance  # eq. (7)
+        else:
+            stated = found.covariance  # eq. (13)
+        np.testing.assert_allclose(np.sqrt(np.diag(stated)), std, rtol=1e-3)
+
+
+def test_published_methods_fit_every_reading_unless_told_otherwise():
+    model, table, _ = campaign()
+    wrong = with_errors(table, 0.05)
+    for method in ("ols", "eq14", "eq14-residual"):
+        kept = identify(model, wrong, Options(method=method))
+        assert len(kept.residual) == 3 * len(table) and len(kept.outliers) >= 5
+    dropped = identify(model, wrong, Options(method="ols", faulty="drop"))
+    assert len(dropped.excluded) >= 5 and len(dropped.residual) < 3 * len(table)
+
+
+@pytest.mark.parametrize("method", [*ROBUST, "reml"])
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_gross_errors_do_not_bend_a_robust_fit(method, share):
+    """The prediction stays within a tenth of the errors' size, within the noise but for the
+    losses without rejection at 30 %."""
+    model, table, truth = campaign(1)
+    wrong = with_errors(table, share)
+    faulty = "drop" if method == "reml" else "auto"
+    result = identify(model, wrong, Options(method=method, faulty=faulty))
+    error = model.predict(table, result.x) - model.predict(table, truth)
+    plain = identify(model, wrong, Options(method="ols"))
+    bent = model.predict(table, plain.x) - model.predict(table, truth)
+    rejecting = method in ("tukey", "reml", "student-t")
+    limit = SIGMA / 2 if rejecting or share < 0.1 else 4 * SIGMA
+    assert np.sqrt(np.mean(error**2)) < limit
+    assert np.sqrt(np.mean(bent**2)) > 2 * np.sqrt(np.mean(error**2))
+
+
+def test_robust_intervals_hold_with_outliers():
+    """12 tables of 7 parameters with 5 % errors: MM intervals at 95 %, in the binomial band."""
+    hits = total = 0
+    for seed in range(12):
+        model, table, truth = campaign(seed)
+        result = identify(model, with_errors(table, 0.05, seed), Options(method="tukey"))
+        for name, true in zip(model.names, truth, strict=True):
+            low, high = result.estimate(name).ci95
+            hits, total = hits + (low <= true <= high), total + 1
+    low, high = binomial_band(total, 0.95)
+    assert low <= hits <= high
+
+
+# --- noise ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [k for k in NOISES if k != "auto"])
+def test_every_noise_model_by_name(noise):
+    model, table, truth = campaign(2, effect=1e-4)
+    result = identify(model, table, Options(noise=noise))
+    assert result.noise["kind"] == noise and result.noise["reason"] == "as asked for"
+    assert np.isfinite(result.covariance).all()
+    if noise.endswith("+configuration"):
+        assert np.abs(z(result, truth)).max() < 4.5
+        sizes = {v["name"]: v["sigma_um"] for v in result.noise["variances"]}
+        assert 50 < sizes["common to each configuration"] < 200
+
+
+def test_auto_says_what_it_chose_and_from_what():
+    model, table, _ = campaign(3, effect=1e-4, stated=False)
+    noise = identify(model, table).noise
+    assert noise["kind"].endswith("+configuration")
+    assert {t["kind"].removesuffix("+configuration") for t in noise["tried"]} >= {
+        "independent", "axis", "marker", "groups", "polar",
+    }  # fmt: skip
+    assert "smallest information criterion" in noise["reason"]
+    best = min(noise["tried"], key=lambda t: t["criterion"])
+    assert best["kind"] == noise["kind"]
+
+
+def test_intervals_hold_where_the_arm_does_not_come_back_to_the_same_place():
+    """20 tables of 7 parameters with 100 µm common to a configuration, twice the noise."""
+    hits = plain_hits = total = 0
+    for seed in range(20):
+        model, table, truth = campaign(seed, effect=1e-4)
+        both = identify(model, table), identify(model, table, Options(method="ols"))
+        for name, true in zip(model.names, truth, strict=True):
+            ends = [r.estimate(name).ci95 for r in both]
+            hits += ends[0][0] <= true <= ends[0][1]
+            plain_hits += ends[1][0] <= true <= ends[1][1]
+            total += 1
+    low, high = binomial_band(total, 0.95)
+    assert low <= hits <= high
+    assert plain_hits < low
+
+
+# --- intervals ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", INTERVALS)
+def test_every_kind_of_intervals(kind):
+    """Independent readings: all estimate the same widths, the clustered from 14 clusters."""
+    model, table, truth = campaign(4)
+    options = Options(method="ols", intervals=kind)
+    result, plain = identify(model, table, options), identify(model, table, Options(method="ols"))
+    assert result.noise["intervals"]["kind"].lower() == ("classical" if kind == "auto" else kind)
+    for name, true in zip(model.names, truth, strict=True):
+        mine, other = result.estimate(name), plain.estimate(name)
+        width = (mine.ci95[1] - mine.ci95[0]) / (other.ci95[1] - other.ci95[0])
+        assert 0.4 < width < 2.5
+        assert mine.ci95[0] < mine.value < mine.ci95[1]
+        assert abs(mine.value - true) < 5 * other.std
+
+
+def test_clustered_intervals_hold_under_a_configuration_effect():
+    hits = total = 0
+    for seed in range(20):
+        model, table, truth = campaign(seed, effect=1e-4)
+        result = identify(model, table, Options(method="ols", intervals="cr2"))
+        for name, true in zip(model.names, truth, strict=True):
+            low, high = result.estimate(name).ci95
+            hits, total = hits + (low <= true <= high), total + 1
+    assert hits >= binomial_band(total, 0.95)[0]
+
+
+def test_a_bootstrap_does_not_depend_on_the_number_of_processes():
+    model, table, _ = campaign(5)
+    one, two = (
+        identify(model, table, Options(intervals="bootstrap", seed=7, jobs=jobs)) for jobs in (1, 2)
+    )
+    for name in model.names:
+        assert one.estimate(name).ci95 == two.estimate(name).ci95
+
+
+# --- what does not go together --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "olss"}, "no method 'olss' (did you mean 'ols'?)"),
+        ({"noise": "group"}, "(did you mean 'groups'?)"),
+        ({"intervals": "hc5"}, "no kind of intervals 'hc5'"),
+        ({"faulty": "ignore"}, "no way with faulty readings 'ignore'"),
+        ({"method": "ols", "noise": "groups"}, "is estimated by the method reml"),
+        ({"method": "wls", "weights": "none"}, "choose the method ols"),
+        ({"method": "eq14", "weights": "rows"}, "choose the method wls"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(InputError) as error:
+        Options(**options)
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (Options(method="huber", bounded=True), "takes no bounds"),
+        (Options(method="tukey", intervals="hc3"), "has intervals of its own"),
+    ],
+)
+def test_a_robust_method_says_what_it_cannot_do(options, message):
+    model, table, _ = campaign()
+    with pytest.raises(InputError, match=message):
+        identify(model, table, options)
+
+
+def test_shared_effects_need_readings_that_share_something():
+    model, table, _ = campaign()
+    alone = table.take((table.repeat == 0) & (table.marker == 0))
+    with pytest.raises(InputError, match="needs repeats or several markers"):
+        identify(model, alone, Options(noise="axis+configuration"))
