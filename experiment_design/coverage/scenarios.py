@@ -57,8 +57,6 @@ SCENARIOS = tuple(
         ("table 1", False, True),
         ("table 1", True, True),
         ("polar", False, False),
-        ("polar", True, False),
-        ("polar", False, True),
     )
     for repeats in (6, 3)
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import platform
 from collections.abc import Iterable, Mapping
 from importlib import metadata, resources
@@ -13,6 +14,7 @@ from elastocal import __version__
 from elastocal.files import atomic_write_text, open_input
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.result import IdentificationResult, Outlier
+from elastocal.report.faults import false_alarm_line, fault_lines
 from elastocal.report.method import intervals_line, method_and_weights
 from elastocal.report.noise import (
     candidate_rows,
@@ -23,7 +25,7 @@ from elastocal.report.noise import (
     size_rows,
 )
 from elastocal.report.residuals import Residuals, residuals_of, summary_of
-from elastocal.report.rows import combination_rows, parameter_rows
+from elastocal.report.rows import any_lopsided, combination_rows, parameter_rows
 from elastocal.report.units import length, significant
 from elastocal.report.verdict import (
     correlation_lines,
@@ -115,6 +117,7 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
         "version": __version__,
         "environment": _environment(),
         "compared": truth is not None,
+        "lopsided": any_lopsided((*result.estimates, *result.combinations)),
         "verdict": verdict,
         "readings": readings(result),
         "method": _sentence(method_and_weights(result)),
@@ -125,8 +128,11 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
         "warnings": [printable(w) for w in result.warnings],
         "parameters": parameter_rows(result, truth),
         "combinations": combination_rows(result, truth),
+        "endless": _endless(result),
         "undetermined": [_sentence(line) for line in undetermined_lines(result)],
         "correlations": correlation_lines(result, MOST_CORRELATIONS),
+        "faults": fault_lines(result),
+        "false_alarm": false_alarm_line(result),
         "outliers": [_faulty(o) for o in result.outliers],
         "excluded": [_faulty(o) for o in result.excluded],
         "most_faulty": MOST_FAULTY,
@@ -136,6 +142,13 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
         },
         **_thinning(residuals),
     }
+
+
+def _endless(result: IdentificationResult) -> str:
+    """A sentence for bars that run off, empty where every interval has two ends."""
+    ends = [end for e in (*result.estimates, *result.combinations) for end in e.ci95 or ()]
+    found = any(math.isinf(end) for end in ends)
+    return " An interval without an end runs to the edge." if found else ""
 
 
 def _noise(result: IdentificationResult, summary: ResidualSummary | None) -> dict[str, Any]:

@@ -24,7 +24,6 @@ METHODS = {
     "tukey": "robust MM-estimate with Tukey's biweight, which gives far readings no weight at all",
     "l1": "least sum of residual lengths (L1), the robust relative of the median",
     "student-t": "maximum likelihood under Student-t noise, which expects some far readings",
-    "constrained": "least squares under constraints or with a prior",
 }
 # What the weights are is said by the method itself, or by the line on the noise model.
 SAID = {"reml", "ols", "eq14", "eq14-residual"}
@@ -53,6 +52,22 @@ INTERVALS = {
         "profile of the sum of squares, which follows the curvature of the model and may be "
         "lopsided; assumes independent normal noise"
     ),
+    "t under constraints": (
+        "t intervals that take equalities for exact and end at bounds; no bound is active, and "
+        "they assume the noise of the method"
+    ),
+    "posterior": (
+        "t intervals of readings and prior together, ending at bounds; they take the prior at its "
+        "word and assume the noise of the method"
+    ),
+    "constrained profile": (
+        "profile of the fit under the constraints: one-sided at a bound, and too wide rather than "
+        "too narrow near one; assumes normal noise"
+    ),
+    "constrained bootstrap": (
+        "parametric bootstrap of the fit under the constraints: noise drawn from the model, its "
+        "size taken for known, and fitted anew; assumes the noise model"
+    ),
     "eq7": "as published, eq. (7): equal, independent noise of the residual's size",
     "eq8": "as published, eq. (8): independent noise whose σ are taken for known",
     "eq11": "as published, eq. (11): independent noise whose σ are taken for known",
@@ -69,6 +84,19 @@ CR = (
     "cluster-robust ({}): readings of a configuration may be correlated in any way; they assume "
     "independent configurations"
 )
+# Without correction for leverage: right in the limit of many rows or configurations.
+LARGE = {
+    "hc0": "that these are many",
+    "hc1": "that these are many",
+    "cr0": "that these are many",
+    "cr1": "that these are many, ten or more per parameter",
+}
+HELD = {
+    "constrained profile": (
+        "Intervals keep the constraints: they stop at bounds and take equalities for exact"
+    ),
+    "constrained bootstrap": "Intervals come from fits that keep the constraints too",
+}
 ROBUST = "asymptotic covariance of the robust estimate ({}); assumes independent readings"
 
 
@@ -79,10 +107,24 @@ def method_of(result: IdentificationResult) -> str:
 def method_and_weights(result: IdentificationResult) -> str:
     """The method, and the weights where the method does not say them."""
     method, noise = method_of(result), result.noise
+    if method == "constrained":
+        return _constrained(result)
     text = METHODS.get(method, printable(method))
     if method in SAID or noise["kind"] == "none":
         return text
     return f"{text}, {printable(str(noise['description']))}"
+
+
+def _constrained(result: IdentificationResult) -> str:
+    """What was known besides the readings, and the weights that the method before it gave these."""
+    prior, active = bool(result.prior_share), bool(result.active)
+    text = "fit with a prior" if prior else "fit under constraints"
+    text += " and under constraints" if prior and active else ""
+    noise = result.noise
+    if noise["kind"] == "none":
+        return f"{text}, all readings weighted alike"
+    how = "weights estimated by restricted likelihood (REML): " if noise.get("variances") else ""
+    return f"{text}, {how}{printable(str(noise['description']))}"
 
 
 def interval_kind(result: IdentificationResult) -> str:
@@ -102,7 +144,8 @@ def intervals_line(result: IdentificationResult) -> str:
     if kind in INTERVALS:
         return INTERVALS[kind]
     if kind.startswith(("hc", "cr")):
-        return (HC if kind.startswith("hc") else CR).format(printable(kind.upper()))
+        text = (HC if kind.startswith("hc") else CR).format(printable(kind.upper()))
+        return f"{text} and {LARGE[kind]}" if kind in LARGE else text
     if kind in ("h1", "h2", "h3"):
         return ROBUST.format(kind.upper())
     description = result.noise["intervals"].get("description", "")
@@ -110,8 +153,8 @@ def intervals_line(result: IdentificationResult) -> str:
 
 
 def constraints_line(result: IdentificationResult) -> str | None:
-    """Which constraints hold with equality, and that their parameters' intervals rest on them."""
-    active = tuple(getattr(result, "active", None) or ())
+    """Which constraints hold with equality, and what the intervals make of them."""
+    active = result.active
     if not active:
         return None
     units = {p.name: p.unit for p in result.model.parameters}
@@ -129,13 +172,14 @@ def constraints_line(result: IdentificationResult) -> str | None:
     more = len(active) - len(texts)
     text = "; ".join([*texts, *([f"and {more} more"] if more else [])])
     bound = any(a.kind != "equality" for a in active)
-    want = "; the data alone would go beyond the bounds" if bound else ""
-    return f"Held by constraints: {text}. Intervals take these for exact{want}."
+    want = "; the readings alone would go beyond the bounds" if bound else ""
+    held = HELD.get(interval_kind(result), "Intervals take these for exact")
+    return f"Active: {text}. {held}{want}."
 
 
 def prior_line(result: IdentificationResult) -> str | None:
     """Parameters that owe more than half of their information to the prior."""
-    shares: dict[str, float] = getattr(result, "prior_share", None) or {}
+    shares = result.prior_share
     if not shares:
         return None
     mostly = sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n])

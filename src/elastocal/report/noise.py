@@ -13,6 +13,7 @@ from elastocal.identification.variance.choose import SHARED
 from elastocal.report.method import method_of, takes_configurations_as_a_whole
 from elastocal.report.units import length, significant
 from elastocal.report.words import printable
+from elastocal.tracker_noise import available_noise
 
 FEW = 6  # sizes that are named one by one; of more, the range and the extremes
 MOST_GROUPS = 4
@@ -39,8 +40,8 @@ def does_noise_explain_it(result: IdentificationResult) -> str:
         if sigma is not None and method == "ols":
             size = f"; the residual amounts to {length(sigma * 1e-6)} per coordinate"
         elif method == "reml":
-            size = "; its size was estimated from the readings"
-        return f"No noise was stated, so nothing says how small the residual should be{size}."
+            size = "; the size of the noise was estimated from the readings"
+        return f"{_why_not_judged(result)}{size}."
     low, high = np.sqrt(stats.chi2.ppf([0.025, 0.975], result.dof) / result.dof)
     band = f"chance alone gives {low:.2f} to {high:.2f}"
     size = f"{significant(ratio)} times the stated noise; {band}"
@@ -56,6 +57,21 @@ def does_noise_explain_it(result: IdentificationResult) -> str:
     if method_of(result) == "reml":
         text += " Weights and intervals follow the noise that the readings show."
     return text
+
+
+def _why_not_judged(result: IdentificationResult) -> str:
+    """What is missing for a comparison of the residual with stated noise."""
+    seen, tracker = result.observations, result.model.cell.tracker
+    stated = available_noise(seen.table, tracker) != "none"
+    if seen.kind == "distance":
+        stated = tracker.distance_sigma is not None
+    nothing_says = "so nothing says how small the residual should be"
+    if seen.kind == "pose" and stated != (tracker.rotation_sigma is not None):
+        which = "positions" if stated else "rotations"
+        return f"Noise was stated for {which} only, {nothing_says}"
+    if stated or result.noise["kind"] == "covariance":
+        return "The residual was not compared with the stated noise"
+    return f"No noise was stated, {nothing_says}"
 
 
 def noise_model_line(result: IdentificationResult) -> str | None:

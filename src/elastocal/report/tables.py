@@ -9,7 +9,7 @@ from rich.text import Text
 
 from elastocal.identification.result import Combination, Estimate, IdentificationResult
 from elastocal.report.noise import candidate_rows, size_rows
-from elastocal.report.rows import texts
+from elastocal.report.rows import any_lopsided, half_head, signed_half, texts
 from elastocal.report.units import display, plain
 from elastocal.report.verdict import summary_lines
 from elastocal.report.words import (
@@ -47,12 +47,15 @@ def parameter_table(
 ) -> Table:
     """Parameters with 95 % half widths; "–" and a note for what the data do not determine.
 
+    Where an interval is lopsided or has no end, the ends stand instead of the half width.
+
     `truth` (SI) adds true values and whether the interval holds them.  `undetermined` False
     leaves out parameters that have no number of their own.  `brief` is for narrow terminals:
     value, interval and unit in one column, neither nominal nor true value.
     """
     notes = undetermined or any(e.note for e in result.estimates if e.identifiable)
-    table = _table("Parameters", "parameter", truth, brief)
+    lopsided = any_lopsided(result.estimates)
+    table = _table("Parameters", "parameter", truth, brief, lopsided)
     if not brief:
         table.add_column("nominal", justify="right", overflow="fold")
     if notes:
@@ -62,7 +65,7 @@ def parameter_table(
             continue
         true = None if truth is None else truth.get(e.name)
         row = [Text(printable(e.name))]
-        row += _numbers(e, true, truth is not None, brief)
+        row += _numbers(e, true, truth is not None, brief, lopsided)
         if not brief:
             known = nominal_known(result, e.name)
             row.append(Text(plain(display(e.nominal, e.unit)[0]) if known else "–"))
@@ -76,10 +79,11 @@ def combination_table(
     result: IdentificationResult, truth: Truth | None = None, brief: bool = False
 ) -> Table:
     """Sums of parameters that the data determine although their members they do not."""
-    table = _table("Combinations (factors in SI units)", "combination", truth, brief)
+    lopsided = any_lopsided(result.combinations)
+    table = _table("Combinations (factors in SI units)", "combination", truth, brief, lopsided)
     for c in result.combinations:
         true = None if truth is None else combination_truth(result, c, truth)
-        numbers = _numbers(c, true, truth is not None, brief)
+        numbers = _numbers(c, true, truth is not None, brief, lopsided)
         table.add_row(Text(shortened(c)), *numbers)
     return table
 
@@ -128,12 +132,12 @@ def print_result(
         console.print(Text.assemble((label + colon, style), rest))
 
 
-def _table(title: str, first: str, truth: Truth | None, brief: bool) -> Table:
+def _table(title: str, first: str, truth: Truth | None, brief: bool, lopsided: bool) -> Table:
     table = _plain(title, first)
     if brief:
-        table.add_column("value ± 95 %", overflow="fold")
+        table.add_column(f"value {half_head(lopsided)}", overflow="fold")
     else:
-        for name in ("value", "± 95 %"):
+        for name in ("value", half_head(lopsided)):
             table.add_column(name, justify="right", overflow="fold")
         table.add_column("unit", overflow="fold")
     if truth is not None:
@@ -157,12 +161,17 @@ def _plain(title: str, first: str) -> Table:
 
 
 def _numbers(
-    e: Estimate | Combination, true: float | None, compared: bool, brief: bool
+    e: Estimate | Combination, true: float | None, compared: bool, brief: bool, lopsided: bool
 ) -> list[Text]:
-    """Cells of value, interval and unit and, where `compared`, true value and verdict."""
+    """Cells of value, interval and unit and, where `compared`, true value and verdict.
+
+    `lopsided` says whether the column's head has no "±", which then stands with the number.
+    """
     value, half, unit, known = texts(e, true)
     verdict = inside(true, e.ci95)
     tail = [Text(verdict, style=STYLE.get(verdict, ""))] if compared else []
     if brief:
-        return [Text(value if e.value is None else f"{value} ± {half} {unit}"), *tail]
+        text = value if e.value is None else f"{value} {signed_half(half)} {unit}"
+        return [Text(text), *tail]
+    half = signed_half(half) if lopsided else half
     return [Text(value), Text(half), Text(unit), *([Text(known), *tail] if compared else [])]

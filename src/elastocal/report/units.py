@@ -57,6 +57,21 @@ def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
     return *with_uncertainty(shown, display(half, unit)[0]), text
 
 
+def with_ends(value: float, low: float, high: float) -> tuple[str, str]:
+    """Value and interval with the digits that `resolution` allows: "0.000", "[0.000, 0.013]"."""
+    size = resolution(value, low, high)
+    return rounded_alike(value, size), f"[{_end(low, size)}, {_end(high, size)}]"
+
+
+def resolution(value: float, low: float, high: float) -> float:
+    """The half width that sets the digits of a lopsided interval, 0 where it has none.
+
+    The shorter side that is neither empty nor without an end, but a tenth of the longer at least.
+    """
+    sides = [side for side in (value - low, high - value) if 0 < side < math.inf]
+    return max(min(sides), max(sides) / 10) if sides else 0.0
+
+
 def rounded_alike(value: float, half: float) -> str:
     """`value` with the digits that `half` allows: a true value beside its estimate."""
     return with_uncertainty(value, half)[0]
@@ -86,6 +101,12 @@ def length(metres: float) -> str:
     if abs(metres) < 0.9995:
         return f"{significant(metres * 1e3)} mm"
     return f"{significant(metres)} m"
+
+
+def _end(value: float, half: float) -> str:
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    return rounded_alike(value, half)
 
 
 def _round(value: float, decimals: int) -> float:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from elastocal.identification.result import IdentificationResult
+from elastocal.report.faults import MOST_TOLD, fault_lines
 from elastocal.report.method import (
     constraints_line,
     intervals_line,
@@ -190,4 +191,5 @@ def summary_lines(result: IdentificationResult, truth: Truth | None = None) -> l
         lines.append(f"Truth: {coverage_line(result, truth)}")
     if pairs := correlation_lines(result):
         lines.append("Correlated over 0.9: " + "; ".join(pairs))
+    lines += [f"Faulty: {text}" for text in fault_lines(result, MOST_TOLD)]
     return lines + [f"Warning: {printable(w)}" for w in result.warnings]

@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 OWN_SCALE = 6  # readings that a group needs for a median and a scale of its own
+MOVED = 1 / 3  # share of a configuration's readings
 LIMIT = 5.0  # robust standard deviations; the verdict that follows takes back what it can explain
 
 
@@ -22,6 +23,9 @@ def screen(readings: Readings, residual: Array, good: Mask | None = None) -> Mas
     configuration (under its load), where that holds enough readings; else with zero and the
     deviation of the `good` readings (N,) of the whole table (default all).  Where noise is stated,
     residuals count in units of it.
+
+    What moves a configuration or a marker in it as a whole moves its median too: readings that are
+    not `good` stay out where they make up a third of their configuration.
     """
     if readings.stated is not None:
         residual = residual / np.sqrt(np.diagonal(readings.stated, axis1=1, axis2=2))
@@ -38,7 +42,11 @@ def screen(readings: Readings, residual: Array, good: Mask | None = None) -> Mas
         scale[members] = _scale(deviation[members], axis=1)[:, None]
     # A group that happens to agree is no reason to suspect the one reading that differs a little.
     scale = np.maximum(scale, 0.2 * table)
-    return np.asarray((deviation <= LIMIT * scale).all(axis=1))
+    near = (deviation <= LIMIT * scale).all(axis=1)
+    if good is None:
+        return np.asarray(near)
+    share = np.bincount(group.ravel(), ~good)[group.ravel()] / count[group.ravel()]
+    return np.asarray(near & (good | (share < MOVED)))
 
 
 def _scale(deviation: Array, axis: int = 0) -> Array:

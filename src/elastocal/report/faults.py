@@ -1,0 +1,84 @@
+"""Groups of readings that are wrong together, in words: marker, configuration, run of lines."""
+
+from __future__ import annotations
+
+import math
+from statistics import median
+
+from elastocal.identification.result import IdentificationResult
+from elastocal.identification.robust.report import Finding
+from elastocal.report.method import method_of
+from elastocal.report.units import length, significant
+from elastocal.report.words import printable
+
+MOST_TOLD = 3  # in the terminal's summary
+FULL_WEIGHT = ("reml", "ols", "wls", "eq14")  # methods that let far readings bend the fit
+PLACE = {
+    "block": "Block of lines {}",
+    "marker": "Marker {}",
+    "configuration": "Configuration {}",
+}
+
+
+def fault_lines(result: IdentificationResult, most: int | None = None) -> list[str]:
+    """A sentence per group of readings beyond the noise, the largest first; of more, how many."""
+    report = result.faulty_report
+    groups = [] if report is None else [f for f in report.findings if f.level != "reading"]
+    lines = [_sentence(result, finding) for finding in groups[:most]]
+    more = len(groups) - len(lines)
+    return [*lines, f"And {more} more."] if more else lines
+
+
+def false_alarm_line(result: IdentificationResult) -> str | None:
+    """How often the search would accuse readings of a table in which nothing is wrong."""
+    report = result.faulty_report
+    if report is None or not fault_lines(result):
+        return None
+    share = significant(100 * report.false_alarm, 2)
+    return f"Of tables in which nothing is wrong, {share} % would yield any finding at all."
+
+
+def _sentence(result: IdentificationResult, finding: Finding) -> str:
+    n, beyond = len(finding.lines), finding.beyond
+    how = "err in common by" if finding.pattern == "common" else "scatter by"
+    size, noise = _metres(result, finding), f"{significant(finding.sigmas, 2)} times the noise"
+    text = f"{PLACE[finding.level].format(printable(finding.name))}: {n} readings {how} "
+    text += noise if size is None else f"{length(size)} ({noise})"
+    if beyond < n:
+        text += f", {beyond or 'none'} of them beyond the noise alone"
+    return f"{text}{_influence(result, finding)}."
+
+
+def _metres(result: IdentificationResult, finding: Finding) -> float | None:
+    """Typical error in m, None where most of the readings are not listed one by one.
+
+    The median where they err in common, which those that do not leave alone; else the rms.  Of
+    a pose the list has the position's error only, and the finding may be one of rotation.
+    """
+    if result.observations.kind == "pose":
+        return None
+    lines = set(finding.lines)
+    listed = [o.residual for o in result.faulty if o.line in lines]
+    if not listed or 2 * len(listed) < len(lines):
+        return None
+    if finding.pattern == "common":
+        return median(listed)
+    return math.sqrt(sum(r * r for r in listed) / len(listed))
+
+
+def _influence(result: IdentificationResult, finding: Finding) -> str:
+    """What the readings do, or would do if they were fitted along, to the parameter they move most.
+
+    The finding's column is one of the fit without them, whose parameters may be fewer.
+    """
+    report = result.faulty_report
+    if report is None or len(report.x) != len(result.determined):
+        return ""
+    name = printable(result.determined[finding.column])
+    if not math.isfinite(finding.influence):
+        return f"; the other readings leave {name} undetermined"
+    apart = {o.line for o in result.excluded} & set(finding.lines)
+    bends = method_of(result) in FULL_WEIGHT and not apart
+    how = "in the fit they move" if bends else "fitted along they would move"
+    count = significant(finding.influence, 2)
+    return f"; {how} {name} by {count} standard deviation{'' if count == '1.0' else 's'}"
