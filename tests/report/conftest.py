@@ -10,6 +10,7 @@ from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_
 
 from elastocal.cell import CartesianNoise, Tracker
 from elastocal.identification.identify import Options, identify
+from elastocal.identification.options import Method
 from elastocal.identification.result import IdentificationResult
 from elastocal.manipulator.model import Model
 from elastocal.simulation.simulate import simulate, values_from
@@ -36,6 +37,8 @@ def make_case(
     faulty: int = 0,
     drop: bool = False,
     observe: str = "position",
+    method: Method = "auto",
+    shifted: slice | None = None,
 ) -> Case:
     """Readings with 30 µm noise of an arm whose base and joints are off by about 1 mm, 1 mrad."""
     cell = kr270_cell(effects, observe)
@@ -61,16 +64,25 @@ def make_case(
     table = simulate(model, table, values_from(model, truth), rng, noise=False)
     position = np.asarray(table.position) + SIGMA * rng.normal(size=(len(table), 3))
     position[3 : 3 + 5 * faulty : 5] += 0.03
+    if shifted is not None:
+        position[shifted] += [4e-3, 1e-3, 0.0]
     table = replace(table, position=position)
     rotation = np.asarray(table.rotation) + 3e-5 * rng.normal(size=(len(table), 3))
     table = replace(table, rotation=rotation)
-    return Case(identify(model, table, Options(faulty="drop" if drop else "keep")), truth)
+    options = Options(faulty="drop" if drop else "keep", method=method)
+    return Case(identify(model, table, options), truth)
 
 
 @pytest.fixture(scope="session")
 def case() -> Case:
     """Two markers; some parameters alone, some combined, absorbed, invisible."""
     return make_case(poses=12)
+
+
+@pytest.fixture(scope="session")
+def shifted() -> Case:
+    """Six lines displaced by 4.1 mm across configurations, and left out as faulty."""
+    return make_case(poses=12, drop=True, method="wls", shifted=slice(9, 15))
 
 
 @pytest.fixture(scope="session")

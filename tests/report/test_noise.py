@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import re
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.options import METHODS
 from elastocal.identification.residual_summary import summarise_residuals
@@ -65,11 +66,8 @@ def noisy(case: Any) -> Any:
         "lack_of_fit": MISFIT,
         "intervals": {"kind": "kenward-roger", "description": "adjusted"},
     }
-    label = "joint2.compliance ≥ 0"
-    active = (
-        SimpleNamespace(label=label, kind="lower", names=("joint2.compliance",), value=0.0,
-                        multiplier=1.0),
-    )  # fmt: skip
+    name = "joint2.compliance"
+    active = (ActiveConstraint(f"{name} >= 0", "lower", (name,), 0.0, 1.0),)
     share = {"joint4.offset": 0.83, "joint5.offset": 0.2, "joint6.offset": float("nan")}
     return changed(
         case.result, noise, method="reml", active=active, prior_share=share,
@@ -95,7 +93,19 @@ def test_stated_weights_are_named_with_the_method(case: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", [k for k in (*INTERVALS, "kenward-roger", "H2", "clustered", "eq8") if k != "auto"]
+    "kind",
+    [
+        *(k for k in INTERVALS if k != "auto"),
+        "kenward-roger",
+        "H2",
+        "CR1",
+        "clustered",
+        "eq8",
+        "t under constraints",
+        "posterior",
+        "constrained profile",
+        "constrained bootstrap",
+    ],
 )
 def test_every_kind_of_interval_says_what_it_assumes(case: Any, kind: str) -> None:
     given = {"intervals": {"kind": kind, "description": "in other words"}}
@@ -181,12 +191,30 @@ def test_shape_of_the_residuals_in_words(case: Any) -> None:
 
 
 def test_constraints_and_prior(noisy: Any, case: Any) -> None:
-    assert "joint2.compliance ≥ 0 (lower bound 0 µrad/(N·m))" in (constraints_line(noisy) or "")
+    line = constraints_line(noisy) or ""
+    assert line.startswith("Active: joint2.compliance ≥ 0 µrad/(N·m). ")
+    assert line.count("joint2.compliance") == 1
     prior = prior_line(noisy) or ""
     assert "joint4.offset 83 %" in prior
     assert "joint5" not in prior
     assert "largest share 20 %" in (prior_line(changed(noisy, prior_share={"a": 0.2})) or "")
     assert constraints_line(case.result) is None
+
+
+def test_nothing_stated_is_only_said_where_it_is_so(case: Any, pose: Any, bare: Any) -> None:
+    def line(result: Any, **noise: Any) -> str:
+        return does_noise_explain_it(changed(result, {"ratio_to_stated": None, **noise}))
+
+    assert line(bare.result).startswith("No noise was stated")
+    assert "not compared" in line(bare.result, kind="covariance")
+    assert "not compared" in line(case.result)
+    assert "not compared" in line(pose.result)
+    model, tracker = pose.result.model, pose.result.model.cell.tracker
+    for left, which in ({"rotation_sigma": None}, "positions"), ({"noise": None}, "rotations"):
+        partly = copy.copy(model)
+        cell = replace(model.cell, tracker=replace(tracker, **left))
+        object.__setattr__(partly, "cell", cell)
+        assert f"stated for {which} only" in line(changed(pose.result, model=partly))
     assert prior_line(case.result) is None
 
 
@@ -214,7 +242,7 @@ def test_page_has_a_section_on_noise(noisy: Any) -> None:
         assert piece in section
     assert section.count("<figure>") == 4
     verdict = page[: page.index("<h2>Parameters")]
-    assert "joint2.compliance ≥ 0" in verdict
+    assert "joint2.compliance ≥ 0 µrad/(N·m)" in verdict
     assert "Mostly prior" in verdict
     assert len(set(re.findall(r'\bid="([^"]*)"', page))) == len(re.findall(r'\bid="', page))
 

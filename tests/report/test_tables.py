@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 from rich.table import Table
 
 from elastocal.identification.result import Combination
-from elastocal.report.rows import texts
+from elastocal.report.rows import (
+    HALF_LENGTH,
+    MIDDLE,
+    bar_from_nominal,
+    parameter_rows,
+    texts,
+)
 from elastocal.report.tables import (
     combination_table,
     parameter_table,
@@ -143,6 +151,55 @@ def test_rotations_and_unstated_noise(pose: Any, bare: Any) -> None:
     assert "restricted likelihood" in text
     assert "No noise was stated" in text
     assert "Warning: 1 reading" in text
+
+
+def lopsided(result: Any, ends: list[tuple[float, float]]) -> Any:
+    """The result with other intervals, in halves of their width, for its first known parameters."""
+    estimates = list(result.estimates)
+    alone = [k for k, e in enumerate(estimates) if e.identifiable]
+    for k, (below, above) in zip(alone, ends, strict=False):
+        e = estimates[k]
+        half = e.ci95[1] - e.value
+        ci95 = (e.value - below * half, e.value + above * half)
+        estimates[k] = replace(e, ci95=ci95)
+    return replace(result, estimates=tuple(estimates)), [estimates[k] for k in alone]
+
+
+@pytest.mark.parametrize("width", [60, 100])
+def test_lopsided_intervals_show_both_ends(case: Any, width: int) -> None:
+    result, known = lopsided(case.result, [(0, 1), (np.inf, 1), (1.04, 1)])
+    rows = {row["parameter"]: row for row in cells(parameter_table(result))}
+    assert rows[known[0].name]["95 %"].startswith("[")
+    assert rows[known[1].name]["95 %"].startswith("[-∞, ")
+    assert rows[known[2].name]["95 %"].startswith("± ")
+    low, high = map(float, rows[known[0].name]["95 %"].strip("[]").split(", "))
+    assert low == float(rows[known[0].name]["value"]) < high
+    text = printed(width, result)
+    assert "[-∞" in text
+    assert "value ± 95 %" not in text[: text.index("Combinations")]
+    assert "inf" not in text[: text.index("Readings")]
+
+
+def test_bars_reach_where_the_interval_does(case: Any) -> None:
+    known = next(e for e in case.result.estimates if e.identifiable)
+    one_sided = replace(known, value=1.0, ci95=(1.0, 3.0))
+
+    def bar(e: Any, true: float) -> Any:
+        result = replace(case.result, estimates=(e,), combinations=())
+        (row,) = parameter_rows(result, {e.name: true})
+        return row.bar
+
+    found = bar(one_sided, 1.0)
+    assert found.low == found.value == MIDDLE
+    assert found.high == pytest.approx(MIDDLE + 2 * HALF_LENGTH / 2.5)
+    found = bar(replace(one_sided, ci95=(-np.inf, 3.0)), 1.0)
+    assert found.low == MIDDLE - HALF_LENGTH < found.value < found.high < MIDDLE + HALF_LENGTH
+    assert bar(replace(one_sided, ci95=(-np.inf, np.inf)), 1.0) is None
+    found = bar_from_nominal(1.0, (1.0, 3.0), 2.0)
+    assert found is not None
+    reach = pytest.approx(HALF_LENGTH / 1.05, abs=0.06)
+    assert MIDDLE - found.low == reach
+    assert found.high - MIDDLE == reach
 
 
 def test_shortened_expression() -> None:

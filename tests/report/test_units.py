@@ -15,6 +15,7 @@ from elastocal.report.units import (
     plain,
     rounded_alike,
     significant,
+    with_ends,
     with_uncertainty,
 )
 
@@ -65,6 +66,32 @@ def test_rounding_stays_within_the_interval(value: float, half: float) -> None:
     number, shown = (float(text) for text in with_uncertainty(value, half))
     assert abs(number - value) <= 0.5001 * 10 ** math.ceil(math.log10(half)) + 1e-9
     assert shown == pytest.approx(half, rel=0.18)
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "shown"),
+    [
+        (0.0, 0.0, 0.01312, ("0.000", "[0.000, 0.013]")),
+        (1.0, 0.99, 3.0, ("1.00", "[0.99, 3.00]")),
+        (2.77, -math.inf, 2.8412, ("2.770", "[-∞, 2.841]")),
+        (2.77, 2.7, math.inf, ("2.770", "[2.700, ∞]")),
+        (-0.5, -0.5, -0.2, ("-0.50", "[-0.50, -0.20]")),
+        (3.50897, -math.inf, math.inf, ("3.50897", "[-∞, ∞]")),
+    ],
+)
+def test_both_ends(value: float, low: float, high: float, shown: tuple[str, str]) -> None:
+    assert with_ends(value, low, high) == shown
+
+
+@given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(1e-3, 1e3))
+def test_ends_are_rounded_by_a_twentieth_of_the_interval_at_most(
+    value: float, below: float, above: float
+) -> None:
+    low, high = value - below, value + above
+    text, ends = with_ends(value, low, high)
+    shown = [float(text), *map(float, ends.strip("[]").split(", "))]
+    for number, exact in zip(shown, (value, low, high), strict=True):
+        assert abs(number - exact) <= 0.051 * (high - low) + 1e-9
 
 
 def test_estimate_in_display_units() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from elastocal.errors import ElastocalError
@@ -46,7 +48,7 @@ def report_faulty(
             e = block_diagonal(own) @ (whiten.T @ (whiten @ e))
         B, e = root @ B, root @ e
     try:
-        return outlier_report(
+        report = outlier_report(
             B, e, size=seen.size, good=good, line=table.row[seen.lead],
             marker=_labels(table.marker_names, table.marker[seen.lead]),
             configuration=None if shared else _labels(
@@ -55,6 +57,7 @@ def report_faulty(
         )  # fmt: skip
     except (ElastocalError, np.linalg.LinAlgError):
         return None
+    return replace(report, names=tuple(problem.model.names[c] for c in columns))
 
 
 def _labels(names: tuple[str, ...], codes: np.ndarray) -> np.ndarray | None:

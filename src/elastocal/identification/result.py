@@ -224,7 +224,7 @@ class IdentificationResult:
             ],
             "prior_share": self.prior_share,
             "faulty_report": (
-                None if self.faulty_report is None else self.faulty_report.named(self.determined)
+                None if self.faulty_report is None else self.faulty_report.to_json()
             ),
             "converged": self.converged,
             "outliers": [vars(o) for o in self.outliers],

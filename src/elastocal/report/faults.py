@@ -34,8 +34,8 @@ def false_alarm_line(result: IdentificationResult) -> str | None:
     report = result.faulty_report
     if report is None or not fault_lines(result):
         return None
-    share = significant(100 * report.false_alarm, 2)
-    return f"Of tables in which nothing is wrong, {share} % would yield any finding at all."
+    share = 100 * report.false_alarm
+    return f"Of tables in which nothing is wrong, at most {share:g} % would yield any finding."
 
 
 def _sentence(result: IdentificationResult, finding: Finding) -> str:
@@ -52,10 +52,11 @@ def _sentence(result: IdentificationResult, finding: Finding) -> str:
 def _metres(result: IdentificationResult, finding: Finding) -> float | None:
     """Typical error in m, None where most of the readings are not listed one by one.
 
-    The median where they err in common, which those that do not leave alone; else the rms.  Of
-    a pose the list has the position's error only, and the finding may be one of rotation.
+    The median where they err in common, which those that do not leave alone; else the rms.  Where
+    they bend the fit, the listed errors are smaller than those found.  Of a pose the list has the
+    position's error only, and the finding may be one of rotation.
     """
-    if result.observations.kind == "pose":
+    if result.observations.kind == "pose" or _bends(result, finding):
         return None
     lines = set(finding.lines)
     listed = [o.residual for o in result.faulty if o.line in lines]
@@ -67,18 +68,17 @@ def _metres(result: IdentificationResult, finding: Finding) -> float | None:
 
 
 def _influence(result: IdentificationResult, finding: Finding) -> str:
-    """What the readings do, or would do if they were fitted along, to the parameter they move most.
-
-    The finding's column is one of the fit without them, whose parameters may be fewer.
-    """
-    report = result.faulty_report
-    if report is None or len(report.x) != len(result.determined):
-        return ""
-    name = printable(result.determined[finding.column])
+    """What they do, or would do if fitted along, to the parameter that they move most."""
+    names = () if result.faulty_report is None else result.faulty_report.names
+    name = printable(names[finding.column]) if names else "a parameter"
     if not math.isfinite(finding.influence):
         return f"; the other readings leave {name} undetermined"
-    apart = {o.line for o in result.excluded} & set(finding.lines)
-    bends = method_of(result) in FULL_WEIGHT and not apart
-    how = "in the fit they move" if bends else "fitted along they would move"
+    how = "in the fit they move" if _bends(result, finding) else "fitted along they would move"
     count = significant(finding.influence, 2)
     return f"; {how} {name} by {count} standard deviation{'' if count == '1.0' else 's'}"
+
+
+def _bends(result: IdentificationResult, finding: Finding) -> bool:
+    """Whether the readings have their full weight in the fit."""
+    apart = {o.line for o in result.excluded} & set(finding.lines)
+    return method_of(result) in FULL_WEIGHT and not apart

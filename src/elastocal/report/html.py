@@ -146,9 +146,9 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
 
 def _endless(result: IdentificationResult) -> str:
     """A sentence for bars that run off, empty where every interval has two ends."""
-    ends = [end for e in (*result.estimates, *result.combinations) for end in e.ci95 or ()]
-    found = any(math.isinf(end) for end in ends)
-    return " An interval without an end runs to the edge." if found else ""
+    intervals = [e.ci95 for e in result.estimates] + [c.ci95 for c in result.combinations]
+    endless = any(math.isinf(end) for ci95 in intervals for end in ci95 or ())
+    return " An interval without an end runs to the edge." if endless else ""
 
 
 def _noise(result: IdentificationResult, summary: ResidualSummary | None) -> dict[str, Any]:

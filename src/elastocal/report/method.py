@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.result import IdentificationResult
 from elastocal.report.units import display, plain
 from elastocal.report.words import printable
@@ -91,6 +92,7 @@ LARGE = {
     "cr0": "that these are many",
     "cr1": "that these are many, ten or more per parameter",
 }
+SIGNS = {"lower": "≥", "upper": "≤", "equality": "="}
 HELD = {
     "constrained profile": (
         "Intervals keep the constraints: they stop at bounds and take equalities for exact"
@@ -158,23 +160,25 @@ def constraints_line(result: IdentificationResult) -> str | None:
     if not active:
         return None
     units = {p.name: p.unit for p in result.model.parameters}
-    texts = []
-    for a in active[:MOST_NAMED]:
-        if a.kind == "semidefinite":
-            texts.append(f"{printable(a.label)} (semidefinite)")
-            continue
-        value, unit = a.value, ""
-        if len(a.names) == 1 and a.names[0] in units:
-            value, unit = display(a.value, units[a.names[0]])
-            unit = f" {unit}"
-        text = f"{printable(a.label)} ({a.kind}{'' if a.kind == 'equality' else ' bound'}"
-        texts.append(f"{text} {plain(value)}{unit})")
+    texts = [_in_words(a, units) for a in active[:MOST_NAMED]]
     more = len(active) - len(texts)
     text = "; ".join([*texts, *([f"and {more} more"] if more else [])])
     bound = any(a.kind != "equality" for a in active)
     want = "; the readings alone would go beyond the bounds" if bound else ""
     held = HELD.get(interval_kind(result), "Intervals take these for exact")
     return f"Active: {text}. {held}{want}."
+
+
+def _in_words(a: ActiveConstraint, units: dict[str, str]) -> str:
+    """ "joint2.compliance ≥ 0 µrad/(N·m)"; a label of the user's own stays as it is."""
+    label = printable(a.label)
+    if a.kind == "semidefinite":
+        return f"{label} (semidefinite)"
+    own = a.kind == "equality" and a.label != f"{a.names[0]} = {a.value:.6g}"
+    if len(a.names) != 1 or own or a.names[0] not in units:
+        return label
+    value, unit = display(a.value, units[a.names[0]])
+    return f"{printable(a.names[0])} {SIGNS[a.kind]} {plain(value)} {unit}"
 
 
 def prior_line(result: IdentificationResult) -> str | None:

@@ -39,7 +39,7 @@ def does_noise_explain_it(result: IdentificationResult) -> str:
         size = ""
         if sigma is not None and method == "ols":
             size = f"; the residual amounts to {length(sigma * 1e-6)} per coordinate"
-        elif method == "reml":
+        elif _is_estimated(result):
             size = "; the size of the noise was estimated from the readings"
         return f"{_why_not_judged(result)}{size}."
     low, high = np.sqrt(stats.chi2.ppf([0.025, 0.975], result.dof) / result.dof)
@@ -54,9 +54,14 @@ def does_noise_explain_it(result: IdentificationResult) -> str:
         text = f"The residual is smaller than the stated noise ({size}): it was stated too large."
     else:
         return f"The residual agrees with the stated noise ({size})."
-    if method_of(result) == "reml":
+    if _is_estimated(result):
         text += " Weights and intervals follow the noise that the readings show."
     return text
+
+
+def _is_estimated(result: IdentificationResult) -> bool:
+    """Whether the weights come from a noise model with estimated variances."""
+    return method_of(result) in ("reml", "constrained") and bool(result.noise.get("variances"))
 
 
 def _why_not_judged(result: IdentificationResult) -> str:

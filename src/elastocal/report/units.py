@@ -64,12 +64,15 @@ def with_ends(value: float, low: float, high: float) -> tuple[str, str]:
 
 
 def resolution(value: float, low: float, high: float) -> float:
-    """The half width that sets the digits of a lopsided interval, 0 where it has none.
+    """The half width whose digits a lopsided interval is shown with, 0 where both ends are open.
 
-    The shorter side that is neither empty nor without an end, but a tenth of the longer at least.
+    Its shorter side gets two digits, unless that is empty, without an end, or below a tenth of
+    the longer.
     """
     sides = [side for side in (value - low, high - value) if 0 < side < math.inf]
-    return max(min(sides), max(sides) / 10) if sides else 0.0
+    if not sides:
+        return 0.0
+    return 1.5 * 10.0 ** math.floor(math.log10(max(min(sides), max(sides) / 10)))
 
 
 def rounded_alike(value: float, half: float) -> str:

@@ -15,7 +15,6 @@ it was seen in.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Literal
@@ -64,7 +63,8 @@ class OutlierReport:
     """Findings, groups before readings and the largest first, and what is left without them.
 
     `x` (p,) is the estimate without them and `sigma` the noise of a whitened row.  `tests` says
-    how many were made per level, `good` (n,) which observations x rests on.
+    how many were made per level, `good` (n,) which observations x rests on, `names` (p,) those of
+    the parameters where they have any.
     """
 
     findings: tuple[Finding, ...]
@@ -74,6 +74,7 @@ class OutlierReport:
     good: Mask
     tests: dict[str, int]
     false_alarm: float
+    names: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, strings and lists; an unbounded influence is None."""
@@ -82,6 +83,8 @@ class OutlierReport:
             entry["readings"], entry["lines"] = list(entry["readings"]), list(entry["lines"])
             if not np.isfinite(entry["influence"]):
                 entry["influence"] = None
+            if self.names:
+                entry["moves_most"] = self.names[entry.pop("column")]
         return {
             "findings": listed,
             "sigma": self.sigma,
@@ -90,13 +93,6 @@ class OutlierReport:
             "tests": dict(self.tests),
             "false_alarm": self.false_alarm,
         }
-
-    def named(self, names: Sequence[str]) -> dict[str, Any]:
-        """As `to_json`, with the name of the parameter that each finding moves most."""
-        found = self.to_json()
-        for entry in found["findings"]:
-            entry["moves_most"] = names[entry.pop("column")]
-        return found
 
 
 def outlier_report(
