@@ -24,10 +24,11 @@ def outliers(lines: range, residual: float = 4.5e-3) -> tuple[Outlier, ...]:
     return tuple(Outlier(line, "7", "M1", residual, 9.0) for line in lines)
 
 
-def with_findings(result: Any, *findings: Finding, parameters: int | None = None, **to: Any) -> Any:
-    n = len(result.determined) if parameters is None else parameters
+def with_findings(result: Any, *findings: Finding, named: bool = True, **to: Any) -> Any:
+    n = len(result.determined)
     good = np.ones(len(result.observations.lead), dtype=bool)
-    report = OutlierReport(findings, np.zeros(n), 1.0, 100, good, {}, 0.01)
+    names = tuple(result.determined) if named else ()
+    report = OutlierReport(findings, np.zeros(n), 1.0, 100, good, {}, 0.01, names)
     return replace(result, **{"method": "reml", "outliers": (), "excluded": ()} | to,
                    faulty_report=report)  # fmt: skip
 
@@ -64,9 +65,8 @@ def test_millimetres_only_where_the_readings_are_listed_and_do_not_bend_the_fit(
     assert "200 of them beyond the noise alone" in text
 
 
-def test_parameter_is_named_only_where_the_column_is_its_own(case: Any) -> None:
-    few = len(case.result.determined) - 1
-    (text,) = fault_lines(with_findings(case.result, BLOCK, parameters=few))
+def test_parameter_is_named_where_the_report_knows_its_name(case: Any) -> None:
+    (text,) = fault_lines(with_findings(case.result, BLOCK, named=False))
     assert "move a parameter by 23" in text
     unknown = replace(BLOCK, influence=float("inf"))
     (text,) = fault_lines(with_findings(case.result, unknown))
