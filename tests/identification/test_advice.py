@@ -27,7 +27,7 @@ SENTENCES = {
     "few": "degrees of freedom for",
     "alone": "Some configuration alone determines a parameter",
     "ill": "Ill-conditioned (condition number",
-    "noise": "times the stated noise (",
+    "noise": "times the stated noise: ",
     "at bound": "stands at its bound",
     "beyond bound": "lies beyond its physical bound",
     "outliers": "beyond what the noise explains",
