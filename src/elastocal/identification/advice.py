@@ -79,9 +79,9 @@ def _noise(result: IdentificationResult) -> list[str]:
     if ratio is None or ratio < FAR_ABOVE_STATED:
         return []
     return [
-        f"The residual is {ratio:.1f} times the stated noise: something is unmodelled or the stated "
-        "noise is too small. The intervals use the residual, not the stated noise; look for "
-        "effects that the model lacks."
+        f"The residual is {ratio:.1f} times the stated noise: something is unmodelled or the "
+        "stated noise is too small. The intervals use the residual, not the stated noise; look "
+        "for effects that the model lacks."
     ]
 
 
