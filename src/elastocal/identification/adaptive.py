@@ -83,9 +83,9 @@ def _settled(
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
         if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
             break
-    chosen = solution.problem.observations
-    inner = linearised(model, chosen, solution.fit.x, solution.reduction.kept)
-    final = estimate_noise(inner, noise.kind)
+    # One that ended at a bound is held there and no longer a column.
+    fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
+    final = estimate_noise(fitted, noise.kind)
     final = replace(final, trials=noise.trials, reason=noise.reason)
     return Adapted(solution, final, now)
 

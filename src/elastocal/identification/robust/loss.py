@@ -52,10 +52,9 @@ class Loss(ABC):
 
 
 @dataclass(frozen=True)
-class Huber(Loss):
-    """ρ = d²/2 up to c, c|d| − c²/2 beyond (Huber 1964)."""
+class Cut(Loss):
+    """A loss that changes its form at d = c."""
 
-    name: ClassVar[str] = "huber"
     c: float
 
     def __post_init__(self) -> None:
@@ -65,6 +64,13 @@ class Huber(Loss):
     @property
     def kink(self) -> float:
         return self.c
+
+
+@dataclass(frozen=True)
+class Huber(Cut):
+    """ρ = d²/2 up to c, c|d| − c²/2 beyond (Huber 1964)."""
+
+    name: ClassVar[str] = "huber"
 
     def rho(self, d: Array) -> Array:
         a = np.abs(d)
@@ -78,19 +84,10 @@ class Huber(Loss):
 
 
 @dataclass(frozen=True)
-class Bisquare(Loss):
+class Bisquare(Cut):
     """Tukey's ρ = c²/6 (1 − (1 − (d/c)²)³) up to c, c²/6 beyond (Beaton and Tukey 1974)."""
 
     name: ClassVar[str] = "tukey"
-    c: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _positive("c", self.c)
-
-    @property
-    def kink(self) -> float:
-        return self.c
 
     @property
     def largest(self) -> float:

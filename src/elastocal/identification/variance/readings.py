@@ -72,6 +72,10 @@ class Readings:
         parts = {name: getattr(self, name) for name in names}
         return replace(self, **{k: v[chosen] for k, v in parts.items() if v is not None})
 
+    def of_columns(self, chosen: Mask) -> Readings:
+        """Only the columns of B where `chosen` (p,) holds."""
+        return replace(self, B=self.B[:, :, chosen])
+
     def moved(self, e: Array) -> Readings:
         """The same readings with other residuals (N, size)."""
         return replace(self, e=e)
