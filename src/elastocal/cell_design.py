@@ -17,8 +17,11 @@ CriterionName = Literal[
 
 @dataclass(frozen=True)
 class TargetPose:
-    """A test pose, where position must be right: joints `q` (n,), force (3,) N, `point` (3,) m in the flange
-    frame (None: the load point if the cell states one, else the mean over the markers)."""
+    """A test pose, where position must be right: joints `q` (n,) and force (3,) N.
+
+    `point` (3,) m in the flange frame; None: the load point if the cell states one, else the mean
+    over the markers.
+    """
 
     q: Array
     force: Array | None = None
@@ -37,8 +40,10 @@ class TargetPath:
 
 @dataclass(frozen=True)
 class TargetBox:
-    """`count` test poses with the point inside a box (m, data's frame), sampled; `rotation` (3, 3) of
-    the flange in the data's frame, None for any that the arm reaches."""
+    """`count` test poses with the point inside a box (m, data's frame), sampled.
+
+    `rotation` (3, 3) of the flange in the data's frame, None for any that the arm reaches.
+    """
 
     lower: Array
     upper: Array
