@@ -8,7 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from elastocal.cell import CartesianNoise, EffectChoice, PolarNoise
+from elastocal.cell_design import DesignSpec
 from elastocal.cell_reader import read_cell
+from elastocal.cell_workspace import Workspace
 from elastocal.errors import InputError
 
 ROBOT = '[robot]\nurdf = "arm.urdf"\n'
@@ -55,6 +57,7 @@ def test_the_smallest_cell_has_a_robot_and_defaults(read, folder):
     assert cell.model.effects == ()
     assert cell.tracker.noise is None
     assert cell.tool.markers == {}
+    assert (cell.workspace, cell.design) == (Workspace(), DesignSpec())
     assert (cell.tool.load_point == 0).all()
 
 
@@ -97,11 +100,9 @@ joint2_rad = [-1, 1]
 joint3_mm = [0, 500]
 joint4_m = [0, 0.5]
 [workspace]
-anything = { goes = 1 }
+clearance_mm = 20
 [design]
 poses = 20
-[[design.test_pose]]
-q_deg = [1, 2]
 """)
     assert cell.name == "cell 7"
     assert (cell.robot.base, cell.robot.flange) == ("base_link", "tool0")
@@ -134,8 +135,8 @@ q_deg = [1, 2]
     assert cell.limits["joint2"] == (-1.0, 1.0)
     assert cell.limits["joint3"] == (0.0, 0.5)
     assert cell.limits["joint4"] == (0.0, 0.5)
-    assert cell.workspace == {"anything": {"goes": 1}}
-    assert cell.design == {"poses": 20, "test_pose": [{"q_deg": [1, 2]}]}
+    assert cell.workspace.clearance == 0.02
+    assert cell.design.poses == 20
 
 
 def test_base_rotation_is_yaw_after_pitch_after_roll(read):
@@ -178,6 +179,7 @@ def test_byte_order_mark_and_windows_line_ends_are_understood(read, text):
         ("[model.nominal]\nbase_rpy = [0, 0, 0]", ["model.nominal.base_rpy;", "base_rpy_deg"]),
         ("[trackr]\nposition_m = [0, 0, 0]", ["trackr", "did you mean tracker"]),
         ("[model]\nposition_m = [0, 0, 0]", ["model.position_m", "[tracker]"]),
+        ("[model]\nobstacle = 1", ["model.obstacle", "did you mean it in [workspace]"]),
         ("[limits]\njoint1 = [0, 1]", ["limits.joint1;", "missing unit: joint1_deg"]),
         ("[limits]\njoin1_deg = [0, 1]", ["limits.join1_deg", "joint1_deg"]),
         ("[limits]\njoint0_deg = [0, 1]", ["limits.joint0_deg"]),

@@ -9,6 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.cell_design import DesignSpec
+from elastocal.cell_workspace import Workspace
+
 Array = NDArray[np.float64]
 Observe = Literal["position", "deflection", "pose", "distance"]
 
@@ -104,5 +107,5 @@ class Cell:
     tracker: Tracker = field(default_factory=Tracker)
     model: ModelSpec = field(default_factory=ModelSpec)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
-    workspace: dict[str, Any] = field(default_factory=dict)
-    design: dict[str, Any] = field(default_factory=dict)
+    workspace: Workspace = field(default_factory=Workspace)
+    design: DesignSpec = field(default_factory=DesignSpec)

@@ -17,16 +17,18 @@ CriterionName = Literal[
 
 @dataclass(frozen=True)
 class TargetPose:
-    """A test pose, where position must be right: joints `q` (n,) and force (3,) N.
+    """A test pose, where position must be right: joints `q` (n,) rad or m and force (3,) N.
 
     `point` (3,) m in the flange frame; None: the load point if the cell states one, else the mean
-    over the markers.
+    over the markers.  `force` None: each of the design's loads that is not zero.  `degrees`: q
+    was stated in degrees, which fits revolute joints only.
     """
 
     q: Array
     force: Array | None = None
     weight: float = 1.0
     point: Array | None = None
+    degrees: bool = False
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,11 @@ class TargetBox:
 
 @dataclass(frozen=True)
 class Motion:
-    """How the arm moves between poses: joint `speed` (n,) rad/s or m/s (None: equal speeds),
-    `home` (n,), `step` rad at most between checked poses, `dwell` s of measuring per pose,
-    `load_change` s for hanging or taking off the load by hand, `both_directions`: approach
-    every pose from both sides (`overshoot` rad), to show backlash."""
+    """How the arm moves between poses: joint `speed` (n,) rad/s or m/s, (1,) where all are alike
+    (None: equal speeds), `home` (n,), `step` rad at most between checked poses, `dwell` s of
+    measuring per pose, `load_change` s for hanging or taking off the load by hand,
+    `both_directions`: approach every pose from both sides (`overshoot` rad), to show backlash.
+    `degrees`: speed or home were stated in degrees, which fits revolute joints only."""
 
     speed: Array | None = None
     home: Array | None = None
@@ -67,6 +70,7 @@ class Motion:
     load_change: float = 600.0
     both_directions: bool = False
     overshoot: float = 0.05
+    degrees: bool = False
 
 
 @dataclass(frozen=True)

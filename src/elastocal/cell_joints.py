@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from elastocal.cell_complaint import dotted
+from elastocal.cell_keys import dotted
 from elastocal.errors import InputError
 from elastocal.nearest import did_you_mean
 from elastocal.units import to_si
@@ -16,9 +16,14 @@ JOINT_KEY = re.compile(r"(joint[1-9][0-9]{0,2})(?:_(deg|rad|mm|m))?", re.ASCII)
 
 
 def joint_values(
-    path: Path, above: tuple[str, ...], table: Mapping[str, Sequence[float]]
+    path: Path,
+    above: tuple[str, ...],
+    table: Mapping[str, Sequence[float]],
+    others: tuple[str, ...] = (),
 ) -> dict[str, tuple[float, ...]]:
     """Values in SI units per joint name, from keys such as joint2_deg of the table `above`.
+
+    `others`: further keys of that table, which a misspelt one may have been meant for.
 
     Raises InputError for other keys, missing units, and a joint given in two units.
     """
@@ -27,7 +32,7 @@ def joint_values(
         match = JOINT_KEY.fullmatch(key)
         joint, unit = match.groups() if match else (None, None)
         if joint is None or unit is None:
-            valid = [f"joint{i}_{u}" for i in range(1, 10) for u in JOINT_UNITS]
+            valid = [f"joint{i}_{u}" for i in range(1, 10) for u in JOINT_UNITS] + [*others]
             names = " or ".join(f"{joint}_{u}" for u in JOINT_UNITS)
             hint = did_you_mean(key, valid) if joint is None else f"; missing unit: {names}"
             raise InputError(

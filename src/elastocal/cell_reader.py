@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import ValidationError
 
 from elastocal.cell import (
-    Array,
     CartesianNoise,
     Cell,
     EffectChoice,
@@ -23,6 +22,8 @@ from elastocal.cell import (
     Tracker,
 )
 from elastocal.cell_complaint import complaint
+from elastocal.cell_design_reader import read_design
+from elastocal.cell_design_schema import DesignTable
 from elastocal.cell_joints import joint_values
 from elastocal.cell_schema import (
     CellTable,
@@ -32,6 +33,9 @@ from elastocal.cell_schema import (
     ToolTable,
     TrackerTable,
 )
+from elastocal.cell_values import rotation_from_rpy
+from elastocal.cell_workspace_reader import read_workspace
+from elastocal.cell_workspace_schema import WorkspaceTable
 from elastocal.errors import InputError
 from elastocal.files import check_exists, read_text
 from elastocal.labels import is_label
@@ -46,8 +50,7 @@ def read_cell(path: str | Path, known_effects: tuple[str, ...] | None = None) ->
     """The cell that a TOML file describes, in SI units.
 
     Paths in it are relative to the file; the robot's files must exist.  `known_effects`: the
-    names that `[model] effects` may use; None leaves them unchecked.  `[workspace]` and
-    `[design]` are handed on as they stand.
+    names that `[model] effects` may use; None leaves them unchecked.
 
     Raises InputError that names file, key, what the key takes and the nearest valid name.
     """
@@ -57,16 +60,24 @@ def read_cell(path: str | Path, known_effects: tuple[str, ...] | None = None) ->
         table = CellTable.model_validate(data)
     except ValidationError as error:
         raise complaint(path, data, error) from None
+    tool = _tool(path, table.tool or ToolTable())
+    markers = tuple(tool.markers)
+    workspace = read_workspace(path, table.workspace or WorkspaceTable(), markers)
+    if workspace.urdf_geometry and table.robot.urdf is None:
+        raise InputError(
+            f'{path}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm for '
+            "capsules along the links instead"
+        )
     return Cell(
         name=table.name or path.stem,
         path=path,
         robot=_robot(path, table.robot),
-        tool=_tool(path, table.tool or ToolTable()),
+        tool=tool,
         tracker=_tracker(path, table.tracker or TrackerTable()),
         model=_model(path, table.model or ModelTable(), known_effects),
         limits=_limits(path, table.limits or {}),
-        workspace=table.workspace or {},
-        design=table.design or {},
+        workspace=workspace,
+        design=read_design(path, table.design or DesignTable(), markers),
     )
 
 
@@ -169,18 +180,9 @@ def _nominal(table: NominalTable) -> Nominal:
     return Nominal(
         joint_compliance=None if compliance is None else tuple(compliance),
         base_position=None if table.base_position_m is None else np.array(table.base_position_m),
-        base_rotation=None if table.base_rpy_deg is None else _rotation(table.base_rpy_deg),
+        base_rotation=None if table.base_rpy_deg is None else rotation_from_rpy(table.base_rpy_deg),
         gravity_compensator=None if spring is None else spring.model_dump(exclude_none=True),
     )
-
-
-def _rotation(rpy_deg: Sequence[float]) -> Array:
-    """Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(np.radians(rpy_deg)), np.sin(np.radians(rpy_deg))
-    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    return about_z @ about_y @ about_x
 
 
 def _effects(

@@ -2,95 +2,94 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-Text = Annotated[str, Field(min_length=1)]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Vector2 = Annotated[list[float], Field(min_length=2, max_length=2)]
-Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
-Positive3 = Annotated[list[Positive], Field(min_length=3, max_length=3)]
-Numbers = Annotated[list[float], Field(min_length=1)]
+from elastocal.cell_design_schema import DesignTable
+from elastocal.cell_table import (
+    NonNegative,
+    Numbers,
+    Positive,
+    Positive3,
+    Table,
+    Text,
+    Vector2,
+    Vector3,
+    key,
+    required,
+)
+from elastocal.cell_workspace_schema import WorkspaceTable
+
 JointName = Annotated[str, Field(pattern=r"^joint[1-9][0-9]{0,2}$")]
 
 
-def _key(takes: str) -> Any:
-    """An optional key; `takes` completes the sentence 'key … takes …' in messages."""
-    return Field(default=None, description=takes)
-
-
-class Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-
-
 class RobotTable(Table):
-    urdf: Text | None = _key('the path of a URDF file, e.g. "arm.urdf"')
-    base: Text | None = _key("the name of a link of the URDF")
-    flange: Text | None = _key("the name of a link of the URDF")
-    dh: Text | None = _key('the path of a DH table, e.g. "nominal_dh.csv"')
-    dh_convention: Literal["standard", "modified"] | None = _key('"standard" or "modified"')
-    masses: Text | None = _key('the path of a table of link masses, e.g. "links.csv"')
+    urdf: Text | None = key('the path of a URDF file, e.g. "arm.urdf"')
+    base: Text | None = key("the name of a link of the URDF")
+    flange: Text | None = key("the name of a link of the URDF")
+    dh: Text | None = key('the path of a DH table, e.g. "nominal_dh.csv"')
+    dh_convention: Literal["standard", "modified"] | None = key('"standard" or "modified"')
+    masses: Text | None = key('the path of a table of link masses, e.g. "links.csv"')
 
 
 class ToolTable(Table):
-    load_point_m: Vector3 | None = _key("three numbers in m, in the flange frame")
-    markers_m: dict[str, Vector3] | None = _key("three numbers in m per marker, flange frame")
+    load_point_m: Vector3 | None = key("three numbers in m, in the flange frame")
+    markers_m: dict[str, Vector3] | None = key("three numbers in m per marker, flange frame")
 
 
 class TrackerTable(Table):
-    position_m: Vector3 | None = _key("three numbers in m")
-    anchor_m: Vector3 | None = _key("three numbers in m")
-    sigma_um: Positive | Positive3 | None = _key("one positive number in µm, or three for x, y, z")
-    range_um: Positive | None = _key("a positive number in µm")
-    range_ppm: NonNegative | None = _key("a number >= 0 in µm per m")
-    transverse_um: Positive | None = _key("a positive number in µm")
-    transverse_ppm: NonNegative | None = _key("a number >= 0 in µm per m")
-    rotation_urad: Positive | None = _key("a positive number in µrad")
-    distance_um: Positive | None = _key("a positive number in µm")
+    position_m: Vector3 | None = key("three numbers in m")
+    anchor_m: Vector3 | None = key("three numbers in m")
+    sigma_um: Positive | Positive3 | None = key("one positive number in µm, or three for x, y, z")
+    range_um: Positive | None = key("a positive number in µm")
+    range_ppm: NonNegative | None = key("a number >= 0 in µm per m")
+    transverse_um: Positive | None = key("a positive number in µm")
+    transverse_ppm: NonNegative | None = key("a number >= 0 in µm per m")
+    rotation_urad: Positive | None = key("a positive number in µrad")
+    distance_um: Positive | None = key("a positive number in µm")
 
 
 class CompensatorTable(Table):
-    joint: JointName = Field(description='the joint the spring spans, e.g. "joint2"')
-    stiffness_N_per_m: NonNegative | None = _key("a number >= 0 in N/m")
-    anchor_m: Vector2 | None = _key("two numbers in m")
-    arm_m: Positive | None = _key("a positive number in m")
-    free_length_m: NonNegative | None = _key("a number >= 0 in m")
+    joint: JointName = required('the joint the spring spans, e.g. "joint2"')
+    stiffness_N_per_m: NonNegative | None = key("a number >= 0 in N/m")
+    anchor_m: Vector2 | None = key("two numbers in m")
+    arm_m: Positive | None = key("a positive number in m")
+    free_length_m: NonNegative | None = key("a number >= 0 in m")
 
 
 class NominalTable(Table):
-    joint_compliance: Annotated[list[NonNegative], Field(min_length=1)] | None = _key(
+    joint_compliance: Annotated[list[NonNegative], Field(min_length=1)] | None = key(
         "one number >= 0 per joint, in rad/(N m)"
     )
-    base_position_m: Vector3 | None = _key("three numbers in m")
-    base_rpy_deg: Vector3 | None = _key("three numbers in degrees: roll, pitch, yaw")
-    gravity_compensator: CompensatorTable | None = _key('a table with joint = "joint2"')
+    base_position_m: Vector3 | None = key("three numbers in m")
+    base_rpy_deg: Vector3 | None = key("three numbers in degrees: roll, pitch, yaw")
+    gravity_compensator: CompensatorTable | None = key('a table with joint = "joint2"')
 
 
 class ModelTable(Table):
-    observe: Literal["position", "deflection", "pose", "distance"] | None = _key(
+    observe: Literal["position", "deflection", "pose", "distance"] | None = key(
         '"position", "deflection", "pose" or "distance"'
     )
-    effects: list[Text] | None = _key('a list of "effect" or "effect:where"')
-    torque: Literal["computed", "measured"] | None = _key('"computed" or "measured"')
-    link_gravity: bool | None = _key("true or false")
-    deflection_model: Literal["equilibrium", "linear"] | None = _key('"equilibrium" or "linear"')
-    compliance_levels: dict[str, Numbers] | None = _key(
+    effects: list[Text] | None = key('a list of "effect" or "effect:where"')
+    torque: Literal["computed", "measured"] | None = key('"computed" or "measured"')
+    link_gravity: bool | None = key("true or false")
+    deflection_model: Literal["equilibrium", "linear"] | None = key('"equilibrium" or "linear"')
+    compliance_levels: dict[str, Numbers] | None = key(
         "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]"
     )
-    gear_ripple_orders: list[Positive] | None = _key("a list of positive numbers")
-    nominal: NominalTable | None = _key("a table")
+    gear_ripple_orders: list[Positive] | None = key("a list of positive numbers")
+    nominal: NominalTable | None = key("a table")
 
 
 class CellTable(Table):
-    name: Text | None = _key("a text")
-    robot: RobotTable = Field(description='a table with urdf = "arm.urdf" or dh = "dh.csv"')
-    tool: ToolTable | None = _key("a table")
-    tracker: TrackerTable | None = _key("a table")
-    model: ModelTable | None = _key("a table")
-    limits: dict[str, Vector2] | None = _key(
+    name: Text | None = key("a text")
+    robot: RobotTable = required('a table with urdf = "arm.urdf" or dh = "dh.csv"')
+    tool: ToolTable | None = key("a table")
+    tracker: TrackerTable | None = key("a table")
+    model: ModelTable | None = key("a table")
+    limits: dict[str, Vector2] | None = key(
         "two numbers per joint, as in joint1_deg = [-170.0, 170.0]"
     )
-    workspace: dict[str, Any] | None = _key("a table")
-    design: dict[str, Any] | None = _key("a table")
+    workspace: WorkspaceTable | None = key("a table")
+    design: DesignTable | None = key("a table")

@@ -84,9 +84,10 @@ class Visibility:
 
 @dataclass(frozen=True)
 class Workspace:
-    """`link_radius` (n,) m: capsules along the links, () for none; `urdf_geometry`: the URDF's
-    own collision shapes.  `clearance` m to obstacles, `self_clearance` m between bodies of the
-    arm; `ignored_pairs` of body names that may touch; `torque_limits` (n,) N m static, () none."""
+    """`link_radius` (n,) m: capsules along the links, (1,) where all are alike, () for none;
+    `urdf_geometry`: the URDF's own collision shapes.  `clearance` m to obstacles,
+    `self_clearance` m between bodies of the arm; `ignored_pairs` of body names that may touch;
+    `torque_limits` (n,) N m static, () none."""
 
     obstacles: tuple[Solid, ...] = ()
     bodies: tuple[CarriedBody, ...] = ()

@@ -86,6 +86,29 @@ class SymbolicArm:
         slope = ca.substitute(ca.jacobian(expression, theta), theta, rest)
         return ca.substitute(expression, theta, rest) + slope @ deflection
 
+    def explicit(self, expression: ca.SX, steps: int) -> ca.SX:
+        """`expression` of inputs, X and θ as one of inputs and X alone.
+
+        Deflections by eq. (3) where the model is linear, else after `steps` fixed-point steps
+        θ ← law(τ(θ)) from rest, each of which divides the error by the ratio of a joint's
+        stiffness to the change of the load's torque with its angle (a hundred and more).
+        """
+        if self._linear:
+            return ca.reshape(self._linearised(ca.vec(expression)), *expression.shape)
+        theta = self.arm.theta
+        if not self.implicit:
+            return expression
+        law = theta - self._residual
+        settled = ca.SX.zeros(theta.shape[0], 1)
+        for _ in range(steps):
+            settled = ca.substitute(law, theta, settled)
+        return ca.substitute(expression, theta, settled)
+
+    @property
+    def reading(self) -> ca.SX:
+        """The reading h of one row (3, 6 or 1 components) in inputs, X and θ."""
+        return self._reading
+
     @cached_property
     def equilibrium(self) -> Equilibrium:
         inputs = list(self.arm.inputs.values())

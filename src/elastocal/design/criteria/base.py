@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 # Matrices (..., S, p, p) that a batched evaluation holds at once, as numbers.
 BATCH_NUMBERS = 2_000_000
@@ -23,6 +24,19 @@ class Gradient:
     G: Array
 
 
+def candidate_sums(M: Array, blocks: Array) -> Iterator[tuple[slice, Array]]:
+    """M_s + B_siᵀ B_si (n, S, p, p) for slices of candidates that fit into memory.
+
+    M (S, p, p), blocks (S, N, r, p).
+    """
+    scenarios, n, _, p = blocks.shape
+    size = max(BATCH_NUMBERS // (scenarios * p * p), 1)
+    for start in range(0, n, size):
+        part = slice(start, start + size)
+        B = blocks[:, part]
+        yield part, M + (B.swapaxes(-1, -2) @ B).swapaxes(0, 1)
+
+
 class Criterion(ABC):
     """Φ(M), to be minimised, M (S, p, p): information under each of S scenarios of the arm.
 
@@ -32,8 +46,8 @@ class Criterion(ABC):
     information this is Φ²/Σ_l n_l max_{i∈l} d_i.
     """
 
-    name: ClassVar[str]
-    certifiable: ClassVar[bool] = True
+    name: str
+    certifiable: bool = True
 
     @abstractmethod
     def value(self, M: Array) -> Array:
@@ -45,14 +59,18 @@ class Criterion(ABC):
 
     def after_adding(self, M: Array, blocks: Array) -> Array:
         """Φ (N,) at M_s + B_siᵀ B_si for each i; M (S, p, p), blocks (S, N, r, p)."""
-        scenarios, n, _, p = blocks.shape
-        size = max(BATCH_NUMBERS // (scenarios * p * p), 1)
-        values = np.empty(n)
-        for start in range(0, n, size):
-            B = blocks[:, start : start + size]
-            added = np.einsum("snri,snrj->nsij", B, B, optimize=True)
-            values[start : start + size] = self.value(M + added)
+        values = np.empty(blocks.shape[1])
+        for part, sums in candidate_sums(M, blocks):
+            values[part] = self.value(sums)
         return values
+
+    def softened(self, order: float) -> Criterion:
+        """A smooth criterion nowhere above this one, towards which it grows with `order`.
+
+        Kinks (a largest eigenvalue, pose or scenario) become power means; a criterion without
+        any is its own.  A lower bound on the softened criterion is one on this.
+        """
+        return self
 
     @abstractmethod
     def reported(self, value: float) -> tuple[float, str]:

@@ -1,0 +1,173 @@
+"""Feasible poses and moves of a KR 270 cell, checked again by MuJoCo's collision.
+
+    python experiment_design/feasibility_check/check.py [--poses 10000] [--jobs 2]
+
+Draws poses until `poses` are feasible, half of them with the load hanging, orders each half so
+that neighbours are near, certifies the moves between neighbours, and has MuJoCo look at every
+pose and at every free move in steps of 0.1° of the fastest joint.  Writes result.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+from joblib import Parallel, delayed
+from mujoco_cell import MujocoCell
+from scipy.stats import qmc
+
+from elastocal.cell_reader import read_cell
+from elastocal.design.feasibility.feasibility import Feasibility
+from elastocal.design.feasibility.rule_book import joint_limits
+from elastocal.design.feasibility.sight import END
+from elastocal.manipulator.choice import load_chain
+
+HERE = Path(__file__).resolve().parent
+FORCE = np.array([0.0, 0.0, -2600.0])
+STEP = np.radians(0.1)
+TOLERANCE = 1e-5  # m: GJK against GJK
+BATCH = 2**16
+MOVES_AT_A_TIME = 50
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--poses", type=int, default=10_000)
+    options.add_argument("--jobs", type=int, default=2)
+    given = options.parse_args()
+    cell = read_cell(HERE / "cell.toml")
+    feasibility = Feasibility(cell, load_chain(cell))
+    lines = ["| | with the load | without |", "|---|---|---|"]
+    columns = [
+        check(feasibility, given.poses // 2, force, given.jobs) for force in (FORCE, 0 * FORCE)
+    ]
+    lines += [f"| {key} | {columns[0][key]} | {columns[1][key]} |" for key in columns[0]]
+    text = "\n".join(lines) + "\n"
+    print(text)
+    (HERE / "result.md").write_text(text, encoding="utf-8")
+    wrong = [key for column in columns for key in column if "violat" in key and column[key] != "0"]
+    raise SystemExit(1 if wrong else 0)
+
+
+def check(feasibility: Feasibility, wanted: int, force: np.ndarray, jobs: int) -> dict[str, str]:
+    """The table's column for one load state."""
+    loaded = bool(force.any())
+    started = time.perf_counter()
+    q, tried, removed = draw(feasibility, wanted, force)
+    drawn = time.perf_counter()
+    q = q[tour(q)]
+    ordered = time.perf_counter()
+    free = feasibility.paths_free(q[:-1], q[1:], loaded)
+    certified = time.perf_counter()
+    moves = np.flatnonzero(free)
+    print(f"{len(q)} poses, {len(moves)} free moves in {certified - started:.0f} s")
+    parts = Parallel(n_jobs=jobs)(
+        delayed(recheck)(feasibility, q[part], q[part + 1], loaded)
+        for part in np.array_split(moves, max(len(moves) // MOVES_AT_A_TIME, 1))
+    )
+    poses = Parallel(n_jobs=jobs)(
+        delayed(recheck_poses)(feasibility, part, loaded) for part in np.array_split(q, 2 * jobs)
+    )
+    blocked = np.flatnonzero(~free)
+    agreed = sum(
+        Parallel(n_jobs=jobs)(
+            delayed(blocked_too)(feasibility, q[part], q[part + 1], loaded)
+            for part in np.array_split(blocked[:: max(len(blocked) // 500, 1)], 2 * jobs)
+        )
+    )
+    ended = time.perf_counter()
+    counts = {f"removed by {rule}": f"{n:,}" for rule, n in removed.items()}
+    return {
+        "poses tried": f"{tried:,}",
+        **counts,
+        "feasible poses checked by MuJoCo": f"{len(q):,}",
+        "violations among them: bodies": str(sum(p[0] for p in poses)),
+        "violations among them: sight": str(sum(p[1] for p in poses)),
+        "moves between neighbours": f"{len(free):,}",
+        "of these certified free": f"{len(moves):,}",
+        "poses on free moves checked by MuJoCo": f"{sum(p[0] for p in parts):,}",
+        "violations on free moves": str(sum(p[1] for p in parts)),
+        "refused moves looked at": f"{len(blocked[:: max(len(blocked) // 500, 1)]):,}",
+        "of these in contact or beyond the rope's angle": f"{agreed:,}",
+        "drawing, s": f"{drawn - started:.1f}",
+        "certifying moves, s": f"{certified - ordered:.1f}",
+        "MuJoCo, s": f"{ended - certified:.1f}",
+    }
+
+
+def draw(
+    feasibility: Feasibility, wanted: int, force: np.ndarray
+) -> tuple[np.ndarray, int, dict[str, int]]:
+    """Feasible poses (wanted, n), how many were tried, and what each rule removed."""
+    lower, upper = joint_limits(feasibility.cell, feasibility.chain)
+    engine = qmc.Sobol(len(lower), rng=np.random.default_rng(1))
+    found: list[np.ndarray] = []
+    tried, removed = 0, dict.fromkeys((rule.name for rule in feasibility.rules), 0)
+    while sum(len(part) for part in found) < wanted:
+        q = lower + engine.random(BATCH) * (upper - lower)
+        left = q
+        for rule in feasibility.rules:
+            poses = feasibility.kinematics.poses(left, force)
+            broken = rule.broken(poses)
+            removed[rule.name] += int(broken.sum())
+            left = left[~broken]
+        found.append(left)
+        tried += len(q)
+    return np.concatenate(found)[:wanted], tried, removed
+
+
+def tour(q: np.ndarray) -> np.ndarray:
+    """A path through all poses that always goes to the nearest one left."""
+    left, path = np.arange(1, len(q)), [0]
+    while len(left):
+        k = int(np.abs(q[left] - q[path[-1]]).max(axis=1).argmin())
+        path.append(int(left[k]))
+        left = np.delete(left, k)
+    return np.array(path)
+
+
+def mujoco(feasibility: Feasibility, slack: float) -> MujocoCell:
+    return MujocoCell(
+        feasibility.cell, feasibility.chain, feasibility.bodies, feasibility.pairs, slack
+    )
+
+
+def recheck_poses(feasibility: Feasibility, q: np.ndarray, loaded: bool) -> tuple[int, int]:
+    """Poses in which MuJoCo sees a margin broken, and those with a hidden marker."""
+    judge = mujoco(feasibility, -TOLERANCE)
+    sight = feasibility.cell.workspace.visibility
+    end = END * sight.beam_radius
+    bodies = sum(bool(judge.contacts(pose, loaded)) for pose in q)
+    return bodies, sum(bool(judge.hidden(pose, end, loaded)) for pose in q)
+
+
+def dense(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Poses from start to end, at most STEP apart in every joint."""
+    count = int(np.ceil(np.abs(end - start).max() / STEP)) + 1
+    return start + np.linspace(0.0, 1.0, max(count, 2))[:, None] * (end - start)
+
+
+def recheck(
+    feasibility: Feasibility, start: np.ndarray, end: np.ndarray, loaded: bool
+) -> tuple[int, int]:
+    """Poses looked at on free moves, and those of them in which a margin is broken."""
+    judge = mujoco(feasibility, -TOLERANCE)
+    poses = [pose for a, b in zip(start, end, strict=True) for pose in dense(a, b)]
+    return len(poses), sum(judge.touches(pose, loaded) for pose in poses)
+
+
+def blocked_too(feasibility: Feasibility, start: np.ndarray, end: np.ndarray, loaded: bool) -> int:
+    """Refused moves on which MuJoCo finds less than margin + 1 mm, or too slanted a rope."""
+    judge = mujoco(feasibility, 1e-3)
+    load = feasibility.cell.workspace.load
+    rope = load.rope_axis, np.cos(load.max_angle)
+    return sum(
+        any(judge.touches(q, loaded) or (loaded and judge.slanted(*rope)) for q in dense(a, b))
+        for a, b in zip(start, end, strict=True)
+    )
+
+
+if __name__ == "__main__":
+    main()

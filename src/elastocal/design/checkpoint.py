@@ -1,0 +1,90 @@
+"""Where a design stands, on disk: an interrupted run goes on where it was."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import secrets
+import shutil
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal import __version__
+from elastocal.files import atomic_write_text
+
+State = Mapping[str, NDArray]
+
+
+def key_of(files: Iterable[Path], **options: object) -> str:
+    """A hash of everything a design depends on: input files, options, the version."""
+    digest = hashlib.sha256(__version__.encode())
+    for path in files:
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    digest.update(json.dumps(options, sort_keys=True, default=str).encode())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage of a design has finished so far; nowhere kept if `path` is None."""
+
+    path: Path | None
+
+    def load(self) -> dict[str, NDArray] | None:
+        """What was saved last, None if nothing (readable) was."""
+        if self.path is None or not self.path.is_file():
+            return None
+        try:
+            with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as saved:
+                return {name: saved[name] for name in saved.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+            return None
+
+    def save(self, state: State) -> None:
+        """Keep `state`, whole or not at all."""
+        if self.path is None:
+            return
+        text = io.BytesIO()
+        np.savez(text, **{name: np.asarray(value) for name, value in state.items()})
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}")
+        temporary.write_bytes(text.getvalue())
+        os.replace(temporary, self.path)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The stages of one design, in a folder beside its output; nowhere if `folder` is None."""
+
+    folder: Path | None = None
+
+    @classmethod
+    def beside(cls, output: Path, key: str) -> Checkpoint:
+        """The folder `OUTPUT.resume`; what another input or option left there is thrown away."""
+        folder = output.with_name(output.name + ".resume")
+        stamp = folder / "key"
+        if not stamp.is_file() or stamp.read_text(encoding="utf-8") != key:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            atomic_write_text(stamp, key)
+        return cls(folder)
+
+    @property
+    def begun(self) -> bool:
+        """Is there anything to go on from?"""
+        return self.folder is not None and any(self.folder.glob("*.npz"))
+
+    def stage(self, name: str) -> Stage:
+        return Stage(None if self.folder is None else self.folder / f"{name}.npz")
+
+    def clear(self) -> None:
+        """The design is done: nothing to resume."""
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)

@@ -1,0 +1,208 @@
+"""Which poses should I measure?  From a cell to a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.cell import Cell
+from elastocal.design.augment import measured
+from elastocal.design.candidates import draw
+from elastocal.design.checkpoint import Checkpoint
+from elastocal.design.checks import check_cell
+from elastocal.design.exact.contribution import values_without
+from elastocal.design.exact.size_curve import size_curve
+from elastocal.design.feasibility.feasibility import Feasibility
+from elastocal.design.joint_space import joint_space
+from elastocal.design.options import DesignOptions
+from elastocal.design.order.blockers import Blockers
+from elastocal.design.order.schedule import schedule
+from elastocal.design.plan import Candidates, Plan, SizePoint
+from elastocal.design.polish.searches import Searches
+from elastocal.design.readings import load_states
+from elastocal.design.reasons import predicted, reasons
+from elastocal.design.select import Selection, select
+from elastocal.design.setup import Known, Pool, Setup, set_up
+from elastocal.design.shares import shares_of
+from elastocal.design.target_poses import test_poses
+from elastocal.errors import InsufficientDataError
+from elastocal.manipulator.limits import joint_limits
+from elastocal.manipulator.model import Model
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Progress = Callable[[str], None]
+
+VIA = 200  # candidates through which a blocked move may go
+
+
+def design(
+    cell: Cell,
+    options: DesignOptions | None = None,
+    checkpoint: Checkpoint | None = None,
+    progress: Progress = lambda message: None,
+) -> Plan:
+    """The measurement plan that [design] of the cell asks for, with its certificates.
+
+    Candidates from Sobol points that every rule of [workspace] allows; their information from the
+    symbolic model; convex relaxation (the bound), exchange, polish; order of execution.  The plan
+    depends on the cell, the options and the seed, not on `options.jobs`, and not on whether the
+    work was interrupted and taken up again from `checkpoint`.
+
+    Raises InputError where cell and options contradict themselves or each other;
+    InsufficientDataError where no pose is feasible, or a parameter that the criterion needs cannot
+    be seen.
+    """
+    return _Design(cell, options or DesignOptions(), checkpoint or Checkpoint(), progress).run()
+
+
+class _Design:
+    """The course of a design; what each step needs of the steps before it."""
+
+    def __init__(
+        self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
+    ) -> None:
+        self.warnings: list[str] = []
+        if cell.model.torque == "measured":
+            cell = replace(cell, model=replace(cell.model, torque="computed"))
+            self.warnings.append(
+                "torques of poses that are not measured yet are computed from load and weights"
+            )
+        self.cell, self.options = cell, options
+        self.checkpoint, self.progress = checkpoint, progress
+        self.model = Model.from_cell(cell)
+        self.cell = self.model.cell
+        self.chain = self.model.chain
+        check_cell(self.cell, self.chain)
+        self.states = load_states(self.cell)
+        self.space = joint_space(self.cell, self.chain)
+        self.feasibility = Feasibility(self.cell, self.chain)
+
+    def run(self) -> Plan:
+        progress, options = self.progress, self.options
+        targets = test_poses(self.cell, self.chain, self.feasibility, options.seed)
+        q, load, group, counts = self._candidates()
+        done = None
+        if options.done is not None:
+            progress("information of the measurements done")
+            done = measured(self.model, options.done, options.fixed)
+            self.warnings.append(f"B is taken at {done.note}")
+        known = Known(options.fixed, options.prior, done)
+        shares = shares_of(self.cell)
+        progress("information of the candidates")
+        setup = set_up(
+            self.model, self.states, q, load, int(shares.sum()), targets, known, options.seed
+        )
+        self.warnings += setup.warnings
+        pool = setup.pool(q, load, group)
+        curve, shares = self._sizes(setup, pool, shares)
+        searches = Searches(setup.information, self.space, self.feasibility, self.feasibility.pairs)
+        found = select(setup, pool, shares, searches, options, self.checkpoint, progress)
+        return self._plan(setup, found, shares, counts, targets.source, curve, done)
+
+    def _candidates(self) -> tuple[Array, IntArray, IntArray, Candidates]:
+        stage = self.checkpoint.stage("candidates")
+        state = stage.load()
+        if state is None:
+            self.progress("drawing candidates")
+            drawn = draw(
+                self.cell, self.chain, self.states, self.feasibility,
+                self.cell.design.candidates, self.options.seed, self.options.jobs, self.progress,
+            )  # fmt: skip
+            rules = list(drawn.removed_by)
+            state = {
+                "q": drawn.q,
+                "load": drawn.load,
+                "group": drawn.group,
+                "tried": np.array([drawn.tried, drawn.feasible]),
+                "rules": np.array(rules, dtype=np.str_),
+                "removed": np.array([drawn.removed_by[r] for r in rules], dtype=np.int64),
+            }
+            stage.save(state)
+        tried, feasible = (int(v) for v in state["tried"])
+        removed = dict(zip(state["rules"].tolist(), state["removed"].tolist(), strict=True))
+        counts = Candidates(tried, feasible, removed)
+        return state["q"], state["load"], state["group"], counts
+
+    def _sizes(
+        self, setup: Setup, pool: Pool, shares: IntArray
+    ) -> tuple[tuple[SizePoint, ...], IntArray]:
+        """The curve of criterion against number of poses, and the shares that meet the target."""
+        target, numbers = self.cell.design.target, self.options.curve
+        if target is None and not numbers:
+            return (), shares
+        found = size_curve(
+            lambda n: setup.problem(pool, shares_of(self.cell, n)),
+            numbers,
+            None if target is None else setup.criterion.from_reported(target),
+            seed=self.options.seed,
+            jobs=self.options.jobs,
+            progress=self.progress,
+        )
+        points = tuple(SizePoint(p.n_poses, p.value, p.bound) for p in found.points)
+        if target is None:
+            return points, shares
+        if found.smallest is None:
+            value, unit = setup.criterion.reported(points[-1].value)
+            raise InsufficientDataError(
+                f"{self.cell.path or self.cell.name}: no plan of up to {points[-1].poses} poses "
+                f"meets the target; the best found reaches {value:.4g} {unit}: allow a larger "
+                "target, more repeats, or a better tracker"
+            )
+        return points, shares_of(self.cell, found.smallest)
+
+    def _plan(
+        self, setup: Setup, found: Selection, shares: IntArray, counts: Candidates, targets: str,
+        curve: tuple[SizePoint, ...], done: object,
+    ) -> Plan:  # fmt: skip
+        pool, chosen = found.pool, found.chosen
+        # In the order of levels, so that the table reads like Table 2.
+        chosen = chosen[np.lexsort((chosen, pool.group[chosen]))]
+        q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
+        self.progress("order of execution")
+        spec = self.cell.design
+        execution = schedule(
+            q, spec.motion, self.feasibility,
+            loads=self.states.forces,
+            load=load if self.states.chosen else None,
+            limits=joint_limits(self.cell, self.chain),
+            via=pool.q[:: max(len(pool) // VIA, 1)],
+            blockers=Blockers(self.feasibility),
+            seed=self.options.seed, progress=self.progress,
+        )  # fmt: skip
+        problem = setup.problem(pool, shares)
+        M = setup.gathered(blocks)[0]
+        numbers = blocks.shape[1] * blocks.shape[2] * spec.repeats
+        numbers += getattr(done, "numbers", 0)
+        value, unit = setup.criterion.reported(found.value)
+        bound = found.certificate.bound_pool
+        return Plan(
+            model=self.model,
+            criterion=spec.criterion,
+            value=found.value,
+            reported=value,
+            unit=unit,
+            q=q,
+            load=load,
+            forces=self.states.forces,
+            group=pool.group[chosen],
+            levels=self.space.levels,
+            level_joint=None if self.space.held is None else f"joint{self.space.held + 1}",
+            execution=execution,
+            candidates=counts,
+            certificate=found.certificate,
+            predicted=predicted(self.model, setup.found, M, numbers),
+            reasons=reasons(
+                self.model, setup.found, blocks[0], setup.prior[0],
+                values_without(problem, chosen), found.value,
+            ),
+            targets=targets,
+            seed=self.options.seed,
+            polished=found.polished,
+            curve=curve,
+            bound_reported=None if bound is None else setup.criterion.reported(bound)[0],
+            warnings=tuple(self.warnings),
+        )  # fmt: skip

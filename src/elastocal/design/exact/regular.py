@@ -1,0 +1,95 @@
+"""Plans that determine all parameters, and the messages where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from elastocal.design.criteria.factor import factorise
+from elastocal.design.exact.pool import admissible, random_plan, without
+from elastocal.design.problem import Array, DesignProblem, IntArray
+from elastocal.errors import InsufficientDataError
+
+# Ridges, as shares of the pool's mean information, under which a regular plan is looked for.
+RIDGES = (1e-3, 1e-6, 1e-9)
+ATTEMPTS = 20
+
+
+def is_regular(M: Array) -> bool:
+    """Are all of M (S, p, p) regular beyond rounding?"""
+    return bool(factorise(M).regular.all())
+
+
+def check_enough(problem: DesignProblem) -> None:
+    """Raise InsufficientDataError where no plan of these shares can determine all parameters."""
+    _, _, r, p = problem.blocks.shape
+    n = problem.n_poses
+    known = min(int(np.linalg.matrix_rank(prior, hermitian=True)) for prior in problem.prior)
+    if known + n * r < p:
+        prior = f" and the prior {known}" if known else ""
+        raise InsufficientDataError(
+            f"fewer equations than parameters: {n} poses of {r} readings give {n * r}{prior}, for "
+            f"{p} parameters; plan at least {-(-(p - known) // r)} poses, switch effects off or "
+            "state a prior"
+        )
+    usable = np.flatnonzero(problem.shares[problem.group] > 0)
+    if not is_regular(problem.prior + problem.sum_of(usable)):
+        raise InsufficientDataError(
+            f"all {len(usable)} candidates of the groups with a share together do not determine "
+            f"the {p} parameters; allow other joint levels or more load, or switch effects off"
+        )
+
+
+def log_det_gain(M: Array, blocks: Array) -> Array:
+    """Σ_s log det(1 + B_si M_s⁻¹ B_siᵀ) (k,) for blocks (S, k, r, p): what adding i brings."""
+    inverse = np.linalg.inv(M)[:, None]
+    inner = blocks @ inverse @ blocks.swapaxes(-1, -2)
+    return np.asarray(np.linalg.slogdet(np.eye(blocks.shape[2]) + inner)[1].sum(axis=0))
+
+
+def ridge(problem: DesignProblem) -> Array:
+    """Diagonal matrices (S, p, p): the mean information of the candidates, parameter by parameter.
+
+    Parameters that differ in scale by orders of magnitude are so treated alike.
+    """
+    mean = np.einsum("snrp,snrp->sp", problem.blocks, problem.blocks) / problem.n_candidates
+    return np.asarray(mean[:, :, None] * np.eye(mean.shape[1]))
+
+
+def regular_plan(
+    problem: DesignProblem, chosen: IntArray, rng: np.random.Generator
+) -> IntArray:
+    """A plan of regular M near `chosen`: exchanges that raise Σ_s log det(M_s + δ ridge), δ → 0.
+
+    For small δ a determinant counts the rank first.  Random plans are tried where `chosen` leads
+    to none; raises InsufficientDataError where they do not either.
+    """
+    unit = ridge(problem)
+    for _ in range(ATTEMPTS):
+        for delta in RIDGES:
+            if is_regular(problem.prior + problem.sum_of(chosen)):
+                return chosen
+            chosen = _raise_determinant(problem, chosen, delta * unit)
+        if is_regular(problem.prior + problem.sum_of(chosen)):
+            return chosen
+        chosen = random_plan(problem, rng)
+    p = problem.blocks.shape[-1]
+    raise InsufficientDataError(
+        f"no plan of {problem.n_poses} poses that determines all {p} parameters was found; plan "
+        "more poses, other shares, or state a prior"
+    )
+
+
+def _raise_determinant(problem: DesignProblem, chosen: IntArray, extra: Array) -> IntArray:
+    """Exchanges, each the best for its pose, until none raises the determinant."""
+    improved = True
+    while improved:
+        improved = False
+        for out in np.unique(chosen):
+            rest = without(chosen, out)
+            into = admissible(problem, rest, int(problem.group[out]))
+            M = problem.prior + extra + problem.sum_of(rest)
+            gain = log_det_gain(M, problem.blocks[:, into])
+            best = int(np.argmax(gain))
+            if gain[best] > gain[np.searchsorted(into, out)] + 1e-6:
+                chosen, improved = np.sort(np.append(rest, into[best])), True
+    return chosen

@@ -1,0 +1,127 @@
+"""What a plan can make certain: the parameters that some feasible pose shows, and their scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from elastocal.design.information import PoseInformation
+from elastocal.errors import InputError, InsufficientDataError
+from elastocal.identification.reduction import Reduction, reduce
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import observe
+from elastocal.nearest import did_you_mean, listed, quoted
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+SAMPLE = 2000  # poses that show what is visible: more would not change a rank
+# Effects that say where things stand rather than what the arm is; D, A, E and O pass them over.
+NUISANCE = ("base_frame", "marker_position", "marker_orientation", "distance_sensor")
+
+
+@dataclass(frozen=True)
+class Estimable:
+    """`reduction` over all parameters (kept, dropped, mixing) and `sizes` (parameters,)."""
+
+    reduction: Reduction
+    sizes: Array
+
+    @property
+    def columns(self) -> IntArray:
+        return self.reduction.kept
+
+
+def typical_sizes(information: PoseInformation, q: Array, load: IntArray) -> Array:
+    """Typical deviation (parameters,) of each parameter, as identification takes them."""
+    model, x = information.model, information.scenarios[0]
+    q, load = _some(q), _some(load)
+    table = information.rows(q, load, x)
+    return model.sizes(model.regressor(table, x, None, observe(table, model.observe)).B)
+
+
+def estimable(
+    information: PoseInformation, q: Array, load: IntArray, free: IntArray, prior: Array
+) -> Estimable:
+    """A minimal complete set of the `free` parameters, from a sample of the poses q (N, n).
+
+    `prior` (parameters, parameters): information known before, scaled by `information.sizes`.
+    Raises InsufficientDataError where no pose shows anything.
+    """
+    model = information.model
+    blocks = information.blocks(_some(q), _some(load))[0]
+    columns = np.searchsorted(information.columns, free)
+    B = blocks.reshape(-1, blocks.shape[-1])[:, columns]
+    known = prior[np.ix_(free, free)]
+    if known.any():
+        values, vectors = linalg.eigh(known)
+        B = np.vstack([B, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T])
+    sizes = information.sizes
+    parameters = tuple(model.parameters[c] for c in free)
+    # The columns are scaled already.
+    local = reduce(B, np.ones(len(free)), parameters, sigma=1.0, threshold=0.0)
+    if not len(local.kept):
+        raise InsufficientDataError(
+            f"{model.cell.path or model.cell.name}: no feasible pose shows any parameter of the "
+            "model; state the load that will hang ([design] loads_N), or choose other effects"
+        )
+    kept, dropped = free[local.kept], free[local.dropped]
+    mixing = local.mixing * sizes[kept][:, None] / sizes[dropped][None, :]
+    return Estimable(Reduction(kept, dropped, mixing, free[local.invisible]), sizes)
+
+
+def interest_of(model: Model, found: Estimable) -> IntArray:
+    """Indices into the kept parameters that D, A, E and the indices O count.
+
+    `[design] interest` names parameters, places or effects; by default all but base and markers.
+    Raises InputError for an unknown name, InsufficientDataError where a named parameter cannot be
+    seen in any feasible pose.
+    """
+    wanted = model.cell.design.interest
+    kept = [model.parameters[c] for c in found.columns]
+    where = f"{model.cell.path or model.cell.name}: [design] interest"
+    if not wanted:
+        own = [k for k, p in enumerate(kept) if p.effect not in NUISANCE]
+        return np.array(own or range(len(kept)), dtype=np.int64)
+    chosen: set[int] = set()
+    for name in wanted:
+        meant = [i for i, p in enumerate(model.parameters) if name in (p.name, p.where, p.effect)]
+        if not meant:
+            valid = sorted({v for p in model.parameters for v in (p.name, p.where, p.effect)})
+            raise InputError(
+                f"{where} names {quoted(name)}, which is no parameter, place or effect of the model"
+                f"{did_you_mean(name, valid)}; there are {listed(valid)}"
+            )
+        here = [k for k, c in enumerate(found.columns) if c in meant]
+        if not here:
+            raise InsufficientDataError(
+                f"{where} names {quoted(name)}; {why(model, found, meant[0])}"
+            )
+        chosen.update(here)
+    return np.array(sorted(chosen), dtype=np.int64)
+
+
+def why(model: Model, found: Estimable, index: int) -> str:
+    """Why parameter `index` is not among the kept ones, and what would help."""
+    name, r = model.names[index], found.reduction
+    if index in r.invisible:
+        return (
+            f"no feasible pose shows {name}: it moves no marker in any of them; change the load's "
+            f"direction or the limits, or leave it out (--fix {name})"
+        )
+    if index in r.dropped:
+        share = np.abs(r.mixing[:, list(r.dropped).index(index)]) / found.sizes[r.kept]
+        partner = model.names[r.kept[int(share.argmax())]]
+        return (
+            f"no set of poses tells {name} from others ({partner} moves the markers in the same "
+            f"way); ask for {partner} instead, or hold one of them (--fix {name})"
+        )
+    return f"{name} is held; drop it from --fix"
+
+
+def _some(values: NDArray) -> NDArray:
+    step = -(-len(values) // SAMPLE)
+    return values[::step]

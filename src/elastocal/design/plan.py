@@ -1,0 +1,156 @@
+"""The frozen result of a design: poses in order, what they promise, how far from the best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.design.order.execution import Execution
+from elastocal.design.reasons import Predicted, Reason
+from elastocal.manipulator.model import Model
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """How many poses were tried, how many the cell allows, and which rule removed the others."""
+
+    tried: int
+    feasible: int
+    removed_by: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How far the plan is from the best, as shares of the criterion (1: cannot be better).
+
+    `efficiency_pool` is certified: no plan with the same shares from the `pool` candidates has a
+    value below `bound_pool`.  `efficiency_continuum` is an estimate: the search tried `searched`
+    poses and `ascents` local searches, and a better pose may still exist.  Values Φ; None where
+    the criterion has no bound.
+    """
+
+    pool: int
+    bound_pool: float | None
+    efficiency_pool: float | None
+    bound_continuum: float | None = None
+    efficiency_continuum: float | None = None
+    searched: int = 0
+    ascents: int = 0
+
+
+@dataclass(frozen=True)
+class SizePoint:
+    """The criterion of the best plan found of `poses` poses, and its bound, in the plan's unit."""
+
+    poses: int
+    value: float
+    bound: float | None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """q (N, n) in SI units, numbered by configuration; `load` (N,) the load state or −1 for all;
+    `group` (N,) into `levels`.  `value` is Φ, `reported` what the user knows it by, in `unit`."""
+
+    model: Model
+    criterion: str
+    value: float
+    reported: float
+    unit: str
+    q: Array
+    load: IntArray
+    forces: Array
+    group: IntArray
+    levels: tuple[float, ...]
+    level_joint: str | None
+    execution: Execution
+    candidates: Candidates
+    certificate: Certificate
+    predicted: tuple[Predicted, ...]
+    reasons: tuple[Reason, ...]
+    targets: str
+    seed: int
+    polished: int = 0
+    curve: tuple[SizePoint, ...] = ()
+    bound_reported: float | None = None
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def configurations(self) -> tuple[str, ...]:
+        return tuple(str(k + 1) for k in range(len(self.q)))
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """The levels as people read them: "joint2 at -25.24°"."""
+        if self.level_joint is None:
+            return ("poses",)
+        revolute = self.model.chain.kinds[int(self.level_joint.removeprefix("joint")) - 1]
+        if revolute == "revolute":
+            return tuple(f"{self.level_joint} at {np.degrees(v):.6g}°" for v in self.levels)
+        return tuple(f"{self.level_joint} at {v * 1e3:.6g} mm" for v in self.levels)
+
+    @property
+    def stated_forces(self) -> Array | None:
+        """The load states where the plan must state them row by row.
+
+        Not where every pose is measured unloaded, or unloaded and under one load, which is what
+        `simulate --load` does to a plan without forces.
+        """
+        loaded = np.any(self.forces != 0, axis=1)
+        usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2
+        return None if usual and (self.load < 0).all() else self.forces
+
+    def to_json(self) -> dict[str, Any]:
+        """The plan as numbers and texts; the file adds its schema."""
+        c = self.certificate
+        return {
+            "criterion": self.criterion,
+            "value": self.reported,
+            "unit": self.unit,
+            "n_poses": len(self.q),
+            "candidates": {
+                "tried": self.candidates.tried,
+                "feasible": self.candidates.feasible,
+                "removed_by": self.candidates.removed_by,
+            },
+            "certificate": {
+                "efficiency_pool": c.efficiency_pool,
+                "bound_pool": self.bound_reported,
+                "efficiency_continuum": c.efficiency_continuum,
+                "pool": c.pool,
+                "pool_is": "certified on the pool",
+                "continuum_is": "estimated on the continuum",
+                "searched": c.searched,
+                "ascents": c.ascents,
+            },
+            "predicted": [
+                {
+                    "name": p.name,
+                    "std": p.std,
+                    "unit": p.unit,
+                    "ci95_half_width": p.half_width,
+                    "combined_with": list(p.combined_with),
+                }
+                for p in self.predicted
+            ],
+            "poses": [
+                {
+                    "configuration": k + 1,
+                    "value_without": None if not np.isfinite(r.loss) else r.loss,
+                    "serves": [
+                        {"name": name, "std_without": None if not np.isfinite(f) else f}
+                        for name, f in r.serves
+                    ],
+                }
+                for k, r in enumerate(self.reasons)
+            ],
+            "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
+            "warnings": list(self.warnings),
+            "seed": self.seed,
+        }

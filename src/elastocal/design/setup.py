@@ -1,0 +1,187 @@
+"""Everything a design knows before it chooses: parameters, criterion, information known before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.design.augment import Done
+from elastocal.design.criteria.base import Criterion
+from elastocal.design.criteria.choose import make_criterion
+from elastocal.design.information import PoseInformation
+from elastocal.design.parameters import (
+    NUISANCE,
+    Estimable,
+    estimable,
+    interest_of,
+    typical_sizes,
+    why,
+)
+from elastocal.design.problem import DesignProblem
+from elastocal.design.readings import LoadStates
+from elastocal.design.target_poses import TargetPoses
+from elastocal.design.targets import on_kept, prediction_rows
+from elastocal.identification.checks import fixed_and_free
+from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.manipulator.model import Model
+from elastocal.simulation.simulate import draw_errors, values_from
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+SCENARIO_STREAM = 1  # of the seed's children; see design.py
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known before a plan: held parameters, a stated prior, measurements done."""
+
+    fixed: tuple[str, ...] = ()
+    prior: GaussianPrior | None = None
+    done: Done | None = None
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Candidates q (N, n), their load state (N,) and group (N,), and blocks (S, N, r, p)."""
+
+    q: Array
+    load: IntArray
+    group: IntArray
+    blocks: Array
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def joined(self, other: Pool) -> Pool:
+        return Pool(
+            np.vstack([self.q, other.q]),
+            np.concatenate([self.load, other.load]),
+            np.concatenate([self.group, other.group]),
+            np.concatenate([self.blocks, other.blocks], axis=1),
+        )
+
+
+@dataclass(frozen=True)
+class Setup:
+    """`information` over the kept parameters, `prior` (S, p, p) scaled, and the criterion."""
+
+    information: PoseInformation
+    found: Estimable
+    criterion: Criterion
+    prior: Array
+    warnings: tuple[str, ...]
+
+    def pool(self, q: Array, load: IntArray, group: IntArray) -> Pool:
+        return Pool(q, load, group, self.information.blocks(q, load))
+
+    def problem(self, pool: Pool, shares: IntArray) -> DesignProblem:
+        return DesignProblem(pool.blocks, self.prior, pool.group, shares, self.criterion)
+
+    def gathered(self, blocks: Array) -> Array:
+        """M (S, p, p) of a plan's blocks (S, N, r, p) and what was known before."""
+        return self.prior + np.einsum("snri,snrj->sij", blocks, blocks, optimize=True)
+
+    def value(self, q: Array, load: IntArray) -> float:
+        """Φ of any plan of poses q (N, n) in load states `load` (N,)."""
+        return float(self.criterion.value(self.gathered(self.information.blocks(q, load))))
+
+
+def set_up(
+    model: Model,
+    states: LoadStates,
+    q: Array,
+    load: IntArray,
+    n_poses: int,
+    targets: TargetPoses,
+    known: Known,
+    seed: int,
+) -> Setup:
+    """The parameters that the candidates q (N, n) show, and the criterion on them.
+
+    Raises InsufficientDataError where no pose shows a parameter that the criterion needs, named
+    with what it is combined with; InputError for unknown names.
+    """
+    spec = model.cell.design
+    scenarios = _scenarios(model, known, seed)
+    every = np.arange(len(model.parameters))
+    raw = PoseInformation(model, states, scenarios, every, np.ones(len(every)))
+    sizes = typical_sizes(raw, q, load)
+    information = replace(raw, sizes=sizes)
+    prior = _prior(model, known, sizes)
+    free = fixed_and_free(model, known.fixed)
+    found = estimable(information, q, load, free, prior)
+    kept = found.columns
+    information = replace(information, columns=kept, sizes=sizes[kept])
+    interest = interest_of(model, found)
+    A = None
+    if spec.criterion in ("test_pose", "I", "G"):
+        rows = [prediction_rows(information, targets, x) for x in scenarios]
+        A = np.stack([on_kept(model, a, found) for a in rows])
+    criterion = make_criterion(
+        spec.criterion,
+        parameters=len(kept),
+        interest=interest,
+        scenarios=len(scenarios),
+        A=A,
+        weights=targets.weight,
+        combination=_combination(model, found),
+        unit=_unit(model),
+        n_poses=n_poses,
+        robust=spec.robust,
+    )
+    prior = np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0)
+    return Setup(information, found, criterion, prior, _unseen(model, found, free))
+
+
+def _scenarios(model: Model, known: Known, seed: int) -> Array:
+    """X (S, parameters): the arm as known best, and draws of what it may be besides."""
+    spec = model.cell.design
+    best = model.nominal if known.done is None else known.done.x
+    if spec.robust == "none":
+        return best[None]
+    rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(SCENARIO_STREAM + 1)[-1])
+    arm = np.array([p.effect not in NUISANCE for p in model.parameters])
+    draws = [values_from(model, draw_errors(model, 1.0, rng)) for _ in range(spec.robust_samples)]
+    moved = [np.where(arm, best + x - model.nominal, best) for x in draws]
+    return np.stack([best, *moved])
+
+
+def _prior(model: Model, known: Known, sizes: Array) -> Array:
+    """Information known before (parameters, parameters), scaled by `sizes`."""
+    n = len(sizes)
+    information = np.zeros((n, n))
+    if model.cell.design.prior == "typical":
+        has = np.array([p.typical is not None for p in model.parameters])
+        information[has, has] += 1.0
+    if known.prior is not None:
+        P = known.prior.rows(model.names)[0] * sizes
+        information += P.T @ P
+    if known.done is not None:
+        information += known.done.information * np.outer(sizes, sizes)
+    return information
+
+
+def _combination(model: Model, found: Estimable) -> Array | None:
+    """The coefficients (kept,) of `[design] combination`, scaled."""
+    wanted = model.cell.design.combination
+    if not wanted:
+        return None
+    a = values_from(model, {name: 0.0 for name in wanted})  # names are checked there
+    a = np.zeros_like(a)
+    for name, factor in wanted.items():
+        a[model.names.index(name)] = factor
+    return on_kept(model, a[None, None, :], found)[0, 0]
+
+
+def _unit(model: Model) -> str:
+    """The unit of `[design] combination`: that of its parameters, "" where they differ."""
+    units = {p.unit for p in model.parameters if p.name in model.cell.design.combination}
+    return units.pop() if len(units) == 1 else ""
+
+
+def _unseen(model: Model, found: Estimable, free: IntArray) -> tuple[str, ...]:
+    """A sentence per free parameter that no feasible pose shows at all."""
+    return tuple(why(model, found, int(i)) for i in found.reduction.invisible if i in free)

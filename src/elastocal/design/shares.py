@@ -1,0 +1,38 @@
+"""How many poses a plan has at each level."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.cell import Cell
+from elastocal.errors import require
+
+IntArray = NDArray[np.int64]
+
+DEFAULT = 15  # poses, as in Table 2 of Klimchik et al. 2013
+
+
+def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
+    """Poses (L,) per level of [design.levels]; (1,) without levels.
+
+    `n_poses` overrides what the cell says; what does not divide evenly goes to the first levels.
+    Raises InputError where levels would be left without a pose, or `per_level` contradicts.
+    """
+    spec = cell.design
+    levels = max(max((len(v) for v in spec.levels.values()), default=1), 1)
+    where = f"{cell.path or cell.name}: [design]"
+    if spec.per_level and n_poses is None:
+        each = spec.per_level * levels if len(spec.per_level) == 1 else spec.per_level
+        require(
+            len(each) == levels,
+            f"{where} poses_per_level has {len(each)} numbers, but there are {levels} levels",
+        )
+        return np.array(each, dtype=np.int64)
+    total = n_poses or spec.poses or DEFAULT
+    require(
+        total >= levels,
+        f"{where} asks for {total} poses at {levels} levels; ask for {levels} at least, or drop "
+        "levels",
+    )
+    return np.array([total // levels + (k < total % levels) for k in range(levels)], dtype=np.int64)
