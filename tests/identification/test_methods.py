@@ -25,6 +25,7 @@ from elastocal.identification.options import METHODS, ROBUST
 from elastocal.identification.variance.choose import KINDS as NOISES
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
+from elastocal.simulation.simulate import simulate
 
 SIGMA = 5e-5
 MARKERS = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}
@@ -263,3 +264,15 @@ def test_shared_effects_need_readings_that_share_something():
     alone = table.take((table.repeat == 0) & (table.marker == 0))
     with pytest.raises(InputError, match="needs repeats or several markers"):
         identify(model, alone, Options(noise="axis+configuration"))
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_computed_readings_give_the_true_values_and_no_noise(stated):
+    """Without noise there is nothing to estimate it from, nor a reading beyond it."""
+    model, table, truth = campaign(stated=stated)
+    exact = simulate(model, table, truth, 0, noise=False)
+    result = identify(model, exact)
+    assert not result.faulty
+    assert any("computed, not measured" in text for text in result.warnings)
+    found = model.predict(exact, result.x)
+    assert np.abs(found - observe(exact, model.observe).value).max() < 1e-9

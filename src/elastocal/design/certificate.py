@@ -3,11 +3,13 @@
 Let ψ = 1/Φ: concave, homogeneous of degree 1, and by Φ's gradient G = −∂Φ/∂M its slope is
 G/Φ².  Euler's identity gives ψ(M) = ⟨G/Φ², M⟩, so the tangent at M lies above ψ everywhere:
 
-    ψ(M') ≤ ψ(M) + ⟨G/Φ², M' − M⟩ = ⟨G, M'⟩/Φ²   for every information M',   ⟨G, M⟩ = Σ_s tr(G_s M_s).
+    ψ(M') ≤ ψ(M) + ⟨G/Φ², M' − M⟩ = ⟨G, M'⟩/Φ²   for every information M',
 
-With M' = prior + Σ w'_i A_i and d_i = ⟨G, A_i⟩ the right side is linear in w', and therefore
+⟨G, M⟩ = Σ_s tr(G_s M_s).  With M' = prior + Σ w'_i A_i and d_i = ⟨G, A_i⟩ the right side is linear
+in w', and therefore
 
-    Φ(w') ≥ Φ² / (⟨G, prior⟩ + max_w' Σ w'_i d_i)  =  Φ / (1 + gap/Φ),   gap = max_w' Σ (w'_i − w_i) d_i
+    Φ(w') ≥ Φ² / (⟨G, prior⟩ + max_w' Σ w'_i d_i) = Φ / (1 + gap/Φ)
+    gap   = max_w' Σ (w'_i − w_i) d_i
 
 for all weights 0 ≤ w'_i ≤ most with Σ_{i∈l} w'_i = n_l, exact plans among them.  The maximum is
 taken greedily: in each group the largest d_i, `most` times each, until n_l poses are placed.

@@ -11,7 +11,7 @@ from elastocal.identification.checks import check_rows, check_table, fixed_and_f
 from elastocal.identification.chunked import residual_at
 from elastocal.identification.estimates import summarise
 from elastocal.identification.heldout import rms_3d
-from elastocal.identification.methods import run_method
+from elastocal.identification.methods import is_exact, run_method
 from elastocal.identification.noise import Weights, scaled_by_component, weights_for
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
@@ -63,7 +63,9 @@ def identify(
         return _solution(model, subset(seen, good), x0, free, chosen, silent, final)
 
     progress("looking for faulty readings")
-    faulty, clean = find_faulty(whole, refit)
+    faulty, clean = np.zeros(len(seen.lead), dtype=bool), whole
+    if not is_exact(whole):
+        faulty, clean = find_faulty(whole, refit)
     if 0 < faulty.mean() < 1:
         clean = refit(~faulty, final=True)
     found = run_method(whole, clean, faulty, refit, options, progress)

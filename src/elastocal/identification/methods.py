@@ -13,7 +13,7 @@ from elastocal.identification import published
 from elastocal.identification.adaptive import Refit, adapt, adapt_all, refined
 from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.covariance.estimate import Covariance
-from elastocal.identification.heldout import held_out_residual
+from elastocal.identification.heldout import held_out_residual, rms_3d
 from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
 from elastocal.identification.knowledge_fit import fit_with_knowledge
 from elastocal.identification.noise import Weights
@@ -28,6 +28,12 @@ Mask = NDArray[np.bool_]
 # A larger share of readings beyond the noise is no accident of measuring: an effect that the model
 # lacks looks like that.  Setting them apart would hide it.
 MOST_SET_ASIDE = 0.1
+# Residuals below this, in m, are rounding: no instrument resolves it, and it tells of no noise.
+EXACT = 1e-9
+COMPUTED = (
+    "the readings agree with the model to a nanometre: they are computed, not measured, and tell "
+    "nothing of the noise"
+)
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,8 @@ def _by_readings(
 ) -> Found:
     """What the method makes of the readings alone."""
     method = options.resolved
-    if method == "reml" and not whole.problem.large:
+    exact = is_exact(clean)
+    if method == "reml" and not whole.problem.large and not exact:
         return _reml(whole, clean, faulty, refit, options, progress)
     if method in ROBUST:
         return _robust(method, clean, whole, ~faulty, options)
@@ -98,7 +105,13 @@ def _by_readings(
         return _published(method, whole, solution, good, options, progress)
     kind = "ols" if solution.problem.weights.kind == "none" else "wls"
     intervals = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
-    return Found(kind, solution, intervals, None, good)
+    warnings = (COMPUTED,) if exact else ()
+    return Found(kind, solution, intervals, None, good, warnings=warnings)
+
+
+def is_exact(solution: Solution) -> bool:
+    """Are these residuals mere rounding?"""
+    return rms_3d(solution.fit.residual, solution.problem.observations.size) < EXACT
 
 
 def _set_aside(faulty: Mask, options: Options) -> bool:

@@ -10,6 +10,7 @@ from design.feasibility.small_cells import (
     DOWN,
     KR270_CHAIN,
     NOTHING,
+    at,
     box,
     cell,
     gantry_at,
@@ -22,7 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from elastocal.cell import Tool
-from elastocal.cell_workspace import CarriedBody, HalfSpace, HangingLoad, Workspace
+from elastocal.cell_workspace import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.design.feasibility.bodies import Body
 from elastocal.design.feasibility.collision import Collisions
 from elastocal.design.feasibility.contact_rules import POSE_SLACK
@@ -46,7 +47,11 @@ def test_no_pair_changes_its_distance_by_more_than_the_bound(seed, tmp_path):
     rng = np.random.default_rng(seed)
     workspace = Workspace(
         link_radius=(0.02,),
-        bodies=(CarriedBody(box("tool", (0.2, 0.1, 0.3), (0.1, 0, 0.2))),),
+        bodies=(
+            CarriedBody(box("tool", (0.2, 0.1, 0.3), (0.1, 0, 0.2))),
+            CarriedBody(Solid("disc", "cylinder", np.array([0.6, 0.02]), at(0, 0, 0.1))),
+            CarriedBody(sphere("ball", 0.3, (0, 0, -0.2)), "link3"),
+        ),
         obstacles=(box("rock", (0.3, 0.3, 0.3), (0.5, 0.5, 0.5)),),
         keep_out=(HalfSpace("wall", np.array([-3.0, 0, 0]), np.array([1.0, 0, 0])),),
         load=HangingLoad(box("load", (0.2, 0.2, 0.2), (0, 0, 0)), 0.3),
@@ -64,6 +69,32 @@ def test_no_pair_changes_its_distance_by_more_than_the_bound(seed, tmp_path):
             known = largest > 1e-3
             tightest = max(tightest, (change[known] / largest[known]).max(initial=0.0))
     assert tightest > 0.5  # a bound, and not a far one
+
+
+def test_arm_and_load_may_part_by_the_motion_of_both():
+    """A counterweight behind joint 2 goes up while a load on a long rope goes down."""
+    workspace = Workspace(
+        bodies=(CarriedBody(sphere("counterweight", 0.1, (-1.5, 0, 0)), "link2"),),
+        load=HangingLoad(sphere("load", 0.1, (0, 0, 0)), rope=30.0),
+    )
+    rules = Feasibility(cell(workspace), KR270_CHAIN)
+    bound = MotionBound(rules.kinematics, rules.bodies, rules.pairs)
+    pair = [p.names for p in rules.pairs].index(("load", "counterweight"))
+    middle, half = np.zeros(6), np.array([0, 0.05, 0, 0, 0, 0])
+    largest = bound(rules.kinematics.poses(middle, DOWN), half[None])[0, pair]
+    change = abs(distances(rules, middle + half) - distances(rules, middle))[pair]
+    assert 0.9 * largest < change <= largest
+
+
+def test_a_disc_that_tilts_about_its_middle_moves_at_its_rim():
+    disc = CarriedBody(Solid("disc", "cylinder", np.array([0.5, 0.01]), at(0, 0, 0)), "link5")
+    table = box("table", (5, 5, 0.1), (1.6, 0, -0.2))
+    rules = Feasibility(cell(Workspace(bodies=(disc,), obstacles=(table,))), KR270_CHAIN)
+    bound = MotionBound(rules.kinematics, rules.bodies, rules.pairs)
+    middle, half = np.zeros(6), np.array([0, 0, 0, 0, 0.3, 0])
+    largest = bound(rules.kinematics.poses(middle, NOTHING), half[None])[0]
+    change = abs(distances(rules, middle + half) - distances(rules, middle))
+    assert 0.9 * largest[0] < change[0] <= largest[0]
 
 
 def distances(rules, q):
@@ -127,6 +158,18 @@ def test_nothing_is_too_thin_to_be_met(x, thickness):
     assert rules.path_free(*above, False)
 
 
+@settings(deadline=None, max_examples=30)
+@given(st.floats(-2.5, 2.5))
+def test_moves_are_judged_each_by_its_own_motion(x):
+    """The one move of a batch that meets the sheet is among shorter ones that do not."""
+    sheet, tip = box("sheet", (1e-4, 1, 1), (x, 0, 0)), CarriedBody(sphere("tip", 1e-3, (0, 0, 0)))
+    rules = gantry_rules(Workspace(bodies=(tip,), obstacles=(sheet,)))
+    ends = np.linspace(0.5, 2.8, 24)
+    start = gantry_at(*[(-2.9, 2, 0)] * 24, (-2.9, 0, 0))
+    end = gantry_at(*[(end, 2, 0) for end in ends], (2.9, 0, 0))
+    assert rules.paths_free(start, end, False).tolist() == [True] * 24 + [False]
+
+
 def test_a_move_past_an_obstacle_is_free_up_to_the_resolution():
     rules = gantry_rules(replace(BALL, obstacles=(box("table", (1, 1, 1), (0, 0, -0.5)),)))
     ways = [(0.15 - 1e-6, False), (0.15 + 3 * RESOLUTION, True)]
@@ -160,14 +203,14 @@ def test_the_load_is_in_the_way_only_where_it_hangs():
 
 
 def test_the_rope_keeps_its_angle_on_the_way():
-    """Joint 5 from 60° through the vertical to 120°, and the long way round by joint 4."""
+    """Joint 5 from 60° through the vertical to 120°, and the long way by two turns of joint 4."""
     axis, limit = np.array([0, 0, 1.0]), np.radians(31)
     load = HangingLoad(sphere("load", 0.1, (0, 0, 0)), 0.5, rope_axis=axis, max_angle=limit)
     rules = Feasibility(cell(Workspace(load=load)), KR270_CHAIN)
     start, end = np.zeros(6), np.zeros(6)
     start[4], end[4] = np.radians([60, 120])
     round_about = end.copy()
-    round_about[3] = 2 * np.pi
+    round_about[3] = 4 * np.pi
     assert rules.path_free(start, end, True)
     assert not rules.path_free(start, round_about, True)
     assert rules.path_free(start, round_about, False)

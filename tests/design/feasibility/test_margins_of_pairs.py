@@ -14,6 +14,7 @@ from design.feasibility.small_cells import (
     box,
     broken,
     cell,
+    gantry,
     gantry_at,
     gantry_rules,
     sphere,
@@ -179,6 +180,13 @@ def test_neighbours_and_a_spherical_wrist_are_not_paired():
         assert {frozenset((link, "table")), frozenset((link, "lamp"))} <= found
     assert frozenset(("base", "table")) not in found
     assert frozenset(("tool", "link6")) not in found and frozenset(("tool", "link5")) in found
+
+
+def test_links_that_a_slide_can_part_are_paired_except_neighbours():
+    found = pair_names(cell(Workspace(link_radius=(0.1,))), gantry())
+    assert found == {
+        frozenset(p) for p in (("link1", "link3"), ("link1", "link4"), ("link2", "link4"))
+    }
 
 
 def test_pairs_that_are_left_out_touch_in_every_pose():

@@ -69,7 +69,9 @@ def diagonal_problem(name: str, sizes: np.ndarray, share: int, most: int) -> Des
         prior=np.zeros((1, p, p)),
         group=np.zeros(p, dtype=np.int64),
         shares=np.array([share]),
-        criterion=make_criterion(name, parameters=p, interest=np.arange(p), A=np.eye(p)[None, :, None]),
+        criterion=make_criterion(
+            name, parameters=p, interest=np.arange(p), A=np.eye(p)[None, :, None]
+        ),
         most=most,
     )
 

@@ -59,7 +59,7 @@ def test_the_relaxed_optimum_lies_between_bound_and_best_plan(name, seed):
     problem = tiny(name, seed=seed, most=1 + seed % 2)
     relaxed = relax(problem)
     assert relaxed.bound <= best_plan(problem) * (1 + 1e-12)
-    assert relaxed.gap <= 1e-6
+    assert relaxed.gap <= 1e-5
     assert relaxed.value * (1 - relaxed.gap) == pytest.approx(relaxed.bound, rel=1e-12)
 
 

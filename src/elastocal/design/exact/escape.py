@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from elastocal.design.exact.exchange import IMPROVEMENT, Exchanged, exchange
@@ -12,6 +14,8 @@ from elastocal.design.problem import DesignProblem, IntArray
 # Changes in vain after which a start is done, and how many poses each of them moves at most.
 PATIENCE = 12
 MOVED = 8
+# Order of the power means that stand for a maximum: smooth, and within a few per cent of it.
+SOFT = 30.0
 
 
 def search(problem: DesignProblem, chosen: IntArray, rng: np.random.Generator) -> Exchanged:
@@ -21,18 +25,32 @@ def search(problem: DesignProblem, chosen: IntArray, rng: np.random.Generator) -
     changes in a row led to nothing better.  An exchange optimum is left where the better plan
     differs by two poses or more, which no single exchange can see.
     """
-    best = exchange(problem, chosen)
+    best = _descended(problem, chosen)
     passes, failed = best.passes, 0
     while failed < PATIENCE:
         changed = _changed(problem, best.chosen, rng)
         failed += 1
         if not is_regular(problem.prior + problem.sum_of(changed)):
             continue
-        found = exchange(problem, changed)
+        found = _descended(problem, changed)
         passes += found.passes
         if found.value < best.value * (1 - IMPROVEMENT):
             best, failed = found, 0
     return Exchanged(best.chosen, best.value, passes)
+
+
+def _descended(problem: DesignProblem, chosen: IntArray) -> Exchanged:
+    """Exchanges on the softened criterion first, where Φ has kinks.
+
+    What lowers a maximum is shut out wherever two of its arguments are equal and each exchange
+    raises one of them; the softened criterion weighs them against each other.
+    """
+    passes, smooth = 0, problem.criterion.softened(SOFT)
+    if smooth is not problem.criterion:
+        first = exchange(replace(problem, criterion=smooth), chosen)
+        chosen, passes = first.chosen, first.passes
+    found = exchange(problem, chosen)
+    return replace(found, passes=found.passes + passes)
 
 
 def _changed(problem: DesignProblem, chosen: IntArray, rng: np.random.Generator) -> IntArray:

@@ -105,8 +105,9 @@ def best_addition(
 
 
 def _upper(problem: DesignProblem, M: Array, candidates: IntArray) -> Array:
-    """Bounds (k,) on 1/Φ(M_s + B_siᵀB_si); inf where none is known."""
-    if not problem.criterion.certifiable or not factorise(M).regular.all():
+    """Bounds (k,) on 1/Φ(M_s + B_siᵀB_si); inf where none is known or none is worth its cost."""
+    known = problem.criterion.certifiable and len(candidates) > FIRST
+    if not known or not factorise(M).regular.all():
         return np.full(len(candidates), np.inf)
     gradient = problem.criterion.gradient(M)
     B = problem.blocks[:, candidates]

@@ -22,7 +22,7 @@ def greedy_plan(problem: DesignProblem, begun: IntArray | None = None) -> IntArr
     while len(chosen) < problem.n_poses:
         taken = np.bincount(problem.group[chosen], minlength=len(problem.shares))
         open_groups = np.flatnonzero(problem.shares > taken)
-        into = np.sort(np.concatenate([admissible(problem, chosen, g) for g in open_groups]))
+        into = np.sort(np.concatenate([admissible(problem, chosen, int(g)) for g in open_groups]))
         M = problem.prior + problem.sum_of(chosen)
         best = best_addition(problem, M, into) if is_regular(M) else None
         if best is None:

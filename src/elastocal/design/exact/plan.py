@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from elastocal.design.criteria.base import Gradient
-from elastocal.design.exact.escape import search
+from elastocal.design.exact.escape import SOFT, search
 from elastocal.design.exact.exchange import TIE, exchange
 from elastocal.design.exact.finished import Checkpoint, Finished, load_finished, save_finished
 from elastocal.design.exact.greedy import fitted, greedy_plan
@@ -16,12 +16,9 @@ from elastocal.design.exact.pool import Prices, random_plan, restrict
 from elastocal.design.exact.regular import check_enough, is_regular, regular_plan
 from elastocal.design.exact.rounding import round_weights
 from elastocal.design.problem import Array, DesignProblem, IntArray
-from elastocal.errors import require
+from elastocal.errors import InsufficientDataError, require
 
 Progress = Callable[[str], None]
-
-# Order of the power means that stand for a maximum where candidates are priced.
-SOFT = 30.0
 
 
 @dataclass(frozen=True)
@@ -65,10 +62,9 @@ def exact_plan(
     InsufficientDataError where no plan of these shares determines all parameters.
     """
     N = problem.n_candidates
-    require(
-        relaxed_weights is None or np.shape(relaxed_weights) == (N,),
-        f"relaxed weights are {np.shape(relaxed_weights)}, not {(N,)}",
-    )
+    if relaxed_weights is not None:
+        shape = relaxed_weights.shape
+        require(shape == (N,), f"relaxed weights have shape {shape}; the pool needs {(N,)}")
     require(starts >= 1, f"an exact plan needs at least one start, got {starts}")
     require(jobs != 0, "jobs is the number of processes, or -1 for all cores; got 0")
     check_enough(problem)
@@ -88,8 +84,8 @@ def exact_plan(
         keep(0, _start(_Pool.of(problem, tangent, relaxed_weights), 0, seeds[0], begun))
     first = done[0]
     if tangent is None:
-        tangent = _tangent(problem, np.bincount(first.chosen, minlength=N))
-    pool = _Pool.of(problem, tangent, relaxed_weights, first.value)
+        tangent = _tangent(problem, np.bincount(first.chosen, minlength=N).astype(float))
+    pool = _Pool.of(problem, tangent, relaxed_weights, first)
     later = [k for k in range(starts) if k not in done]
     for k, finished in _run(pool, later, seeds, jobs):
         keep(k, finished)
@@ -106,12 +102,13 @@ def _tangent(problem: DesignProblem, weights: Array) -> Gradient | None:
 @dataclass(frozen=True)
 class _Pool:
     """Candidates `kept` of the whole pool as a problem of their own, those `near` looked at first,
-    and relaxed weights, both by their places in `kept`."""
+    relaxed weights and a regular plan that is `known`, all by their places in `kept`."""
 
     problem: DesignProblem
     kept: IntArray
     near: IntArray
     weights: Array | None
+    known: IntArray | None = None
 
     @classmethod
     def of(
@@ -119,16 +116,18 @@ class _Pool:
         problem: DesignProblem,
         tangent: Gradient | None,
         weights: Array | None,
-        value: float = np.inf,
+        first: Finished | None = None,
     ) -> _Pool:
-        everything = np.arange(problem.n_candidates)
+        """All candidates, or those that may be in a better plan than `first`."""
         if tangent is None:
+            everything = np.arange(problem.n_candidates)
             return cls(problem, everything, everything, weights)
         prices = Prices.of(problem, tangent)
-        kept = prices.may_better(value)
+        kept = prices.may_better(np.inf if first is None else first.value)
         rest = restrict(problem, kept)
         near = Prices(prices.d[kept], prices.upper[kept]).near(rest)
-        return cls(rest, kept, near, None if weights is None else weights[kept])
+        known = None if first is None else np.searchsorted(kept, first.chosen)
+        return cls(rest, kept, near, None if weights is None else weights[kept], known)
 
 
 def _start(
@@ -138,10 +137,9 @@ def _start(
     rng = np.random.default_rng(seed)
     problem = pool.problem
     chosen = _begin(pool, k, rng) if begun is None else begun
+    chosen = _regular(pool, chosen, rng)
     kept = np.union1d(pool.near, chosen)
-    nearby = restrict(problem, kept)
-    chosen = regular_plan(nearby, np.searchsorted(kept, chosen), rng)
-    found = search(nearby, chosen, rng)
+    found = search(restrict(problem, kept), np.searchsorted(kept, chosen), rng)
     final = exchange(problem, kept[found.chosen])
     return Finished(pool.kept[final.chosen], final.value, found.passes + final.passes)
 
@@ -156,6 +154,16 @@ def _begin(pool: _Pool, k: int, rng: np.random.Generator) -> IntArray:
     if weights is not None and k % 2 == 0:
         return round_weights(problem, weights, rng)
     return pool.near[random_plan(restrict(problem, pool.near), rng)]
+
+
+def _regular(pool: _Pool, chosen: IntArray, rng: np.random.Generator) -> IntArray:
+    """`chosen` or a plan near it that determines all parameters, of near candidates if it can."""
+    kept = np.union1d(pool.near, chosen)
+    nearby = restrict(pool.problem, kept)
+    try:
+        return kept[regular_plan(nearby, np.searchsorted(kept, chosen), rng)]
+    except InsufficientDataError:
+        return regular_plan(pool.problem, chosen, rng) if pool.known is None else pool.known
 
 
 def _run(

@@ -89,4 +89,3 @@ class Prices:
             order = np.argsort(-self.d[members], kind="stable")
             kept.append(members[order[: NEAR_PER_POSE * share]])
         return np.sort(np.concatenate(kept))
-

@@ -19,17 +19,21 @@ def is_regular(M: Array) -> bool:
     return bool(factorise(M).regular.all())
 
 
+def fewest_poses(problem: DesignProblem) -> int:
+    """The smallest number of poses that gives as many equations as there are parameters."""
+    _, _, r, p = problem.blocks.shape
+    return -(-(p - _known(problem)) // r)
+
+
 def check_enough(problem: DesignProblem) -> None:
     """Raise InsufficientDataError where no plan of these shares can determine all parameters."""
     _, _, r, p = problem.blocks.shape
-    n = problem.n_poses
-    known = min(int(np.linalg.matrix_rank(prior, hermitian=True)) for prior in problem.prior)
-    if known + n * r < p:
+    n, known, needed = problem.n_poses, _known(problem), fewest_poses(problem)
+    if n < needed:
         prior = f" and the prior {known}" if known else ""
         raise InsufficientDataError(
             f"fewer equations than parameters: {n} poses of {r} readings give {n * r}{prior}, for "
-            f"{p} parameters; plan at least {-(-(p - known) // r)} poses, switch effects off or "
-            "state a prior"
+            f"{p} parameters; plan at least {needed} poses, switch effects off or state a prior"
         )
     usable = np.flatnonzero(problem.shares[problem.group] > 0)
     if not is_regular(problem.prior + problem.sum_of(usable)):
@@ -37,6 +41,11 @@ def check_enough(problem: DesignProblem) -> None:
             f"all {len(usable)} candidates of the groups with a share together do not determine "
             f"the {p} parameters; allow other joint levels or more load, or switch effects off"
         )
+
+
+def _known(problem: DesignProblem) -> int:
+    """How many combinations of parameters the prior determines."""
+    return min(int(np.linalg.matrix_rank(prior, hermitian=True)) for prior in problem.prior)
 
 
 def log_det_gain(M: Array, blocks: Array) -> Array:
@@ -55,9 +64,7 @@ def ridge(problem: DesignProblem) -> Array:
     return np.asarray(mean[:, :, None] * np.eye(mean.shape[1]))
 
 
-def regular_plan(
-    problem: DesignProblem, chosen: IntArray, rng: np.random.Generator
-) -> IntArray:
+def regular_plan(problem: DesignProblem, chosen: IntArray, rng: np.random.Generator) -> IntArray:
     """A plan of regular M near `chosen`: exchanges that raise Σ_s log det(M_s + δ ridge), δ → 0.
 
     For small δ a determinant counts the rank first.  Random plans are tried where `chosen` leads

@@ -88,7 +88,9 @@ def _arm(cell: Cell, chain: Chain) -> Iterator[Body]:
     workspace = cell.workspace
     where = f"{cell.path or cell.name}: [workspace]"
     if workspace.urdf_geometry and workspace.link_radius:
-        raise InputError(f"{where} gives link_radius and urdf_geometry; the arm can have only one")
+        raise InputError(
+            f'{where} gives link_radius and geometry = "urdf"; the arm can have only one'
+        )
     if workspace.urdf_geometry:
         from elastocal.design.feasibility.urdf_bodies import urdf_bodies
 

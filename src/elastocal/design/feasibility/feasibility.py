@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,17 @@ LOADED = np.array([0.0, 0.0, -1.0])  # any force: the load hangs
 SAMPLE = 300  # random poses in which a pair must once keep apart to be believed
 
 
+_last_restored: dict[str, Feasibility] = {}
+
+
+def _restored(token: str, cell: Cell, chain: Chain) -> Feasibility:
+    """The rules anew, once per process: with every task the same ones are sent again."""
+    if token not in _last_restored:
+        _last_restored.clear()
+        _last_restored[token] = Feasibility(cell, chain)
+    return _last_restored[token]
+
+
 class Feasibility:
     """The rules of a cell for the nominal, rigid arm.
 
@@ -37,7 +49,7 @@ class Feasibility:
     """
 
     def __init__(self, cell: Cell, chain: Chain) -> None:
-        self.cell, self.chain = cell, chain
+        self.cell, self.chain, self._token = cell, chain, uuid4().hex
         self.kinematics = Kinematics(cell, chain)
         self.bodies: tuple[Body, ...] = cell_bodies(cell, chain)
         self.pairs: tuple[Pair, ...] = cell_pairs(cell, chain, self.bodies)
@@ -46,7 +58,7 @@ class Feasibility:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Feasibility, (self.cell, self.chain)
+        return _restored, (self._token, self.cell, self.chain)
 
     def check(self, q: Array, force: Array) -> Verdict:
         """Every rule on every pose q (N, n) rad or m under a force (3,) or (N, 3) N.

@@ -23,7 +23,8 @@ class MotionBound:
 
         S_j = S_{j+1} + h_j ρ_j,   ρ_j = lever_j + S_{j+1}   (revolute; h_j for a prismatic one)
 
-    with S_{i+1} = 0 and lever_j its distance from axis j at the middle.  The distance of a body
+    with S_{i+1} = 0 and lever_j its distance from axis j at the middle.  The ball by which a
+    sphere or capsule is grown turns into itself and does not count.  The distance of a body
     on joint i from one on joint a < i changes by at most S_{a+1}, from one in the data's frame by
     S_1 (Schwarzer, Saha & Latombe 2005, here with the levers at the middle instead of the longest
     ones).  The hanging load moves with the load point and does not turn: S_1 of that point, and
@@ -38,16 +39,8 @@ class MotionBound:
         self._axes = np.array([joint.axis for joint in chain.joints])
         self._revolute = [joint.kind == "revolute" for joint in chain.joints]
         hook = (chain.flange_placement @ [*kinematics.load_point, 1.0])[None, :3]
-        # Per carrier its joint and the points and radii that hull its bodies: joints, load point.
-        hulls = [[few_points(b.solid) for b in bodies if b.carrier == i] for i in range(n)]
-        self._carried = [
-            (
-                i,
-                np.concatenate([points for points, _ in own] or [np.zeros((1, 3))]),
-                np.concatenate([np.full(len(points), r) for points, r in own] or [np.zeros(1)]),
-            )
-            for i, own in enumerate(hulls)
-        ]
+        # The points and radii whose motion bounds that of all bodies on a joint; the load point.
+        self._carried = [(i, *_reach([b for b in bodies if b.carrier == i])) for i in range(n)]
         self._carried.append((n - 1, hook, np.zeros(1)))
         # Each pair's bound is one entry of S, or the sum of two.
         at = np.zeros((2, 2, len(pairs)), dtype=int)
@@ -77,7 +70,17 @@ class MotionBound:
                     arm = world - poses.frames[:, j, :3, 3:]
                     along = (axis[:, None] @ arm)[:, 0]
                     square = np.einsum("nik,nik->nk", arm, arm) - along**2
-                    lever = (np.sqrt(np.maximum(square, 0.0)) + radii).max(axis=1)
+                    lever = (np.sqrt(np.maximum(square, 0.0)) + radii).max(axis=1, initial=0.0)
                     S[:, c, j] = S[:, c, j + 1] + half[:, j] * (lever + S[:, c, j + 1])
         (one, upto), (two, upto_two) = self._at
         return np.asarray(S[:, one, upto] + S[:, two, upto_two])
+
+
+def _reach(bodies: Sequence[Body]) -> tuple[Array, Array]:
+    """Points (k, 3) on a joint and what any point of its bodies may be further out (k,)."""
+    points, radii = [np.zeros((0, 3))], [np.zeros(0)]
+    for body in bodies:
+        own, radius = few_points(body.solid)
+        points.append(own)
+        radii.append(np.full(len(own), radius if body.solid.shape == "cylinder" else 0.0))
+    return np.concatenate(points), np.concatenate(radii)

@@ -26,12 +26,12 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
     import pinocchio as pin
 
     path = cell.robot.urdf
-    where = f"{cell.path or cell.name}: [workspace] urdf_geometry"
+    where = f'{cell.path or cell.name}: [workspace] geometry = "urdf"'
     if path is None:
-        raise InputError(f"{where} = true, but the robot has no URDF; give link_radius_m instead")
-    model = pin.buildModelFromUrdf(str(path))
+        raise InputError(f"{where}, but the robot has no URDF; give link_radius_mm instead")
     folders = [str(folder) for folder in path.resolve().parents[:PARENTS]]
     try:
+        model = pin.buildModelFromUrdf(str(path))
         geometry = pin.buildGeomFromUrdf(
             model, str(path), pin.GeometryType.COLLISION, package_dirs=folders
         )
@@ -39,10 +39,12 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
         raise InputError(
             f"{where}: {path}: {' '.join(str(error).split())}; put the mesh files where the URDF "
             "looks for them (beside it, or in a package directory above it), or give "
-            "link_radius_m instead"
+            "link_radius_mm instead"
         ) from None
     if not geometry.ngeoms:
-        raise InputError(f"{where}: {path} has no <collision> elements; give link_radius_m instead")
+        raise InputError(
+            f"{where}: {path} has no <collision> elements; give link_radius_mm instead"
+        )
     moving = [joint.name for joint in chain.joints]
     locked = pin.StdVec_Index()
     for name in list(model.names)[1:]:

@@ -11,8 +11,8 @@ import numpy as np
 from elastocal.design.certificate import tangent_bound
 from elastocal.design.criteria.base import Array, Gradient
 from elastocal.design.problem import IntArray
-from elastocal.design.relaxation.interior_point import Restricted
 from elastocal.design.relaxation.pool import Pool
+from elastocal.design.relaxation.restricted import Restricted
 
 MOST_ROUNDS = 200
 # The master's gap as a part of the pool's: more would be lost on candidates that will change.
@@ -23,6 +23,8 @@ ENTERING = 4
 LEAST_DEPTH, MOST_DEPTH = 1e-3, 0.1
 # Weights below this part of the largest leave the support, unless their d is near the margin.
 NEGLIGIBLE = 1e-4
+# Information in a direction, as a part of that of the whole pool, which counts as none.
+UNSEEN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def optimise(
     value, bound, gap, accuracy = np.inf, 0.0, 1.0, MASTER_PART
     history: list[Step] = []
     for _ in range(MOST_ROUNDS):
-        task = pool.restricted(support)
+        support, task = _regular(pool, support)
         inside = task.inside(weights[support], min(max(gap, LEAST_DEPTH), MOST_DEPTH))
         found, tangent = master(task, inside, accuracy)
         weights = pool.fixed.copy()
@@ -96,3 +98,22 @@ def optimise(
         kept = (task.relative(found) > NEGLIGIBLE) | (d[support] >= (1.0 - gap) * least[support])
         support = np.concatenate([support[kept], entering])
     return best, steepest, tuple(history)
+
+
+def _regular(pool: Pool, support: IntArray) -> tuple[IntArray, Restricted]:
+    """The support with candidates added until it sees every direction that the pool sees.
+
+    Directions that Φ does not count, such as nuisance parameters beside c, draw no weight.
+    """
+    while True:
+        task = pool.restricted(support)
+        even = task.inside(np.zeros(len(support)), 1.0)
+        M = pool.root @ task.information(even) @ pool.root.transpose(0, 2, 1)
+        eigenvalues, U = np.linalg.eigh(M)
+        unseen = eigenvalues < UNSEEN
+        if not unseen.any():
+            return support, task
+        rows = (U * unseen[:, None, :]).transpose(0, 2, 1) @ pool.root
+        d = pool.sensitivity(rows.transpose(0, 2, 1) @ rows)
+        d[support] = -np.inf
+        support = np.concatenate([support, pool.best(d, np.ones_like(pool.levels))])

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.design.criteria.base import Array
+from elastocal.design.criteria.base import Array, IntArray
 from elastocal.design.criteria.determinant import DeterminantCriterion
 from elastocal.design.criteria.eigenvalue import EigenvalueCriterion
 from elastocal.design.criteria.o5 import FifthObservability
@@ -89,7 +89,7 @@ def _targets(cp: ModuleType, C: Array, M: Any, root: Array, unit: float) -> Cone
     return Cone(largest, [cp.bmat([[M, Q], [Q.T, U]]) >> 0, limit], kinked)
 
 
-def _determinant(cp: ModuleType, interest: Array, M: Any, root: Array) -> Cone:
+def _determinant(cp: ModuleType, interest: IntArray, M: Any, root: Array) -> Cone:
     """det(V_II)^{1/k}, J in the basis where V_II starts as the identity."""
     K = root.T[interest]
     K = np.linalg.solve(np.linalg.cholesky(K @ K.T), K)
@@ -97,7 +97,7 @@ def _determinant(cp: ModuleType, interest: Array, M: Any, root: Array) -> Cone:
     return Cone(cp.exp(-cp.log_det(J) / len(K)), [M - K.T @ J @ K >> 0])
 
 
-def _fifth(cp: ModuleType, interest: Array, M: Any, root: Array, unit: float) -> Cone:
+def _fifth(cp: ModuleType, interest: IntArray, M: Any, root: Array, unit: float) -> Cone:
     """(tr V_II^{1/2})² with X² ⪯ J by [J X; X 1] ⪰ 0."""
     K = root.T[interest] / np.sqrt(unit)
     k = len(K)
@@ -106,7 +106,7 @@ def _fifth(cp: ModuleType, interest: Array, M: Any, root: Array, unit: float) ->
     return Cone(cp.square(cp.matrix_frac(np.eye(k), X)), below)
 
 
-def _eigenvalue(cp: ModuleType, interest: Array, M: Any, root: Array, unit: float) -> Cone:
+def _eigenvalue(cp: ModuleType, interest: IntArray, M: Any, root: Array, unit: float) -> Cone:
     """λ_max(V_II) = 1/u."""
     K = root.T[interest] / np.sqrt(unit)
     u = cp.Variable(nonneg=True)

@@ -16,9 +16,8 @@ from elastocal.design.criteria.base import Array, Criterion, Gradient
 from elastocal.design.criteria.scenarios import ScenarioCriterion
 from elastocal.design.criteria.worst import Worst
 from elastocal.design.relaxation.cones import Cone, cone_of
-from elastocal.design.relaxation.interior_point import Restricted
-from elastocal.errors import ElastocalError, InputError
-
+from elastocal.design.relaxation.restricted import Restricted
+from elastocal.errors import InputError, InsufficientDataError
 
 # Of clarabel on the scaled program, whose optimum is near 1; the second where the first fails.
 TOLERANCES = (1e-10, 1e-8)
@@ -37,7 +36,7 @@ class ConicMaster:
     def __call__(self, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Gradient]:
         """w (k,) and a tangent; `start` sets the units of the program and nothing else.
 
-        Raises ElastocalError where clarabel finds no solution.
+        Raises InsufficientDataError where clarabel finds no solution.
         """
         cp = self._cp
         M = task.information(start)
@@ -52,7 +51,9 @@ class ConicMaster:
             information = information + root @ task.base[s] @ root.T
             cones.append(cone_of(cp, self._base, s, information, root, float(values[s])))
             constraints += cones[-1].constraints
-        relative = [float(v / values.max()) * cone.value for v, cone in zip(values, cones)]
+        relative = [
+            float(v / values.max()) * cone.value for v, cone in zip(values, cones, strict=True)
+        ]
         total = cp.Variable()
         if self._worst:
             limit = [value <= total for value in relative]
@@ -87,7 +88,7 @@ class ConicMaster:
                     continue
                 if program.status in ("optimal", "optimal_inaccurate"):
                     return
-        raise ElastocalError(
+        raise InsufficientDataError(
             f"the conic solver stopped with status {program.status!r} on the relaxation; the "
             "information may be nearly singular: add prior knowledge or poses"
         )

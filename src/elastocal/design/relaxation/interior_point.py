@@ -23,8 +23,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from elastocal.design.certificate import largest_sum
 from elastocal.design.criteria.base import Array
-from elastocal.design.problem import IntArray
 from elastocal.design.relaxation.pieces import Local, Pieces
+from elastocal.design.relaxation.restricted import Restricted
 
 MOST_STEPS = 100
 TO_BOUNDARY = 0.99
@@ -43,43 +43,8 @@ RIDGE = 1e-14
 
 
 @dataclass(frozen=True)
-class Restricted:
-    """Candidates A (S, k, p, p) in levels (k,) 0 … L−1 with shares (L,), each at most `most`.
-
-    `base` (S, p, p): information that does not depend on their weights.
-    """
-
-    A: Array
-    base: Array
-    level: IntArray
-    shares: IntArray
-    most: int
-
-    def information(self, w: Array) -> Array:
-        return self.base + np.tensordot(self.A, w, (1, 0))
-
-    def relative(self, w: Array) -> Array:
-        """w_i as a part of the largest weight of its level."""
-        largest = np.zeros(len(self.shares))
-        np.maximum.at(largest, self.level, w)
-        return np.asarray(w / largest[self.level])
-
-    def inside(self, w: Array, depth: float) -> Array:
-        """w ≥ 0 scaled to the shares and moved off its bounds, `depth` of the way to even ones."""
-        size = np.bincount(self.level)
-        total = np.bincount(self.level, w)
-        scale = self.shares / np.where(total > 0.0, total, np.inf)
-        clipped = np.minimum(w * scale[self.level], self.most)
-        filled = np.bincount(self.level, clipped)
-        missing = np.maximum(self.shares - filled, 0.0)
-        part = missing / np.maximum(self.most * size - filled, np.finfo(float).tiny)
-        full = clipped + part[self.level] * (self.most - clipped)
-        return np.asarray((1.0 - depth) * full + depth * (self.shares / size)[self.level])
-
-
-@dataclass(frozen=True)
 class Point:
-    """w (k,) inside its bounds, the pieces there, −∂f_j/∂w_i (J, k), slacks s (J,) and F_σ."""
+    """w (k,) inside its bounds, the pieces there, their slacks s (J,) and F_σ as `merit`."""
 
     w: Array
     local: Local
@@ -112,16 +77,13 @@ class Multipliers:
         return max(float(np.abs(np.log(value / centre)).max()) for value, centre in pairs)
 
 
-def solve(
-    pieces: Pieces, task: Restricted, start: Array, accuracy: float
-) -> tuple[Array, Array]:
+def solve(pieces: Pieces, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Array]:
     """Weights w (k,) whose log Φ is within `accuracy` of the least, and multipliers μ (J,).
 
     `start` (k,) strictly inside its bounds with the right sums per level.
     """
     local = pieces.at(task.information(start))
-    if local is None:
-        raise ArithmeticError("the interior point started at a singular information matrix")
+    assert local is not None  # every support sees what the pool sees
     count = 2 * len(start) + len(local.values)
     mu = np.full(len(local.values), 1.0 / len(local.values))
     gap = _gap(task, start, local, mu, local.slopes(task.A))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from elastocal.design.criteria.base import BATCH_NUMBERS, Array
 from elastocal.design.problem import DesignProblem, IntArray
-from elastocal.design.relaxation.interior_point import Restricted
+from elastocal.design.relaxation.restricted import Restricted
 from elastocal.errors import InsufficientDataError
 
 # Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.
@@ -36,25 +38,30 @@ class Pool:
         self.fixed = np.where(whole[problem.group], float(problem.most), 0.0)
         self.levels = np.flatnonzero(~whole & (problem.shares > 0))
 
-    def uniform(self) -> Array:
-        """w (N,): each group's share spread evenly; regular if any design is.
+    def even(self) -> Array:
+        """w (N,): each group's share spread evenly."""
+        size = np.bincount(self.problem.group, minlength=len(self.problem.shares))
+        return np.asarray((self.problem.shares / np.maximum(size, 1))[self.problem.group])
 
-        Raises InsufficientDataError where even this information is singular.
+    @cached_property
+    def root(self) -> Array:
+        """R (S, p, p) with R M Rᵀ = 1 for the information M of even weights.
+
+        Raises InsufficientDataError where that is singular, as then it is for any weights.
         """
-        problem = self.problem
-        size = np.bincount(problem.group, minlength=len(problem.shares))
-        weights = (problem.shares / np.maximum(size, 1))[problem.group]
-        for s, M in enumerate(self.information(weights)):
-            diagonal = np.diag(M)
+        M = self.information(self.even())
+        for s, M_s in enumerate(M):
+            diagonal = np.diag(M_s)
             scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-            smallest = float(np.linalg.eigvalsh(M / np.outer(scale, scale))[0])
-            if not smallest > SINGULAR * len(M):
+            smallest = float(np.linalg.eigvalsh(M_s / np.outer(scale, scale))[0])
+            if not smallest > SINGULAR * len(M_s):
                 raise InsufficientDataError(
-                    f"all {problem.n_candidates} candidate poses together leave some parameters "
-                    f"undetermined (scenario {s}: smallest eigenvalue of the scaled information "
-                    f"{smallest:.1e}): add prior knowledge, other poses or loads, or fix parameters"
+                    f"all {self.problem.n_candidates} candidate poses together leave some "
+                    f"parameters undetermined (scenario {s + 1} of {len(M)}: smallest eigenvalue "
+                    f"of the scaled information {smallest:.1e}): add prior knowledge, other poses "
+                    "or loads, or fix parameters"
                 )
-        return np.asarray(weights, dtype=float)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(M)))
 
     def scaled(self, weights: Array) -> Array:
         """w ≥ 0 (N,) with each group's sum brought to its share, 0 where a group has none."""

@@ -25,8 +25,8 @@ DIRECT = 2000
 PER_PARAMETER = 4
 # Multiplicative steps before that.
 PASSES = 10
-# Part of even weights in the first ones, so that no start is singular.
-EVEN = 0.1
+# Part of even weights in the first ones, so that none is singular.
+EVEN = 0.05
 # Parts of the largest weight below which weights are tried to be left out.
 NEGLIGIBLE = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
@@ -81,10 +81,11 @@ def relax(
     )
     require(0.0 < tolerance < 1.0, f"tolerance is {tolerance}; it must lie between 0 and 1")
     pool = Pool(problem)
-    first = _first_weights(pool, start)
-    pieces = None if method == "conic" else pieces_of(criterion, len(problem.prior))
+    _ = pool.root  # a pool that cannot see all parameters is refused here
     if len(pool.levels) == 0:
         return _only_plan(pool)
+    first = _first_weights(pool, start)
+    pieces = None if method == "conic" else pieces_of(criterion, len(problem.prior))
     master: Master = ConicMaster(criterion) if pieces is None else NewtonMaster(pieces)
     whole = method == "conic" and problem.n_candidates <= DIRECT
 
@@ -114,20 +115,21 @@ def _first_weights(pool: Pool, start: Array | None) -> Array:
 
     Silvey, Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379.
     """
-    problem = pool.problem
-    weights = pool.uniform()
+    problem, even = pool.problem, pool.even()
+    weights = even
     if start is not None:
         require(
-            start.shape == weights.shape and bool(np.all(start >= 0.0)),
+            start.shape == even.shape and bool(np.all(start >= 0.0)),
             f"start of the relaxation has shape {start.shape} or negative weights; give "
-            f"{weights.shape} weights of 0 or more",
+            f"{even.shape} weights of 0 or more",
         )
-        weights = EVEN * weights + (1.0 - EVEN) * pool.scaled(start)
+        weights = EVEN * even + (1.0 - EVEN) * pool.scaled(start)
     # Of a maximum its mean: on a kink these steps would swing from one side to the other.
     criterion = problem.criterion.softened(1.0)
     for _ in range(PASSES):
         d = pool.sensitivity(criterion.gradient(pool.information(weights)).G)
-        weights = np.minimum(pool.scaled(weights * np.sqrt(d)), problem.most)
+        step = np.minimum(pool.scaled(weights * np.sqrt(d)), problem.most)
+        weights = EVEN * even + (1.0 - EVEN) * step
     return weights
 
 

@@ -10,8 +10,9 @@ from elastocal.design.criteria.o5 import FifthObservability
 from elastocal.design.criteria.prediction_maximum import GCriterion
 from elastocal.design.criteria.trace import TraceCriterion
 from elastocal.design.criteria.worst import Worst
-from elastocal.design.relaxation.interior_point import Restricted, solve
+from elastocal.design.relaxation.interior_point import solve
 from elastocal.design.relaxation.pieces import Pieces
+from elastocal.design.relaxation.restricted import Restricted
 from elastocal.design.relaxation.terms import RootDeterminant, SquaredTraceRoot, Term, Traces
 
 

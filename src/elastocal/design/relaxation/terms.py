@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from elastocal.design.criteria.base import Array
-from elastocal.design.problem import IntArray
+from elastocal.design.criteria.base import Array, IntArray
 
 
 class Term(ABC):
