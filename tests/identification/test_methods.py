@@ -273,6 +273,7 @@ def test_computed_readings_give_the_true_values_and_no_noise(stated):
     exact = simulate(model, table, truth, 0, noise=False)
     result = identify(model, exact)
     assert not result.faulty
+    assert result.faulty_report is None
     assert any("computed, not measured" in text for text in result.warnings)
     found = model.predict(exact, result.x)
     assert np.abs(found - observe(exact, model.observe).value).max() < 1e-9

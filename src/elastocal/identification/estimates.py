@@ -12,7 +12,7 @@ from elastocal.identification.advice import warnings_for
 from elastocal.identification.faulty_report import report_faulty
 from elastocal.identification.heldout import rms_3d
 from elastocal.identification.intervals import Intervals
-from elastocal.identification.methods import Found
+from elastocal.identification.methods import Found, is_exact
 from elastocal.identification.noise_summary import noise_summary
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
 from elastocal.identification.result import (
@@ -70,9 +70,9 @@ def summarise(
         excluded=beyond if set_apart else (),
         warnings=(),
         residual_summary=_residual_summary(solution, found.leverage),
-        faulty_report=report_faulty(
-            whole, found.solution if set_apart else clean, found.noise, found.good
-        ),
+        faulty_report=None
+        if is_exact(whole)
+        else report_faulty(whole, found.solution if set_apart else clean, found.noise, found.good),
         active=found.active,
         prior_share=found.prior_share,
     )
