@@ -109,7 +109,7 @@ class Clock:
     """Wall and CPU seconds of named steps."""
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, Any] = {}
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
@@ -134,17 +134,16 @@ def main(urdf: Path, pool: Path, out: Path) -> None:
     with clock.step("detmax"):
         history = Detmax(design._subX_dict, int(given["poses"])).main_algo()
     p = design.R_rearr.shape[1]
-    np.savez(
-        out,
-        regressor=design.R_rearr.reshape(len(q), 3, p),
-        names=design.calib_config["param_name"],
-        weights=weights,
-        ranked=design._select_by_threshold(),
-        detmax=p * np.log(history[-1]),
-        status=str(socp.solution.status),
-        wall_solver=socp.solution.searchTime,
-        **clock.seconds,
-    )
+    found: dict[str, Any] = {
+        "regressor": design.R_rearr.reshape(len(q), 3, p),
+        "names": design.calib_config["param_name"],
+        "weights": weights,
+        "ranked": design._select_by_threshold(),
+        "detmax": p * np.log(history[-1]),
+        "status": str(socp.solution.status),
+        "wall_solver": socp.solution.searchTime,
+    }
+    np.savez(out, **found, **clock.seconds)
 
 
 if __name__ == "__main__":

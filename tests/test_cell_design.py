@@ -99,7 +99,6 @@ point_m = [0, 1, 0]
 [design.motion]
 home_deg = [0, 90]
 speed_deg_per_s = [90, 180]
-step_deg = 1.8
 dwell_s = 20
 load_change_s = 300
 both_directions = true
@@ -134,7 +133,6 @@ overshoot_deg = 3
     np.testing.assert_allclose(motion.home, [0, np.pi / 2])
     np.testing.assert_allclose(motion.speed, [np.pi / 2, np.pi])
     assert (motion.dwell, motion.load_change, motion.both_directions) == (20, 300, True)
-    assert motion.step == pytest.approx(np.radians(1.8))
     assert motion.overshoot == pytest.approx(np.radians(3))
     assert motion.degrees
 

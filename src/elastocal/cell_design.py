@@ -19,9 +19,10 @@ CriterionName = Literal[
 class TargetPose:
     """A test pose, where position must be right: joints `q` (n,) rad or m and force (3,) N.
 
-    `point` (3,) m in the flange frame; None: the load point if the cell states one, else the mean
-    over the markers.  `force` None: each of the design's loads that is not zero.  `degrees`: q
-    was stated in degrees, which fits revolute joints only.
+    `point` (3,) m in the flange frame; None: the markers themselves where their places are fitted,
+    else the load point if the cell states one, else the mean over the markers.  `force` None: each
+    of the design's loads that is not zero.  `degrees`: q was stated in degrees, which fits
+    revolute joints only.
     """
 
     q: Array
@@ -58,14 +59,13 @@ class TargetBox:
 @dataclass(frozen=True)
 class Motion:
     """How the arm moves between poses: joint `speed` (n,) rad/s or m/s, (1,) where all are alike
-    (None: equal speeds), `home` (n,), `step` rad at most between checked poses, `dwell` s of
+    (None: equal speeds), `home` (n,), `dwell` s of
     measuring per pose, `load_change` s for hanging or taking off the load by hand,
     `both_directions`: approach every pose from both sides (`overshoot` rad), to show backlash.
     `degrees`: speed or home were stated in degrees, which fits revolute joints only."""
 
     speed: Array | None = None
     home: Array | None = None
-    step: float = 0.03
     dwell: float = 30.0
     load_change: float = 600.0
     both_directions: bool = False

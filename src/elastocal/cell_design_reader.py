@@ -191,12 +191,11 @@ def _motion(path: Path, table: MotionTable) -> Motion:
             f"{path}: keys design.motion.speed_{speed[1]} and design.motion.home_{home[1]} mix "
             "units; give both in degrees, or both in SI units (_si)"
         )
-    step, dwell, change = table.step_deg, table.dwell_s, table.load_change_s
+    dwell, change = table.dwell_s, table.load_change_s
     overshoot = table.overshoot_deg
     return Motion(
         speed=None if speed is None else np.atleast_1d(speed[0]),
         home=None if home is None else home[0],
-        step=default.step if step is None else to_si(step, "deg"),
         dwell=default.dwell if dwell is None else float(dwell),
         load_change=default.load_change if change is None else float(change),
         both_directions=bool(table.both_directions),

@@ -62,7 +62,6 @@ class MotionTable(Table):
     speed_si: Positives | None = key("one positive number per joint, in rad/s or m/s")
     home_deg: Numbers | None = key("one number per joint, in degrees")
     home_si: Numbers | None = key("one number per joint, in rad or m")
-    step_deg: Positive | None = key("a positive number in degrees")
     dwell_s: NonNegative | None = key("a number >= 0 in s")
     load_change_s: NonNegative | None = key("a number >= 0 in s")
     both_directions: bool | None = key("true or false")

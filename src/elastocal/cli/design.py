@@ -91,7 +91,12 @@ def design(
     programs = tuple(program or ())
     _check_suffixes(programs, picture)
     check_outputs(output, report, picture, *programs)
-    asked = {"poses": poses, "criterion": criterion, "target": target, "candidates": candidates}
+    asked = {
+        "poses": poses,
+        "criterion": criterion,
+        "target": None if target is None else target * 1e-6,
+        "candidates": candidates,
+    }
     with progress_line(quiet) as progress:
         progress("reading")
         wanted = _read(cell, asked)
@@ -217,13 +222,10 @@ def _write(
 
 
 def _write_program(plan: Plan, path: Path) -> None:
+    from elastocal.design.programs.krl import krl_program
+    from elastocal.design.programs.urscript import urscript_program
     from elastocal.files import atomic_write_text
 
-    if path.suffix.lower() == ".src":
-        from elastocal.design.programs.krl import krl_program as program
-    else:
-        from elastocal.design.programs.urscript import urscript_program as program
-    text = program(
-        plan.execution, plan.model.chain, plan.configurations, plan.forces, name=path.stem
-    )
-    atomic_write_text(path, text)
+    write = krl_program if path.suffix.lower() == ".src" else urscript_program
+    arguments = (plan.execution, plan.model.chain, plan.configurations, plan.forces)
+    atomic_write_text(path, write(*arguments, name=path.stem))

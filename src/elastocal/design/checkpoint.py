@@ -52,7 +52,7 @@ class Stage:
         if self.path is None:
             return
         text = io.BytesIO()
-        np.savez(text, **{name: np.asarray(value) for name, value in state.items()})
+        np.savez(text, allow_pickle=False, **{k: np.asarray(v) for k, v in state.items()})
         self.path.parent.mkdir(parents=True, exist_ok=True)
         temporary = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}")
         temporary.write_bytes(text.getvalue())

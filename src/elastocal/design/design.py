@@ -17,7 +17,7 @@ from elastocal.design.exact.contribution import values_without
 from elastocal.design.exact.size_curve import size_curve
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space
-from elastocal.design.options import DesignOptions
+from elastocal.design.options import EFFORTS, DesignOptions
 from elastocal.design.order.blockers import Blockers
 from elastocal.design.order.schedule import schedule
 from elastocal.design.plan import Candidates, Plan, SizePoint
@@ -28,7 +28,7 @@ from elastocal.design.select import Selection, select
 from elastocal.design.setup import Known, Pool, Setup, set_up
 from elastocal.design.shares import shares_of
 from elastocal.design.target_poses import test_poses
-from elastocal.errors import InsufficientDataError
+from elastocal.errors import InsufficientDataError, require
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
 
@@ -36,6 +36,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Progress = Callable[[str], None]
 
+MOST_POSES = 100  # that a target is sought with
 VIA = 200  # candidates through which a blocked move may go
 
 
@@ -83,7 +84,7 @@ class _Design:
 
     def run(self) -> Plan:
         progress, options = self.progress, self.options
-        targets = test_poses(self.cell, self.chain, self.feasibility, options.seed)
+        targets = test_poses(self.cell, self.chain, self._at_work(), options.seed)
         q, load, group, counts = self._candidates()
         done = None
         if options.done is not None:
@@ -102,6 +103,11 @@ class _Design:
         searches = Searches(setup.information, self.space, self.feasibility, self.feasibility.pairs)
         found = select(setup, pool, shares, searches, options, self.checkpoint, progress)
         return self._plan(setup, found, shares, counts, targets.source, curve, done)
+
+    def _at_work(self) -> Feasibility:
+        """The rules for test poses: there the arm works, and the tracker need not see it."""
+        workspace = replace(self.cell.workspace, visibility=None, load=None)
+        return Feasibility(replace(self.cell, workspace=workspace), self.chain)
 
     def _candidates(self) -> tuple[Array, IntArray, IntArray, Candidates]:
         stage = self.checkpoint.stage("candidates")
@@ -137,22 +143,40 @@ class _Design:
         found = size_curve(
             lambda n: setup.problem(pool, shares_of(self.cell, n)),
             numbers,
-            None if target is None else setup.criterion.from_reported(target),
+            None if target is None else self._target(setup, target),
+            between=(pool.n_groups, MOST_POSES),
+            starts=EFFORTS[self.options.effort].starts,
             seed=self.options.seed,
             jobs=self.options.jobs,
             progress=self.progress,
         )
-        points = tuple(SizePoint(p.n_poses, p.value, p.bound) for p in found.points)
+        reported = setup.criterion.reported
+        points = tuple(
+            SizePoint(
+                p.n_poses, reported(p.value)[0], None if p.bound is None else reported(p.bound)[0]
+            )
+            for p in found.points
+        )
         if target is None:
             return points, shares
         if found.smallest is None:
-            value, unit = setup.criterion.reported(points[-1].value)
+            last = points[-1]
             raise InsufficientDataError(
-                f"{self.cell.path or self.cell.name}: no plan of up to {points[-1].poses} poses "
-                f"meets the target; the best found reaches {value:.4g} {unit}: allow a larger "
-                "target, more repeats, or a better tracker"
+                f"{self.cell.path or self.cell.name}: no plan of up to {last.poses} poses meets "
+                f"the target of {target * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
+                "allow more, measure more repeats, or take a better tracker"
             )
         return points, shares_of(self.cell, found.smallest)
+
+    def _target(self, setup: Setup, target: float) -> float:
+        """Φ of a target in m."""
+        unit_value, unit = setup.criterion.reported(1.0)
+        require(
+            unit == "µm",
+            f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria test_pose, "
+            f"I and G, not with {self.cell.design.criterion}; drop it, or compare by --curve",
+        )
+        return (target * 1e6 / unit_value) ** 2
 
     def _plan(
         self, setup: Setup, found: Selection, shares: IntArray, counts: Candidates, targets: str,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from elastocal.design.certificate import efficiency
 from elastocal.design.checkpoint import Checkpoint
-from elastocal.design.continuum import estimate
+from elastocal.design.continuum import Continuum, estimate
 from elastocal.design.exact.plan import exact_plan
 from elastocal.design.options import EFFORTS, DesignOptions
 from elastocal.design.plan import Certificate
@@ -56,13 +56,13 @@ def select(
     """
     first = len(pool)
     search = _Rounds(setup, searches, shares, options, checkpoint, progress)
-    relaxed = search.relax(pool, 0)
+    relaxed = search.relax(pool)
     chosen = search.exchange(pool, relaxed, None, 0)
     effort = EFFORTS[options.effort]
     for k in range(1, effort.rounds + 1):
         grown, chosen = search.polish(pool, chosen, k)
         pool = search.widen(grown, relaxed, k)
-        relaxed = search.relax(pool, k)
+        relaxed = search.relax(pool)
         chosen = search.exchange(pool, relaxed, chosen, k)
     value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
     certificate = search.certificate(pool, relaxed, value)
@@ -80,7 +80,7 @@ class _Rounds:
     checkpoint: Checkpoint
     progress: Progress
 
-    def relax(self, pool: Pool, k: int) -> Relaxed | None:
+    def relax(self, pool: Pool) -> Relaxed | None:
         """The relaxed optimum on the pool; None for a criterion without a bound."""
         if not self.setup.criterion.certifiable:
             return None
@@ -137,7 +137,7 @@ class _Rounds:
             return pool
         return pool.joined(self.setup.pool(state["q"], state["load"], state["group"]))
 
-    def _continuum(self, pool: Pool, relaxed: Relaxed, k: int):
+    def _continuum(self, pool: Pool, relaxed: Relaxed, k: int) -> Continuum:
         effort = EFFORTS[self.options.effort]
         # The pool may have grown since: candidates added later have weight 0.
         problem = self.setup.problem(pool, self.shares)

@@ -55,6 +55,10 @@ class Pool:
     def __len__(self) -> int:
         return len(self.q)
 
+    @property
+    def n_groups(self) -> int:
+        return int(self.group.max()) + 1
+
     def joined(self, other: Pool) -> Pool:
         return Pool(
             np.vstack([self.q, other.q]),

@@ -26,7 +26,7 @@ from elastocal.design.target_reach import (
 )
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.limits import finite_ranges, joint_limits
+from elastocal.manipulator.limits import finite_ranges, joint_index, joint_limits
 
 Array = NDArray[np.float64]
 
@@ -37,12 +37,14 @@ DRAWN = 4096  # postures among which the default test poses are sought, where a 
 @dataclass(frozen=True)
 class TargetPoses:
     """T test poses: `q` (T, n) rad or m, `force` (T, 3) N in the data's frame, `weight` (T,) of
-    sum 1, `point` (T, 3) m in the flange frame; `source` says where they come from."""
+    sum 1, `point` (T, 3) m in the flange frame, `stated` (T,) by the user or else the default;
+    `source` says where they come from."""
 
     q: Array
     force: Array
     weight: Array
     point: Array
+    stated: NDArray[np.bool_]
     source: str
 
 
@@ -55,6 +57,7 @@ class _Group:
     weight: Array
     point: Array
     told: str
+    stated: bool
 
 
 def test_poses(
@@ -77,7 +80,9 @@ def test_poses(
         check_posture(cell, chain, key, pose.q, pose.degrees)
         own = point if pose.point is None else pose.point
         force = None if pose.force is None else pose.force[None]
-        groups.append(_Group(pose.q[None], force, np.array([pose.weight]), own, ""))
+        groups.append(
+            _Group(pose.q[None], force, np.array([pose.weight]), own, "", pose.point is not None)
+        )
     told = [f"{len(groups)} of [[design.test_pose]]"] if groups else []
     if spec.test_path is not None:
         groups.append(_along_path(cell, chain, spec.test_path, point, feasibility, seed))
@@ -96,13 +101,14 @@ def _default_point(cell: Cell) -> Array:
 
 
 def _together(groups: Sequence[_Group], loads: Array, told: Sequence[str]) -> TargetPoses:
-    q, force, weight, point = [], [], [], []
+    q, force, weight, point, stated = [], [], [], [], []
     for group in groups:
         each = loads if group.force is None else np.zeros((1, 3))
         q.append(np.repeat(group.q, len(each), axis=0))
         force.append(np.tile(loads, (len(group.q), 1)) if group.force is None else group.force)
         weight.append(np.repeat(group.weight / len(each), len(each)))
         point.append(np.broadcast_to(group.point, (len(q[-1]), 3)))
+        stated.append(np.full(len(q[-1]), group.stated))
     all_weights = np.concatenate(weight)
     # First by the largest, so that no sum overflows.
     all_weights = all_weights / all_weights.max()
@@ -111,6 +117,7 @@ def _together(groups: Sequence[_Group], loads: Array, told: Sequence[str]) -> Ta
         np.vstack(force),
         all_weights / all_weights.sum(),
         np.vstack(point),
+        np.concatenate(stated),
         "test poses: " + ", ".join(told),
     )
 
@@ -119,13 +126,16 @@ def _along_path(
     cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Rules | None, seed: int
 ) -> _Group:
     path = read_path(spec.file, chain.kinds)
+    stated = spec.point is not None
     point = point if spec.point is None else spec.point
     force = path.force
     if force is None and spec.force is not None:
         force = np.broadcast_to(spec.force, (len(path.weight), 3))
     if path.q is not None:
         _check_path_limits(cell, chain, path, path.q)
-        return _Group(path.q, force, path.weight, point, f"{len(path.q)} of {spec.file.name}")
+        return _Group(
+            path.q, force, path.weight, point, f"{len(path.q)} of {spec.file.name}", stated
+        )
     assert path.position is not None  # read_path: joints or positions
     rotation = None if path.rotation is None else Rotation.from_rotvec(path.rotation).as_matrix()
     places = Places(path.position, rotation, point, force)
@@ -138,7 +148,7 @@ def _along_path(
             f"{len(path.weight)} places); {remedy(cell)}"
         )
     q, told = preferred(cell, chain, places, found, rules, seed)
-    return _Group(q, force, path.weight, point, f"{len(q)} of {spec.file.name}{told}")
+    return _Group(q, force, path.weight, point, f"{len(q)} of {spec.file.name}{told}", stated)
 
 
 def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> None:
@@ -156,6 +166,7 @@ def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> N
 def _in_box(
     cell: Cell, chain: Chain, box: TargetBox, point: Array, rules: Rules | None, seed: int
 ) -> _Group:
+    stated = box.point is not None
     point = point if box.point is None else box.point
     position = box.lower + (box.upper - box.lower) * _sobol(3, box.count, seed)
     each = (box.count, 3)
@@ -172,13 +183,16 @@ def _in_box(
             f"{'leave out rpy_deg, ' if box.rotation is not None else ''}{remedy(cell)}"
         )
     q, told = preferred(cell, chain, places, found, rules, seed)
-    return _Group(q, force, np.ones(len(q)), point, f"{len(q)} in [design.test_box]{told}")
+    return _Group(q, force, np.ones(len(q)), point, f"{len(q)} in [design.test_box]{told}", stated)
 
 
 def _drawn(cell: Cell, chain: Chain, point: Array, rules: Rules | None, seed: int) -> _Group:
     low, high = finite_ranges(chain, *joint_limits(cell, chain))
     count = DEFAULT_COUNT if rules is None else DRAWN
     q = low + (high - low) * _sobol(chain.n_joints, count, seed)
+    for name, levels in cell.model.compliance_levels.items():
+        # Elsewhere the model has no compliance for that joint.
+        q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, count)
     if rules is not None:
         loads = working_loads(cell)
         ok = np.logical_and.reduce(
@@ -192,7 +206,7 @@ def _drawn(cell: Cell, chain: Chain, point: Array, rules: Rules | None, seed: in
                 "[[design.test_pose]], or relax the rules of [workspace]"
             )
     told = f"{len(q)} drawn over the joint limits (the cell states none)"
-    return _Group(q, None, np.ones(len(q)), point, told)
+    return _Group(q, None, np.ones(len(q)), point, told, False)
 
 
 def _sobol(dimension: int, count: int, seed: int) -> Array:

@@ -16,34 +16,60 @@ from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 # Share of a test point's motion that may lie outside what the poses show: rounding, not physics.
 OUTSIDE = 1e-6
 
 
 def prediction_rows(information: PoseInformation, targets: TargetPoses, x: Array) -> Array:
-    """A (T, 3, parameters): ∂(position of the test point)/∂X at the test poses, in m per unit.
+    """A (T, r, parameters): ∂(position at the test pose)/∂X in m per unit, at arm values x.
 
-    The position is that under load in the data's frame, at arm values x; base and markers move it
-    too, so that it does not depend on how the arm's frames are chosen.
+    The position is that under load in the data's frame; base and markers move it too, so that it
+    does not depend on how the arm's frames are chosen.  It is that of the test point.  Where the
+    markers' own places are fitted and no point was stated, it is that of the M markers, each
+    divided by √M, as only they can be known: the sum of squares is then their mean.
     """
-    points, which = np.unique(targets.point, axis=0, return_inverse=True)
-    names = tuple(f"test point {k + 1}" for k in range(len(points)))
-    model = _with_points(information.model, dict(zip(names, points, strict=True)))
-    T = len(targets.q)
-    table = Measurements(
+    model = information.model
+    fitted = any(p.effect == "marker_position" for p in model.parameters)
+    by_marker = ~targets.stated & fitted
+    markers = tuple(model.cell.tool.markers)
+    M = len(markers) if by_marker.any() else 1
+    A = np.zeros((len(targets.q), M, 3, len(model.parameters)))
+    if by_marker.any():
+        own = replace(model.cell.model, observe="position")
+        arm = Model(model.chain, replace(model.cell, model=own))
+        which = np.flatnonzero(by_marker)
+        code = np.tile(np.arange(M), len(which))
+        table = _table(targets, np.repeat(which, M), code, markers)
+        A[which] = arm.regressor(table, x).B.reshape(len(which), M, 3, -1) / np.sqrt(M)
+    if not by_marker.all():
+        which = np.flatnonzero(~by_marker)
+        points, code = np.unique(targets.point[which], axis=0, return_inverse=True)
+        names = tuple(f"test point {k + 1}" for k in range(len(points)))
+        arm = _with_points(model, dict(zip(names, points, strict=True)))
+        table = _table(targets, which, code.ravel(), names)
+        A[which, 0] = arm.regressor(table, x).B.reshape(len(which), 3, -1)
+    return A.reshape(len(A), 3 * M, -1)
+
+
+def _table(
+    targets: TargetPoses, pose: IntArray, marker: IntArray, names: tuple[str, ...]
+) -> Measurements:
+    """The test poses `pose` (R,) as rows with these markers."""
+    n = len(pose)
+    return Measurements(
         source="test poses",
-        row=np.arange(1, T + 1),
-        q=targets.q,
-        configuration=np.arange(T),
-        configuration_labels=tuple(map(str, range(1, T + 1))),
-        repeat=np.zeros(T, dtype=np.int64),
-        marker=which.ravel(),
+        row=pose + 1,
+        q=targets.q[pose],
+        configuration=pose,
+        configuration_labels=tuple(map(str, range(1, len(targets.q) + 1))),
+        repeat=np.zeros(n, dtype=np.int64),
+        marker=marker,
         marker_names=names,
-        force=targets.force,
-        position=np.zeros((T, 3)),
+        force=targets.force[pose],
+        position=np.zeros((n, 3)),
     )
-    return model.regressor(table, x).B.reshape(T, 3, -1)
 
 
 def _with_points(model: Model, points: dict[str, Array]) -> Model:
@@ -66,7 +92,7 @@ def _places(choice: EffectChoice, markers: dict[str, Array]) -> tuple[str | None
 
 
 def on_kept(model: Model, A: Array, found: Estimable) -> Array:
-    """A (T, 3, kept) on the kept parameters, scaled by their sizes.
+    """A (T, r, kept) on the kept parameters, scaled by their sizes.
 
     A test point is predictable where its motion by the dropped parameters is that by the kept
     ones they combine with: A_D = A_K · mixing.  Raises InsufficientDataError that names the

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import InputError, InsufficientDataError
+from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import Observations
 from elastocal.measurements import Measurements
@@ -56,29 +57,6 @@ def check_rows(model: Model, table: Measurements) -> None:
     _check_units(model, table)
 
 
-def limits(model: Model) -> tuple[Array, Array]:
-    """Lower and upper joint limits (n,) in rad or m: the robot's, narrowed by the cell's.
-
-    Raises InputError where the cell limits a joint that the robot does not have, or leaves a
-    joint no range at all.
-    """
-    lower = np.array([j.lower for j in model.chain.joints])
-    upper = np.array([j.upper for j in model.chain.joints])
-    for name, (low, high) in model.cell.limits.items():
-        i = int(name.removeprefix("joint")) - 1
-        if i >= len(lower):
-            raise InputError(
-                f"{model.cell.path}: [limits] names {name}, but robot '{model.chain.name}' has "
-                f"{len(lower)} joints"
-            )
-        lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
-        if lower[i] >= upper[i]:
-            raise InputError(
-                f"{model.cell.path}: [limits] {name} leaves no range inside the robot's own limits"
-            )
-    return lower, upper
-
-
 def check_limits(model: Model, table: Measurements) -> None:
     """Joint values within the limits of robot and cell; InputError names line, joint and remedy."""
     revolute = np.array([k == "revolute" for k in model.chain.kinds])
@@ -91,7 +69,7 @@ def check_limits(model: Model, table: Measurements) -> None:
             f"({int(wound.any(axis=1).sum())} lines); these are probably degrees in a column "
             "named …_rad: rename it to …_deg"
         )
-    lower, upper = limits(model)
+    lower, upper = joint_limits(model.cell, model.chain)
     beyond = (table.q < lower - LIMIT_SLACK) | (table.q > upper + LIMIT_SLACK)
     if beyond.any():
         i, j = (int(v) for v in np.argwhere(beyond)[0])

@@ -12,15 +12,20 @@ from rich.text import Text
 
 from elastocal.design.plan import Plan
 from elastocal.design.reasons import Predicted, Reason
-from elastocal.report.units import display, with_uncertainty
+from elastocal.report.units import display, significant
 from elastocal.report.words import printable
 
 TOLD = 2  # parameters that a pose serves, in the table
+WIDE = 110  # columns, from which on the reasons stand beside the poses
+SERVES = "serves (standard deviation without it)"
 
 
 def print_plan(console: Console, plan: Plan) -> None:
     """Poses in the order of the plan, predicted intervals, and what the plan is worth in words."""
-    console.print(pose_table(plan))
+    wide = console.width >= WIDE
+    console.print(pose_table(plan, reasons=wide))
+    if not wide:
+        console.print(reason_table(plan))
     console.print(interval_table(plan))
     if plan.curve:
         console.print(curve_table(plan))
@@ -30,8 +35,8 @@ def print_plan(console: Console, plan: Plan) -> None:
         console.print(Text.assemble((f"{label}: ", style), text))
 
 
-def pose_table(plan: Plan) -> Table:
-    """Joint values, level, place in the order of execution, and what the pose is there for."""
+def pose_table(plan: Plan, reasons: bool = True) -> Table:
+    """Joint values, load, place in the order of execution, and what the pose is there for."""
     table = _table("Poses")
     table.add_column("pose", justify="right")
     for i, kind in enumerate(plan.model.chain.kinds):
@@ -40,7 +45,8 @@ def pose_table(plan: Plan) -> Table:
     if len(plan.forces) > 1 and (plan.load >= 0).any():
         table.add_column("load N", justify="right")
     table.add_column("order", justify="right")
-    table.add_column("serves (standard deviation without it)", overflow="fold")
+    if reasons:
+        table.add_column(SERVES, overflow="fold")
     order = {stop.pose: k + 1 for k, stop in reversed(list(enumerate(plan.execution.stops)))}
     for k, reason in enumerate(plan.reasons):
         row = [str(k + 1)]
@@ -48,8 +54,18 @@ def pose_table(plan: Plan) -> Table:
             row.append(f"{np.degrees(value) if kind == 'revolute' else value * 1e3:.2f}")
         if len(plan.forces) > 1 and (plan.load >= 0).any():
             row.append(" ".join(f"{f:g}" for f in plan.forces[plan.load[k]]))
-        row += [str(order[k]), served(reason)]
+        row += [str(order[k]), *([served(reason)] if reasons else [])]
         table.add_row(*map(Text, row))
+    return table
+
+
+def reason_table(plan: Plan) -> Table:
+    """What each pose is there for."""
+    table = _table("Why each pose")
+    table.add_column("pose", justify="right")
+    table.add_column(SERVES, overflow="fold")
+    for k, reason in enumerate(plan.reasons):
+        table.add_row(str(k + 1), Text(served(reason)))
     return table
 
 
@@ -72,7 +88,7 @@ def interval_table(plan: Plan) -> Table:
         table.add_column("together with", overflow="fold")
     for p in plan.predicted:
         shown, unit = display(p.half_width, p.unit)
-        row = [printable(p.name), with_uncertainty(shown, shown)[1], unit]
+        row = [printable(p.name), significant(shown, 2), unit]
         if len(table.columns) > 3:
             row.append(_partners(p))
         table.add_row(*map(Text, row))

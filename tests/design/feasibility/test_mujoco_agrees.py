@@ -7,9 +7,9 @@ from design.feasibility.small_cells import CHECK, DOWN, NOTHING, study_module
 from elastocal.cell_reader import read_cell
 from elastocal.design.feasibility.collision import Collisions
 from elastocal.design.feasibility.feasibility import Feasibility
-from elastocal.design.feasibility.rule_book import joint_limits
 from elastocal.design.feasibility.sight import END
 from elastocal.manipulator.choice import load_chain
+from elastocal.manipulator.limits import joint_limits
 
 pytest.importorskip("mujoco")
 TOLERANCE = 1e-5  # m between two implementations of GJK

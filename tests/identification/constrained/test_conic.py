@@ -1,6 +1,5 @@
 """Huber losses and semidefinite matrices against independent solutions and their optimality."""
 
-import sys
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -231,16 +230,6 @@ def test_contradicting_matrix_is_named():
         solve_constrained(B, y, NAMES, stated)
     assert "'K'" in str(error.value) and "a + c" in str(error.value)
     assert "bound of d" not in str(error.value)
-
-
-@pytest.mark.parametrize("module", ["clarabel", "cvxpy"])
-def test_a_missing_solver_is_said_only_where_it_is_needed(monkeypatch, module):
-    B, y = problem(7)
-    monkeypatch.setitem(sys.modules, module, None)
-    assert solve_constrained(B, y, NAMES, non_negative(*NAMES)).active
-    for needs in ({"loss": "huber"}, {"constraints": SCALED}):
-        with pytest.raises(InputError, match=r"pip install 'elastocal\[design\]'"):
-            solve_constrained(B, y, NAMES, **needs)
 
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")

@@ -16,11 +16,12 @@ from elastocal.design.feasibility.collision import Collisions
 from elastocal.design.feasibility.frames import Kinematics, Poses
 from elastocal.design.feasibility.pairs import Pair, cell_pairs
 from elastocal.design.feasibility.paths import Paths
-from elastocal.design.feasibility.rule_book import joint_range, rule_book
+from elastocal.design.feasibility.rule_book import rule_book
 from elastocal.design.feasibility.rules import Rule
 from elastocal.design.feasibility.verdict import Verdict
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.limits import finite_ranges, joint_limits
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -93,7 +94,7 @@ class Feasibility:
     @cached_property
     def always_in_contact(self) -> tuple[tuple[str, str], ...]:
         """Pairs too close in each of 300 random poses: likely modelling errors."""
-        lower, upper = joint_range(self.cell, self.chain)
+        lower, upper = finite_ranges(self.chain, *joint_limits(self.cell, self.chain))
         q = np.random.default_rng(0).uniform(lower, upper, (SAMPLE, len(lower)))
         poses = self._poses(q, LOADED)
         return tuple(

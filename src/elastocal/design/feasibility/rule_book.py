@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,10 @@ from elastocal.design.feasibility.pairs import RULES, Pair
 from elastocal.design.feasibility.rules import Bound, Rule
 from elastocal.design.feasibility.sight import incidence, marker_positions
 from elastocal.errors import InputError
-from elastocal.identification.checks import limits
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.model import Model
+from elastocal.manipulator.limits import joint_limits
 
 Array = NDArray[np.float64]
-
-FREE_SLIDE = 1.0  # m either way: where to try a prismatic joint without limits
 
 
 def rule_book(
@@ -45,21 +41,6 @@ def rule_book(
         ),
         *_line_of_sight(cell, kinematics, bodies),
     )
-
-
-def joint_limits(cell: Cell, chain: Chain) -> tuple[Array, Array]:
-    """Lower and upper limits (n,), rad or m, infinite where there is none: the robot's, narrowed
-    by the cell's."""
-    bare = replace(cell.model, effects=(), observe="position", link_gravity=False)
-    tool = replace(cell.tool, markers={"flange": np.zeros(3)})
-    return limits(Model(chain, replace(cell, model=bare, tool=tool)))
-
-
-def joint_range(cell: Cell, chain: Chain) -> tuple[Array, Array]:
-    """As `joint_limits`, and a finite range to try where there is no limit."""
-    lower, upper = joint_limits(cell, chain)
-    span = np.array([np.pi if kind == "revolute" else FREE_SLIDE for kind in chain.kinds])
-    return np.where(np.isfinite(lower), lower, -span), np.where(np.isfinite(upper), upper, span)
 
 
 def _joints(cell: Cell, chain: Chain) -> Rule:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from elastocal.cell import Cell
 from elastocal.cell_workspace import HalfSpace
 from elastocal.design.feasibility.bodies import HANGING, WORLD, Body, data_base
+from elastocal.design.feasibility.contact_rules import POSE_SLACK
 from elastocal.design.feasibility.pairs import Pair
 from elastocal.design.feasibility.shapes import few_points
 from elastocal.design.polish.covers import excess, signed_distance, smooth_min, sphere_cover
@@ -91,7 +92,7 @@ def _clearance(arm: _Frames, pair: Pair) -> ca.SX:
             a, b = b, a
         points, radius = sphere_cover(a.solid)
         distances = [signed_distance(b.solid, arm.seen_from(b, arm.point(a, p))) for p in points]
-    return smooth_min(ca.vertcat(*distances), WIDTH) - radius - pair.margin
+    return smooth_min(ca.vertcat(*distances), WIDTH) - radius - (pair.margin + POSE_SLACK)
 
 
 def _rope_angle(cell: Cell, arm: _Frames) -> Iterator[ca.SX]:

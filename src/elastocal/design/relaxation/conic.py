@@ -7,7 +7,6 @@ of the mean over scenarios of a maximum.
 from __future__ import annotations
 
 import warnings
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from elastocal.design.criteria.scenarios import ScenarioCriterion
 from elastocal.design.criteria.worst import Worst
 from elastocal.design.relaxation.cones import Cone, cone_of
 from elastocal.design.relaxation.restricted import Restricted
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.errors import InsufficientDataError
 
 # Of clarabel on the scaled program, whose optimum is near 1; the second where the first fails.
 TOLERANCES = (1e-10, 1e-8)
@@ -31,7 +30,9 @@ class ConicMaster:
         base = criterion.base if isinstance(criterion, Worst) else criterion
         assert isinstance(base, ScenarioCriterion)
         self._base = base
-        self._cp = cvxpy()
+        import cvxpy as cp
+
+        self._cp = cp
 
     def __call__(self, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Gradient]:
         """w (k,) and a tangent; `start` sets the units of the program and nothing else.
@@ -92,16 +93,3 @@ class ConicMaster:
             f"the conic solver stopped with status {program.status!r} on the relaxation; the "
             "information may be nearly singular: add prior knowledge or poses"
         )
-
-
-def cvxpy() -> ModuleType:
-    """The module, or InputError that says how to get it."""
-    try:
-        import clarabel  # noqa: F401  (CVXPY finds it by itself, or fails late)
-        import cvxpy as cp
-    except ImportError as missing:
-        raise InputError(
-            f"the conic relaxation needs {missing.name}, which is not installed: "
-            "pip install 'elastocal[design]'"
-        ) from None
-    return cp

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import ElastocalError
 from elastocal.identification.constrained.objective import Objective
 from elastocal.identification.constrained.system import Matrix, System
 
@@ -55,7 +55,8 @@ def _posed(
     objective: Objective, system: System, basis: Array, size: float
 ) -> tuple[str, ConicPoint | None]:
     """Status, and the minimiser where one was found, of the program in x/size."""
-    cp = cvxpy()
+    import cvxpy as cp
+
     w = cp.Variable(basis.shape[1])
     J, loss = objective.B @ basis, objective.loss
     if loss.quadratic:
@@ -69,7 +70,7 @@ def _posed(
             r = cp.norm(
                 cp.reshape(r, (len(objective.y) // loss.size, loss.size), order="C"), axis=1
             )
-        cost = cp.sum(cp.huber(r, loss.threshold / size))
+        cost = cp.sum(cp.huber(r, loss.threshold / size))  # type: ignore[arg-type]
         if len(objective.P):
             cost += cp.sum_squares(objective.P @ basis @ w - objective.target / size)
     below, above = np.isfinite(system.lower), np.isfinite(system.upper)
@@ -91,7 +92,8 @@ def _posed(
 
 def least_excess(system: System) -> dict[str, float]:
     """Multipliers by label of min t subject to every constraint relaxed by t ≥ 0."""
-    cp = cvxpy()
+    import cvxpy as cp
+
     z, t = cp.Variable(len(system.names)), cp.Variable(nonneg=True)
     norms = np.linalg.norm(system.A, axis=1)
     norms = np.where(norms > 0, norms, 1.0)
@@ -114,7 +116,8 @@ def least_excess(system: System) -> dict[str, float]:
 
 def extremes(system: System, index: int) -> tuple[float, float]:
     """Smallest and largest x[index] that the constraints allow; infinite where unbounded."""
-    cp = cvxpy()
+    import cvxpy as cp
+
     x = cp.Variable(len(system.names))
     below, above = np.isfinite(system.lower), np.isfinite(system.upper)
     wanted = [_value(cp, m, x, 1.0) >> 0 for m in system.matrices]
@@ -124,21 +127,8 @@ def extremes(system: System, index: int) -> tuple[float, float]:
     ends = []
     for sense, beyond in ((cp.Minimize, -np.inf), (cp.Maximize, np.inf)):
         status = _solve(cp.Problem(sense(x[index]), wanted))
-        ends.append(float(x.value[index]) if status in OPTIMAL else beyond)
+        ends.append(float(np.asarray(x.value)[index]) if status in OPTIMAL else beyond)
     return ends[0], ends[1]
-
-
-def cvxpy() -> ModuleType:
-    """The module, or InputError that says how to get it."""
-    try:
-        import clarabel  # noqa: F401  (CVXPY finds it by itself, or fails late)
-        import cvxpy as cp
-    except ImportError as missing:
-        raise InputError(
-            f"Huber losses and matrix constraints need {missing.name}, which is not installed: "
-            "pip install 'elastocal[design]'"
-        ) from None
-    return cp
 
 
 def _value(cp: ModuleType, matrix: Matrix, x: Any, size: float) -> Any:
@@ -148,6 +138,8 @@ def _value(cp: ModuleType, matrix: Matrix, x: Any, size: float) -> Any:
 
 
 def _solve(problem: Any) -> str:
+    import cvxpy as cp
+
     with warnings.catch_warnings():
         # Inaccurate solutions are polished and judged by their KKT residual.
         warnings.simplefilter("ignore")
@@ -155,7 +147,7 @@ def _solve(problem: Any) -> str:
             options = {f"tol_{name}": tolerance for name in ("gap_abs", "gap_rel", "feas")}
             try:
                 problem.solve(solver="CLARABEL", **options)
-            except cvxpy().SolverError:
+            except cp.SolverError:
                 continue
             return str(problem.status)
     return "solver_error"

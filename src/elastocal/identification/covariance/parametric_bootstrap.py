@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError, require
+from elastocal.errors import ElastocalError, InsufficientDataError, require
 from elastocal.identification.covariance.estimate import Covariance
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ def parametric_bootstrap(
 
     Every draw has its own generator, spawned from `seed`, so the result does not depend on
     `jobs`, the number of processes (−1: all cores); with more than one, `draw` and `fit` must
-    pickle and joblib be installed.  A fit that raises ElastocalError or returns what is not
+    pickle.  A fit that raises ElastocalError or returns what is not
     finite is a failed draw.
 
     Raises InputError where draws < 2, InsufficientDataError where fewer than two fits succeed.
@@ -101,13 +101,8 @@ def parametric_bootstrap(
 def _parallel(
     draw: Draw, fit: FitAgain, seeds: Sequence[np.random.SeedSequence], jobs: int
 ) -> list[Array | None]:
-    try:
-        from joblib import Parallel, delayed, effective_n_jobs
-    except ImportError:
-        raise InputError(
-            "a bootstrap on several cores needs joblib: pip install elastocal[studies],"
-            " or set jobs to 1"
-        ) from None
+    from joblib import Parallel, delayed, effective_n_jobs
+
     chunks = min(len(seeds), 8 * effective_n_jobs(jobs))  # a slow chunk must not hold up the rest
     tasks = (delayed(_chunk)(draw, fit, seeds[k::chunks]) for k in range(chunks))
     parts = Parallel(n_jobs=jobs)(tasks)

@@ -108,9 +108,9 @@ def prepared(folder: Path, seed: int) -> Arm:
 def evolved(arm: Arm, budget: float, seed: int) -> tuple[Array, int]:
     """The plan (n_poses, 6) of scipy's differential evolution, and how many plans it evaluated.
 
-    15 × 6 joint angles within the joint limits, scipy's defaults (15 members per variable, best1bin,
-    polished by L-BFGS-B at the end) but for a whole generation evaluated at a time, which is
-    quicker; stopped after `budget` s of CPU time, the final polish not counted.
+    15 × 6 joint angles within the joint limits, scipy's defaults (15 members per variable,
+    best1bin, polished by L-BFGS-B at the end) but for a whole generation evaluated at a time, which
+    is quicker; stopped after `budget` s of CPU time, the final polish not counted.
     """
     space, evaluated, start = arm.searches.space, 0, time.process_time()
 

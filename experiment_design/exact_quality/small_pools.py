@@ -1,0 +1,51 @@
+"""Random small pools whose best plan is known, because every plan is evaluated."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement, product
+
+import numpy as np
+
+from elastocal.design.criteria.choose import make_criterion
+from elastocal.design.problem import Array, DesignProblem, IntArray
+
+CRITERIA = ("test_pose", "D", "E")
+ROWS = 3
+
+
+def random_problem(name: str, seed: int, *, most: int = 1, prior: float = 0.0) -> DesignProblem:
+    """4 to 6 poses out of 10 to 16 candidates in 1 to 3 groups, for 4 to 9 parameters.
+
+    Three readings per pose, normal B whose size varies by e from candidate to candidate; shares
+    are drawn and may be 0.  `prior` > 0: what poses already measured tell, of that weight.
+    """
+    rng = np.random.default_rng([seed, CRITERIA.index(name)])
+    N, n = int(rng.integers(10, 17)), int(rng.integers(4, 7))
+    L, p = int(rng.integers(1, 4)), int(rng.integers(4, 10))
+    group, shares = np.zeros(N, dtype=np.int64), np.full(1, N + 1)
+    while (np.bincount(group, minlength=L) < shares).any():
+        group, shares = rng.integers(0, L, N), rng.multinomial(n, np.ones(L) / L)
+    blocks = rng.normal(size=(1, N, ROWS, p)) * np.exp(rng.normal(size=(1, N, 1, 1)))
+    targets = rng.normal(size=(1, 8, ROWS, p))
+    done = np.sqrt(prior) * rng.normal(size=(2 * ROWS, p))
+    criterion = make_criterion(name, parameters=p, interest=np.arange(p), A=targets)
+    return DesignProblem(blocks, (done.T @ done)[None], group, shares, criterion, most)
+
+
+def all_plans(problem: DesignProblem) -> IntArray:
+    """Every plan (k, n_poses) of these shares, no candidate more often than `most`."""
+    parts = [
+        [
+            plan
+            for plan in combinations_with_replacement(np.flatnonzero(problem.group == g), share)
+            if share == 0 or np.unique(plan, return_counts=True)[1].max() <= problem.most
+        ]
+        for g, share in enumerate(problem.shares)
+    ]
+    return np.array([sum(plan, ()) for plan in product(*parts)], dtype=np.int64)
+
+
+def all_values(problem: DesignProblem, plans: IntArray) -> Array:
+    """Φ (k,) of the plans (k, n_poses), straight from the definition of M."""
+    each = np.einsum("snri,snrj->nsij", problem.blocks, problem.blocks)
+    return problem.criterion.value(problem.prior + each[plans].sum(axis=1))
