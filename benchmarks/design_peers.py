@@ -25,7 +25,9 @@ from peer_kr270 import Arm, evolved, prepared
 from peer_tools import ONE_THREAD, Row, Seconds, peer, required, seconds_of, starts, table, timed
 
 from elastocal.design.criteria.determinant import DeterminantCriterion
+from elastocal.design.exact.exchange import exchange
 from elastocal.design.exact.plan import exact_plan
+from elastocal.design.exact.rounding import round_weights
 from elastocal.design.polish.coordinate_ascent import polish
 from elastocal.design.problem import DesignProblem
 from elastocal.design.relaxation.relax import relax
@@ -35,7 +37,9 @@ POOL, POSES = 1000, 30  # of the UR10
 WORSE = 1e-4  # log det below the convex optimum that is allowed
 FASTER = 20
 STARTS = (1, 10)
-DE_BUDGET = 10.0  # times our CPU time
+GENERATIONS = 60  # of differential evolution: more than 10 times the time of our first start
+POLISHED = 3  # plans, from different seeds
+SWEEPS = 50  # at most; a sweep that gains less than 1e-4 is the last
 RANDOM = 200
 
 
@@ -121,46 +125,49 @@ def beside_exchange(python: Path | None, folder: Path) -> None:
         f"{pooling.wall:.2f} s), {arm.problem.blocks.shape[3]} parameters, ρ₀ at {arm.n_targets} "
         "test poses"
     )
-    relaxed, relaxing = timed(partial(relax, arm.problem))
-    ours = []
-    for number in STARTS:
-        plan, exchanging = timed(
-            partial(
-                exact_plan, arm.problem, relaxed_weights=relaxed.weights, starts=number, seed=SEED
-            )
-        )
-        took = pooling + relaxing + exchanging
-        ours.append(Row(f"elastocal, {starts(number)}", arm.rho(arm.pool.q[plan.chosen]), took))
-    pool = arm.pool
-    off, polishing = timed(
-        partial(polish, arm.problem, arm.searches, pool.q, pool.load, plan.chosen)
-    )
-    ours.append(Row("elastocal, then polished off the pool", arm.rho(off.q), took + polishing))
-    first = ours[0]
-    assert first.took is not None
+    ours, bound = _ours(arm, pooling)
     others = [] if python is None else list(_pydoe(python, folder, arm, pooling))
-    budget = DE_BUDGET * first.took.cpu
-    (plan_q, plans), took = timed(partial(evolved, arm, budget, SEED))
+    (plan_q, plans), took = timed(partial(evolved, arm, GENERATIONS, SEED))
     others.append(Row(f"scipy: differential evolution, {plans} plans", arm.rho(plan_q), took))
     rng = np.random.default_rng(SEED)
-    drawn = [rng.choice(len(pool), arm.poses, replace=False) for _ in range(RANDOM)]
-    chance = Row(
-        f"mean of {RANDOM} random plans", float(np.mean([arm.rho(pool.q[c]) for c in drawn]))
-    )
-    bound = 1e6 * np.sqrt(relaxed.bound)
+    drawn = [rng.choice(len(arm.pool), arm.poses, replace=False) for _ in range(RANDOM)]
+    chance = Row(f"mean of {RANDOM} random plans", float(arm.rhos(arm.pool.q[drawn]).mean()))
     table(
         f"{arm.poses} poses", "ρ₀, µm", 3, f"above the bound on the pool, {bound:.3f} µm",
         [chance, *others, *ours], lambda value: f"{100 * (value / bound - 1):.1f} %",
     )  # fmt: skip
     for row in others:
-        assert row.took is not None
-        less = 100 * (1 - first.value / row.value)
-        wall, cpu = row.took.wall / first.took.wall, row.took.cpu / first.took.cpu
+        quicker = [own for own in ours if own.wall < row.wall]
+        best = min(quicker or ours, key=lambda own: own.value)
         required(
-            f"{first.what}, beside {row.what.split(',')[0]}: ρ₀ smaller by {less:.1f} %, "
-            f"{wall:.1f} times as fast (CPU time: {cpu:.1f})",
-            less > 0 and wall > 1,
+            f"{best.what}, beside {row.what.split(',')[0]}: ρ₀ "
+            f"{100 * (1 - best.value / row.value):.1f} % smaller, "
+            f"{row.wall / best.wall:.1f} times as fast",
+            bool(quicker) and best.value < row.value,
         )
+
+
+def _ours(arm: Arm, pooling: Seconds) -> tuple[list[Row], float]:
+    """Plans of increasing effort, each with all the time that it took, and the bound in µm."""
+    problem, q = arm.problem, arm.pool.q
+    relaxed, relaxing = timed(partial(relax, problem))
+    w, before = relaxed.weights, pooling + relaxing
+    once, took = timed(lambda: exchange(problem, round_weights(problem, w)))
+    rows = [Row("elastocal, one exchange", arm.rho(q[once.chosen]), before + took)]
+    for number in STARTS:
+        work = partial(exact_plan, problem, relaxed_weights=w, starts=number, seed=SEED)
+        plan, took = timed(work)
+        rows.append(Row(f"elastocal, {starts(number)}", arm.rho(q[plan.chosen]), before + took))
+    value, total = np.inf, before
+    for k in range(POLISHED):
+        work = partial(exact_plan, problem, relaxed_weights=w, starts=k + 1, seed=SEED + k)
+        plan, took = timed(work)
+        load, chosen = arm.pool.load, plan.chosen
+        off, last = timed(partial(polish, problem, arm.searches, q, load, chosen, sweeps=SWEEPS))
+        value, total = min(value, arm.rho(off.q)), total + took + last
+        name = "elastocal, 1 start, polished" if k == 0 else f"elastocal, best of {k + 1} polished"
+        rows.append(Row(name, value, total))
+    return rows, float(1e6 * np.sqrt(relaxed.bound))
 
 
 def _pydoe(python: Path, folder: Path, arm: Arm, pooling: Seconds) -> Iterator[Row]:

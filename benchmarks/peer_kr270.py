@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, differential_evolution
+from scipy.optimize import differential_evolution
 
 from elastocal.cell_reader import read_cell
 from elastocal.design.candidates import draw
@@ -105,14 +104,14 @@ def prepared(folder: Path, seed: int) -> Arm:
     return Arm(setup, setup.pool(drawn.q, drawn.load, drawn.group), searches, len(targets.q))
 
 
-def evolved(arm: Arm, budget: float, seed: int) -> tuple[Array, int]:
+def evolved(arm: Arm, generations: int, seed: int) -> tuple[Array, int]:
     """The plan (n_poses, 6) of scipy's differential evolution, and how many plans it evaluated.
 
     15 × 6 joint angles within the joint limits, scipy's defaults (15 members per variable,
     best1bin, polished by L-BFGS-B at the end) but for a whole generation evaluated at a time, which
-    is quicker; stopped after `budget` s of CPU time, the final polish not counted.
+    is quicker, and for the number of generations.
     """
-    space, evaluated, start = arm.searches.space, 0, time.process_time()
+    space, evaluated = arm.searches.space, 0
 
     def rhos(x: Array) -> Array:
         nonlocal evaluated
@@ -121,11 +120,8 @@ def evolved(arm: Arm, budget: float, seed: int) -> tuple[Array, int]:
         found = arm.rhos(plans.reshape(len(plans), POSES, -1))
         return found if x.ndim == 2 else found[0]
 
-    def over(intermediate_result: OptimizeResult) -> bool:
-        return time.process_time() - start > budget
-
     limits = list(zip(space.lower, space.upper, strict=True)) * POSES
     found = differential_evolution(
-        rhos, limits, rng=seed, vectorized=True, updating="deferred", callback=over
+        rhos, limits, rng=seed, vectorized=True, updating="deferred", maxiter=generations
     )
     return found.x.reshape(POSES, -1), evaluated

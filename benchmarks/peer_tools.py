@@ -37,6 +37,10 @@ class Row:
     value: float
     took: Seconds | None = None
 
+    @property
+    def wall(self) -> float:
+        return self.took.wall if self.took else 0.0
+
 
 def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
     wall, cpu = time.perf_counter(), time.process_time()

@@ -16,7 +16,7 @@ ROWS = 3
 def random_problem(name: str, seed: int, *, most: int = 1, prior: float = 0.0) -> DesignProblem:
     """4 to 6 poses out of 10 to 16 candidates in 1 to 3 groups, for 4 to 9 parameters.
 
-    Three readings per pose, normal B whose size varies by e from candidate to candidate; shares
+    Three readings per pose, normal B; shares
     are drawn and may be 0.  `prior` > 0: what poses already measured tell, of that weight.
     """
     rng = np.random.default_rng([seed, CRITERIA.index(name)])
@@ -25,7 +25,7 @@ def random_problem(name: str, seed: int, *, most: int = 1, prior: float = 0.0) -
     group, shares = np.zeros(N, dtype=np.int64), np.full(1, N + 1)
     while (np.bincount(group, minlength=L) < shares).any():
         group, shares = rng.integers(0, L, N), rng.multinomial(n, np.ones(L) / L)
-    blocks = rng.normal(size=(1, N, ROWS, p)) * np.exp(rng.normal(size=(1, N, 1, 1)))
+    blocks = rng.normal(size=(1, N, ROWS, p))
     targets = rng.normal(size=(1, 8, ROWS, p))
     done = np.sqrt(prior) * rng.normal(size=(2 * ROWS, p))
     criterion = make_criterion(name, parameters=p, interest=np.arange(p), A=targets)

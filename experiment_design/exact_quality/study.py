@@ -1,6 +1,6 @@
 """Does the exact search find the best plan?  Every plan of small pools is evaluated.
 
-    python study.py [--instances 100] [--starts 10]
+    python study.py [--instances 100] [--starts 5]
 
 Random pools (see small_pools.py) with the criteria test_pose, D and E.  Beside `exact_plan`, with
 and without the relaxation that `design` gives it: one plain exchange from one random plan, to show
@@ -52,7 +52,7 @@ def instance(name: str, seed: int, starts: int) -> tuple[int, list[float], float
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--instances", type=int, default=100)
-    parser.add_argument("--starts", type=int, default=10)
+    parser.add_argument("--starts", type=int, default=5)
     chosen = parser.parse_args()
     lines = [
         "| criterion | instances | plans each, at most | one plain exchange | search | search with "

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import sys
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -20,15 +19,19 @@ from elastocal.cli.app import (
     progress_line,
     reporting_errors,
 )
-from elastocal.errors import InputError, require
+from elastocal.cli.plan_files import (
+    check_apart,
+    check_programs,
+    check_suffixes,
+    files_of,
+    write_all,
+)
+from elastocal.errors import ElastocalError, InputError, require
 
 if TYPE_CHECKING:
     from elastocal.cell import Cell
     from elastocal.design.options import DesignOptions
-    from elastocal.design.plan import Plan
-
-PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
-PICTURES = (".png", ".svg")
+    from elastocal.identification.constrained.prior import GaussianPrior
 
 
 @app.command()
@@ -44,7 +47,7 @@ def design(
     target: Annotated[
         float | None,
         typer.Option(
-            help="Find the smallest number of poses that reaches this (µm for test_pose)."
+            help="Find the smallest number of poses that reaches this, in µm (test_pose, I, G)."
         ),
     ] = None,
     curve: Annotated[
@@ -61,7 +64,7 @@ def design(
         typer.Option(help="Hold a parameter, place or effect as known; repeatable."),
     ] = None,
     candidates: Annotated[
-        int | None, typer.Option(min=1, help="Feasible candidates per level to choose from.")
+        int | None, typer.Option(min=1, help="Feasible candidates to choose from, over all levels.")
     ] = None,
     effort: Annotated[str, typer.Option(help="quick, normal or thorough.")] = "normal",
     program: Annotated[
@@ -89,48 +92,57 @@ def design(
     report = output.with_suffix(".json")
     require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
     programs = tuple(program or ())
-    _check_suffixes(programs, picture)
-    check_outputs(output, report, picture, *programs)
+    check_suffixes(programs, picture)
+    written = [p for p in (output, report, *programs, picture) if p is not None]
+    check_outputs(*written)
     asked = {
         "poses": poses,
         "criterion": criterion,
-        "target": None if target is None else target * 1e-6,
+        "target": _target(target, poses),
         "candidates": candidates,
     }
     with progress_line(quiet) as progress:
         progress("reading")
         wanted = _read(cell, asked)
+        check_programs(wanted, programs)
         options = _options(wanted, augment, knowledge, fix, curve, effort, seed, jobs)
-        files = [p for p in (cell, augment, knowledge, *_files_of(wanted)) if p is not None]
-        told = {k: v for k, v in asked.items()} | {"fix": fix, "curve": curve, "effort": effort}
+        files = [p for p in (cell, augment, knowledge, *files_of(wanted)) if p is not None]
+        check_apart(written, files)
+        told = asked | {"fix": fix, "curve": curve, "effort": effort}
         checkpoint = Checkpoint.beside(output, key_of(files, seed=seed, **told))
         if checkpoint.begun:
-            progress(f"going on with the interrupted design in {checkpoint.folder}")
-        plan = run(wanted, options, checkpoint, progress)
-        _write(plan, output, report, programs, picture)
+            progress("going on with the design that was interrupted")
+        try:
+            plan = run(wanted, options, checkpoint, progress)
+        except ElastocalError:
+            # The same input ends here again: there is nothing to go on with.
+            checkpoint.drop()
+            raise
+        write_all(plan, output, report, programs, picture)
         checkpoint.clear()
     if as_json:
-        typer.echo(json.dumps(plan.to_json(), indent=1))
+        typer.echo(report.read_text(encoding="utf-8"), nl=False)
         return
     from elastocal.report.plan_tables import print_plan
 
     print_plan(console(), plan)
-    for path in (output, report, *programs, picture):
-        if path is not None:
-            typer.echo(f"wrote {path}")
+    for path in written:
+        typer.echo(f"wrote {path}")
 
 
-def _check_suffixes(programs: tuple[Path, ...], picture: Path | None) -> None:
-    for path in programs:
-        require(
-            path.suffix.lower() in PROGRAMS,
-            f"--program {path}: the suffix says the language, "
-            + " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items()),
-        )
+def _target(target: float | None, poses: int | None) -> float | None:
+    """--target in m."""
+    if target is None:
+        return None
     require(
-        picture is None or picture.suffix.lower() in PICTURES,
-        f"--picture {picture}: name it {' or '.join(PICTURES)}",
+        math.isfinite(target) and target > 0,
+        f"--target takes a positive number of µm; found {target:g}",
     )
+    require(
+        poses is None,
+        f"--poses {poses} and --target {target:g}: a target asks for the number of poses; drop one",
+    )
+    return target * 1e-6
 
 
 def _read(path: Path, asked: dict[str, Any]) -> Cell:
@@ -150,7 +162,8 @@ def _read(path: Path, asked: dict[str, Any]) -> Cell:
         )
     changes = {key: value for key, value in asked.items() if value is not None}
     if "poses" in changes:
-        changes["per_level"] = ()
+        # What the cell says of their number gives way to the command line.
+        changes |= {"per_level": (), "target": None}
     return replace(cell, design=replace(cell.design, **changes))
 
 
@@ -159,7 +172,6 @@ def _options(
     curve: str | None, effort: str, seed: int, jobs: int,
 ) -> DesignOptions:  # fmt: skip
     from elastocal.design.options import DesignOptions
-    from elastocal.identification.knowledge import read_knowledge
     from elastocal.manipulator.choice import load_chain
     from elastocal.measurement_reader import read_measurements
 
@@ -171,15 +183,38 @@ def _options(
             marker_names=tuple(cell.tool.markers),
             observe=cell.model.observe,
         )
+    markers = () if done is None else done.marker_names
+    prior, notes = (None, ()) if knowledge is None else _prior(knowledge, cell, markers)
     return DesignOptions(
         effort=effort,  # type: ignore[arg-type]
         seed=seed,
         jobs=jobs,
         fixed=tuple(fix or ()),
-        prior=None if knowledge is None else read_knowledge(knowledge).prior,
+        prior=prior,
         done=done,
         curve=_numbers(curve),
+        notes=notes,
     )
+
+
+def _prior(
+    path: Path, cell: Cell, markers: tuple[str, ...]
+) -> tuple[GaussianPrior, tuple[str, ...]]:
+    """What a knowledge file says that counts for a plan, and a sentence on what does not."""
+    from elastocal.identification.constrained.constraints import Constraints
+    from elastocal.identification.knowledge import read_knowledge
+    from elastocal.manipulator.model import Model
+
+    known = read_knowledge(path)
+    prior = known.of(Model.from_cell(cell, markers))[1]
+    if prior is None:
+        raise InputError(
+            f"{path}: states no prior, and only priors count for a plan; add "
+            '[prior."joint2.compliance"] with mean and std, or leave --knowledge out'
+        )
+    left_out = known.physical or known.constraints != Constraints()
+    note = f"{path}: only its priors count for a plan; bounds, equalities and matrices do not"
+    return prior, (note,) if left_out else ()
 
 
 def _numbers(text: str | None) -> tuple[int, ...]:
@@ -191,41 +226,3 @@ def _numbers(text: str | None) -> tuple[int, ...]:
         raise InputError(
             f"--curve takes numbers of poses, as in 10,15,20; found '{text}'"
         ) from None
-
-
-def _files_of(cell: Cell) -> tuple[Path | None, ...]:
-    """Files that the cell names and a plan depends on."""
-    robot, path = cell.robot, cell.design.test_path
-    meshes = [s.mesh for s in cell.workspace.obstacles]
-    meshes += [body.solid.mesh for body in cell.workspace.bodies]
-    return (robot.urdf, robot.dh, robot.masses, None if path is None else path.file, *meshes)
-
-
-def _write(
-    plan: Plan, output: Path, report: Path, programs: tuple[Path, ...], picture: Path | None
-) -> None:
-    from elastocal.design.plan_file import plan_rows, write_plan, write_plan_json
-
-    chain = plan.model.chain
-    rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
-    write_plan(output, rows, chain.kinds)
-    write_plan_json(report, plan.to_json() | {"command": " ".join(["elastocal", *sys.argv[1:]])})
-    for path in programs:
-        _write_program(plan, path)
-    if picture is not None:
-        from elastocal.report.plan_picture import write_plan_picture
-
-        write_plan_picture(
-            picture, plan.model.cell, chain, plan.q,
-            names=plan.configurations, group=plan.group, group_names=plan.group_names,
-        )  # fmt: skip
-
-
-def _write_program(plan: Plan, path: Path) -> None:
-    from elastocal.design.programs.krl import krl_program
-    from elastocal.design.programs.urscript import urscript_program
-    from elastocal.files import atomic_write_text
-
-    write = krl_program if path.suffix.lower() == ".src" else urscript_program
-    arguments = (plan.execution, plan.model.chain, plan.configurations, plan.forces)
-    atomic_write_text(path, write(*arguments, name=path.stem))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from elastocal.design.readings import marker_sigmas
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.identify import identify
 from elastocal.identification.noise import Weights, weights_for, whitener
@@ -36,6 +37,8 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
     Where it does not suffice to identify the arm, B is taken at the nominal one.  The noise is
     the stated one, as for the poses to come.
     """
+    if table.sigma is None:
+        table = marker_sigmas(model.cell, table)
     try:
         x = identify(model, table, Options(method="wls", fixed=fixed)).x
         note = "the arm as identified from the measurements done"

@@ -10,6 +10,7 @@ import secrets
 import shutil
 import zipfile
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal import __version__
-from elastocal.files import atomic_write_text
 
 State = Mapping[str, NDArray]
 
@@ -67,14 +67,11 @@ class Checkpoint:
 
     @classmethod
     def beside(cls, output: Path, key: str) -> Checkpoint:
-        """The folder `OUTPUT.resume`; what another input or option left there is thrown away."""
-        folder = output.with_name(output.name + ".resume")
-        stamp = folder / "key"
-        if not stamp.is_file() or stamp.read_text(encoding="utf-8") != key:
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-            atomic_write_text(stamp, key)
-        return cls(folder)
+        """In the folder `OUTPUT.resume`, apart from what other input or options left there.
+
+        Nothing is written, nor anything of another design thrown away, before a stage is saved.
+        """
+        return cls(output.with_name(output.name + ".resume") / key[:32])
 
     @property
     def begun(self) -> bool:
@@ -84,7 +81,14 @@ class Checkpoint:
     def stage(self, name: str) -> Stage:
         return Stage(None if self.folder is None else self.folder / f"{name}.npz")
 
-    def clear(self) -> None:
-        """The design is done: nothing to resume."""
+    def drop(self) -> None:
+        """This design ends without a plan: nothing to resume, but perhaps of another one."""
         if self.folder is not None:
             shutil.rmtree(self.folder, ignore_errors=True)
+            with suppress(OSError):
+                self.folder.parent.rmdir()
+
+    def clear(self) -> None:
+        """The output is written: nothing to resume, whatever else was begun for it."""
+        if self.folder is not None:
+            shutil.rmtree(self.folder.parent, ignore_errors=True)

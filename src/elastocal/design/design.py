@@ -26,11 +26,12 @@ from elastocal.design.readings import load_states
 from elastocal.design.reasons import predicted, reasons
 from elastocal.design.select import Selection, select
 from elastocal.design.setup import Known, Pool, Setup, set_up
-from elastocal.design.shares import shares_of
+from elastocal.design.shares import check_available, most_poses, shares_of
 from elastocal.design.target_poses import test_poses
 from elastocal.errors import InsufficientDataError, require
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
+from elastocal.nearest import did_you_mean, listed, quoted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -66,7 +67,7 @@ class _Design:
     def __init__(
         self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
     ) -> None:
-        self.warnings: list[str] = []
+        self.warnings = list(options.notes)
         if cell.model.torque == "measured":
             cell = replace(cell, model=replace(cell.model, torque="computed"))
             self.warnings.append(
@@ -74,25 +75,30 @@ class _Design:
             )
         self.cell, self.options = cell, options
         self.checkpoint, self.progress = checkpoint, progress
-        self.model = Model.from_cell(cell)
+        self.model = Model.from_cell(cell, options.done.marker_names if options.done else ())
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
+        _check_combination(self.model)
         self.states = load_states(self.cell)
         self.space = joint_space(self.cell, self.chain)
         self.feasibility = Feasibility(self.cell, self.chain)
 
     def run(self) -> Plan:
         progress, options = self.progress, self.options
+        shares = shares_of(self.cell)
+        planned = [shares_of(self.cell, n) for n in options.curve]
+        planned += [shares] if self.cell.design.target is None else []
         targets = test_poses(self.cell, self.chain, self._at_work(), options.seed)
         q, load, group, counts = self._candidates()
+        for wanted in planned:
+            check_available(self.cell, np.bincount(group), wanted)
         done = None
         if options.done is not None:
             progress("information of the measurements done")
             done = measured(self.model, options.done, options.fixed)
             self.warnings.append(f"B is taken at {done.note}")
         known = Known(options.fixed, options.prior, done)
-        shares = shares_of(self.cell)
         progress("information of the candidates")
         setup = set_up(
             self.model, self.states, q, load, int(shares.sum()), targets, known, options.seed
@@ -144,7 +150,7 @@ class _Design:
             lambda n: setup.problem(pool, shares_of(self.cell, n)),
             numbers,
             None if target is None else self._target(setup, target),
-            between=(pool.n_groups, MOST_POSES),
+            between=(pool.n_groups, most_poses(self.cell, np.bincount(pool.group), MOST_POSES)),
             starts=EFFORTS[self.options.effort].starts,
             seed=self.options.seed,
             jobs=self.options.jobs,
@@ -164,7 +170,7 @@ class _Design:
             raise InsufficientDataError(
                 f"{self.cell.path or self.cell.name}: no plan of up to {last.poses} poses meets "
                 f"the target of {target * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
-                "allow more, measure more repeats, or take a better tracker"
+                "ask for less, measure more repeats, or take a better tracker"
             )
         return points, shares_of(self.cell, found.smallest)
 
@@ -197,6 +203,9 @@ class _Design:
             blockers=Blockers(self.feasibility),
             seed=self.options.seed, progress=self.progress,
         )  # fmt: skip
+        if execution.one_sided:
+            told = ", ".join(str(k + 1) for k in execution.one_sided)
+            self.warnings.append(f"approached from one side only, as the other is blocked: {told}")
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
         numbers = blocks.shape[1] * blocks.shape[2] * spec.repeats
@@ -230,3 +239,21 @@ class _Design:
             bound_reported=None if bound is None else setup.criterion.reported(bound)[0],
             warnings=tuple(self.warnings),
         )  # fmt: skip
+
+
+def _check_combination(model: Model) -> None:
+    """`[design] combination` is there where criterion c needs it, and names parameters."""
+    cell = model.cell
+    where = f"{cell.path or cell.name}: [design]"
+    names = cell.design.combination
+    require(
+        bool(names) or cell.design.criterion != "c",
+        f"{where} states no combination, which criterion c makes certain; add it, as in "
+        f'combination = {{ "{next(iter(model.names), "joint2.compliance")}" = 1.0 }}',
+    )
+    for name in names:
+        require(
+            name in model.names,
+            f"{where} combination names {quoted(name)}, which is no parameter of the model"
+            f"{did_you_mean(name, model.names)}; there are {listed(model.names)}",
+        )

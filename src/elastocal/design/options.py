@@ -34,7 +34,8 @@ EFFORTS: dict[str, Search] = {
 @dataclass(frozen=True)
 class DesignOptions:
     """`fixed`: parameters, places or effects held; `prior`: what is known of parameters;
-    `done`: measurements that the plan adds to; `curve`: numbers of poses to compare."""
+    `done`: measurements that the plan adds to; `curve`: numbers of poses to compare; `notes`:
+    sentences on how these came about, for the plan's warnings."""
 
     effort: Effort = "normal"
     seed: int = 0
@@ -43,6 +44,7 @@ class DesignOptions:
     prior: GaussianPrior | None = None
     done: Measurements | None = None
     curve: tuple[int, ...] = field(default=())
+    notes: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from scipy import linalg
 from elastocal.design.information import PoseInformation
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.reduction import Reduction, reduce
+from elastocal.manipulator.limits import joint_index
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
 from elastocal.nearest import did_you_mean, listed, quoted
@@ -38,8 +39,8 @@ class Estimable:
 def typical_sizes(information: PoseInformation, q: Array, load: IntArray) -> Array:
     """Typical deviation (parameters,) of each parameter, as identification takes them."""
     model, x = information.model, information.scenarios[0]
-    q, load = _some(q), _some(load)
-    table = information.rows(q, load, x)
+    some = _sample(model, q, load)
+    table = information.rows(q[some], load[some], x)
     return model.sizes(model.regressor(table, x, None, observe(table, model.observe)).B)
 
 
@@ -52,7 +53,9 @@ def estimable(
     Raises InsufficientDataError where no pose shows anything.
     """
     model = information.model
-    blocks = information.blocks(_some(q), _some(load))[0]
+    some = _sample(model, q, load)
+    first = replace(information, scenarios=information.scenarios[:1])
+    blocks = first.blocks(q[some], load[some])[0]
     columns = np.searchsorted(information.columns, free)
     B = blocks.reshape(-1, blocks.shape[-1])[:, columns]
     known = prior[np.ix_(free, free)]
@@ -122,6 +125,14 @@ def why(model: Model, found: Estimable, index: int) -> str:
     return f"{name} is held; drop it from --fix"
 
 
-def _some(values: NDArray) -> NDArray:
-    step = -(-len(values) // SAMPLE)
-    return values[::step]
+def _sample(model: Model, q: Array, load: IntArray) -> IntArray:
+    """Indices of about SAMPLE poses, equally many of each level and load state where there are."""
+    cell = model.cell
+    held = [joint_index(cell, model.chain, name, "[design.levels]") for name in cell.design.levels]
+    kinds, kind = np.unique(np.column_stack([q[:, held], load]), axis=0, return_inverse=True)
+    each = -(-SAMPLE // len(kinds))
+    found = []
+    for k in range(len(kinds)):
+        members = np.flatnonzero(kind.ravel() == k)
+        found.append(members[:: -(-len(members) // each)])
+    return np.sort(np.concatenate(found))

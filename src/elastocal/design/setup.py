@@ -22,7 +22,8 @@ from elastocal.design.parameters import (
 from elastocal.design.problem import DesignProblem
 from elastocal.design.readings import LoadStates
 from elastocal.design.target_poses import TargetPoses
-from elastocal.design.targets import on_kept, prediction_rows
+from elastocal.design.targets import on_kept, prediction_rows, unpredictable
+from elastocal.errors import InsufficientDataError
 from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.manipulator.model import Model
@@ -122,8 +123,8 @@ def set_up(
     interest = interest_of(model, found)
     A = None
     if spec.criterion in ("test_pose", "I", "G"):
-        rows = [prediction_rows(information, targets, x) for x in scenarios]
-        A = np.stack([on_kept(model, a, found) for a in rows])
+        rows = np.stack([prediction_rows(information, targets, x) for x in scenarios])
+        A = on_kept(model, rows, found)
     criterion = make_criterion(
         spec.criterion,
         parameters=len(kept),
@@ -177,7 +178,13 @@ def _combination(model: Model, found: Estimable) -> Array | None:
     a = np.zeros_like(a)
     for name, factor in wanted.items():
         a[model.names.index(name)] = factor
-    return on_kept(model, a[None, None, :], found)[0, 0]
+    lost = unpredictable(a[None, None], found)
+    if lost is not None:
+        raise InsufficientDataError(
+            f"{model.cell.path or model.cell.name}: [design] combination depends on "
+            f"{model.names[lost[1]]}; {why(model, found, lost[1])}"
+        )
+    return np.asarray((a * found.sizes)[found.columns])
 
 
 def _unit(model: Model) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell import Cell
-from elastocal.errors import require
+from elastocal.errors import InsufficientDataError, require
 
 IntArray = NDArray[np.int64]
 
@@ -36,3 +36,36 @@ def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
         "levels",
     )
     return np.array([total // levels + (k < total % levels) for k in range(levels)], dtype=np.int64)
+
+
+def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
+    """Are there as many candidates per level, `available` (L,), as the plan has poses there?
+
+    A candidate stands in a plan once.  Raises InputError where too few were asked for,
+    InsufficientDataError where too few are feasible.
+    """
+    short = np.flatnonzero(available < shares)
+    if not len(short):
+        return
+    k, drawn = int(short[0]), cell.design.candidates
+    level = f" takes {shares[k]} at level {k + 1} of {next(iter(cell.design.levels), '')}"
+    where = f"{cell.path or cell.name}: a plan of {int(shares.sum())} poses"
+    where += level if len(shares) > 1 else ""
+    asked = drawn // len(shares) + (k < drawn % len(shares))
+    require(
+        asked >= shares[k],
+        f"{where}, but {drawn} candidates leave {asked} to choose from; ask for more "
+        "(--candidates, or [design] candidates)",
+    )
+    raise InsufficientDataError(
+        f"{where}, but only {available[k]} feasible candidates were found; plan fewer poses, or "
+        "relax the limits or the rules of [workspace]"
+    )
+
+
+def most_poses(cell: Cell, available: IntArray, limit: int) -> int:
+    """The most poses, `limit` at most, for which `available` (L,) candidates per level suffice."""
+    n = len(available)
+    while n < limit and (shares_of(cell, n + 1) <= available).all():
+        n += 1
+    return n

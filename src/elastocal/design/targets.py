@@ -92,22 +92,29 @@ def _places(choice: EffectChoice, markers: dict[str, Array]) -> tuple[str | None
 
 
 def on_kept(model: Model, A: Array, found: Estimable) -> Array:
-    """A (T, r, kept) on the kept parameters, scaled by their sizes.
+    """A (S, T, r, kept) on the kept parameters, scaled by their sizes, under S scenarios.
 
     A test point is predictable where its motion by the dropped parameters is that by the kept
     ones they combine with: A_D = A_K · mixing.  Raises InsufficientDataError that names the
     parameter where it is not: no number of poses would make that position certain.
     """
-    r, sizes = found.reduction, found.sizes
-    kept = A[..., r.kept] * sizes[r.kept]
-    largest = float(np.abs(A * sizes).max())
-    off = np.abs((A[..., r.dropped] - A[..., r.kept] @ r.mixing) * sizes[r.dropped])
-    worst = off.max(axis=(0, 1), initial=0.0)
-    if len(worst) and worst.max() > OUTSIDE * largest:
-        index = int(r.dropped[int(worst.argmax())])
-        pose = int(off[..., int(worst.argmax())].max(axis=1).argmax()) + 1
+    lost = unpredictable(A[0], found)  # the mixing is that of the first scenario
+    if lost is not None:
+        pose, index = lost
         raise InsufficientDataError(
-            f"{model.cell.path or model.cell.name}: the position at test pose {pose} depends on "
-            f"{model.names[index]}; {why(model, found, index)}"
+            f"{model.cell.path or model.cell.name}: the position at test pose {pose + 1} depends "
+            f"on {model.names[index]}; {why(model, found, index)}; or ask for parameters instead "
+            'of test poses (criterion = "D")'
         )
-    return kept
+    kept = found.reduction.kept
+    return np.asarray(A[..., kept] * found.sizes[kept])
+
+
+def unpredictable(A: Array, found: Estimable) -> tuple[int, int] | None:
+    """A row of A (T, r, parameters) and a parameter by which no plan can predict it, if any."""
+    r, sizes = found.reduction, found.sizes
+    off = np.abs((A[..., r.dropped] - A[..., r.kept] @ r.mixing) * sizes[r.dropped]).max(axis=1)
+    if off.max(initial=0.0) <= OUTSIDE * float(np.abs(A * sizes).max()):
+        return None
+    dropped = int(off.max(axis=0).argmax())
+    return int(off[:, dropped].argmax()), int(r.dropped[dropped])

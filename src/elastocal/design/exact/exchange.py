@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from elastocal.design.criteria.factor import factorise
-from elastocal.design.exact.pool import admissible, without
+from elastocal.design.exact.pool import without
 from elastocal.design.problem import Array, DesignProblem, IntArray
+from elastocal.errors import InsufficientDataError
+
+Mask = NDArray[np.bool_]
 
 # Relative gain in Φ below which an exchange is not made: rounding must not decide.
 IMPROVEMENT = 1e-9
@@ -29,16 +32,19 @@ class Exchanged:
 
 @dataclass(frozen=True)
 class _State:
-    """A plan with Φ and the sensitivities d (N,) of all candidates at its information."""
+    """A plan with Φ, the sensitivities d (N,) of all candidates at its information, and which of
+    them (N,) may be measured once more."""
 
     chosen: IntArray
     value: float
     d: Array
+    free: Mask
 
     @classmethod
     def of(cls, problem: DesignProblem, chosen: IntArray) -> _State:
         gradient = problem.criterion.gradient(problem.prior + problem.sum_of(chosen))
-        return cls(chosen, gradient.value, problem.sensitivity(gradient.G))
+        free = np.bincount(chosen, minlength=problem.n_candidates) < problem.most
+        return cls(chosen, gradient.value, problem.sensitivity(gradient.G), free)
 
 
 def exchange(problem: DesignProblem, chosen: IntArray) -> Exchanged:
@@ -68,14 +74,15 @@ def exchange(problem: DesignProblem, chosen: IntArray) -> Exchanged:
 
 def _exchanged(problem: DesignProblem, state: _State, out: int) -> _State | None:
     """The plan with the best candidate in the place of `out`; None where none betters it."""
-    rest = without(state.chosen, out)
-    into = admissible(problem, rest, int(problem.group[out]))
-    into = into[into != out]
+    into = state.free & (problem.group == problem.group[out])
+    into[out] = False
     if problem.criterion.certifiable:
-        into = into[state.d[into] > state.d[out] + IMPROVEMENT * state.value]
-    if not len(into):
+        into &= state.d > state.d[out] + IMPROVEMENT * state.value
+    candidates = np.flatnonzero(into)
+    if not len(candidates):
         return None
-    best = best_addition(problem, problem.prior + problem.sum_of(rest), into, state.value)
+    rest = without(state.chosen, out)
+    best = best_addition(problem, problem.prior + problem.sum_of(rest), candidates, state.value)
     if best is None:
         return None
     better = _State.of(problem, np.sort(np.append(rest, best)))
@@ -106,10 +113,13 @@ def best_addition(
 
 def _upper(problem: DesignProblem, M: Array, candidates: IntArray) -> Array:
     """Bounds (k,) on 1/Φ(M_s + B_siᵀB_si); inf where none is known or none is worth its cost."""
-    known = problem.criterion.certifiable and len(candidates) > FIRST
-    if not known or not factorise(M).regular.all():
-        return np.full(len(candidates), np.inf)
-    gradient = problem.criterion.gradient(M)
+    unknown = np.full(len(candidates), np.inf)
+    if not problem.criterion.certifiable or len(candidates) <= FIRST:
+        return unknown
+    try:
+        gradient = problem.criterion.gradient(M)
+    except InsufficientDataError:
+        return unknown
     B = problem.blocks[:, candidates]
     S, k, r, p = B.shape
     weighted = B.reshape(S, k * r, p) @ gradient.G

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from elastocal.design.criteria.factor import factorise
+from elastocal.design.criteria.factor import SINGULAR, factorise
 from elastocal.design.exact.pool import admissible, random_plan, without
 from elastocal.design.problem import Array, DesignProblem, IntArray
 from elastocal.errors import InsufficientDataError
@@ -15,8 +15,8 @@ ATTEMPTS = 20
 
 
 def is_regular(M: Array) -> bool:
-    """Are all of M (S, p, p) regular beyond rounding?"""
-    return bool(factorise(M).regular.all())
+    """Are all of M (S, p, p) regular, by a margin that no order of summation or columns uses up?"""
+    return bool((factorise(M).condition < SINGULAR / 10).all())
 
 
 def fewest_poses(problem: DesignProblem) -> int:
@@ -67,18 +67,19 @@ def ridge(problem: DesignProblem) -> Array:
 def regular_plan(problem: DesignProblem, chosen: IntArray, rng: np.random.Generator) -> IntArray:
     """A plan of regular M near `chosen`: exchanges that raise Σ_s log det(M_s + δ ridge), δ → 0.
 
-    For small δ a determinant counts the rank first.  Random plans are tried where `chosen` leads
-    to none; raises InsufficientDataError where they do not either.
+    Large δ leads to well-conditioned plans.  Where they are of lower rank, random plans follow and
+    only the smallest δ, under which a determinant counts the rank first.  Raises
+    InsufficientDataError where none of them becomes regular.
     """
-    unit = ridge(problem)
+    unit, ridges = ridge(problem), RIDGES
     for _ in range(ATTEMPTS):
-        for delta in RIDGES:
+        for delta in ridges:
             if is_regular(problem.prior + problem.sum_of(chosen)):
                 return chosen
             chosen = _raise_determinant(problem, chosen, delta * unit)
         if is_regular(problem.prior + problem.sum_of(chosen)):
             return chosen
-        chosen = random_plan(problem, rng)
+        chosen, ridges = random_plan(problem, rng), RIDGES[-1:]
     p = problem.blocks.shape[-1]
     raise InsufficientDataError(
         f"no plan of {problem.n_poses} poses that determines all {p} parameters was found; plan "

@@ -1,0 +1,99 @@
+"""How much the bound leaves below Table 2, under other tools and test poses than the study's.
+
+    .venv/bin/python experiment_design/kr270_plan/assumptions.py
+
+Tool, markers and test pose of the paper are not published, so the margin between Table 2 and the
+best possible plan is a range, not a number.  Joint limits alone; writes assumptions.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from compared import HERE, table_2
+
+from elastocal.cell import Cell, Tool
+from elastocal.cell_reader import read_cell
+from elastocal.design.candidates import draw
+from elastocal.design.feasibility.feasibility import Feasibility
+from elastocal.design.joint_space import joint_space
+from elastocal.design.readings import ALL_LOADS, load_states
+from elastocal.design.relaxation.relax import relax
+from elastocal.design.setup import Known, set_up
+from elastocal.design.shares import shares_of
+from elastocal.design.target_poses import TargetPoses
+from elastocal.manipulator.model import Model
+
+CANDIDATES = 20_000
+SETS = 5  # sets of twenty test poses, drawn over the joint limits
+AROUND = {"M1": (0.25, 0.0, 0.0), "M2": (-0.1, 0.2, 0.11), "M3": (-0.1, -0.2, 0.11)}
+TOOLS = {
+    "load at (0.20, 0, 0.25) m, three markers 0.25 m about the flange": ((0.20, 0.0, 0.25), AROUND),
+    "load at (0.05, 0, 0.60) m, the same markers": ((0.05, 0.0, 0.60), AROUND),
+    "load at (0.40, 0, 0) m, the same markers": ((0.40, 0.0, 0.0), AROUND),
+    "load at (0.20, 0, 0.25) m, one marker 0.25 m beside the flange": (
+        (0.20, 0.0, 0.25),
+        {"M1": (0.25, 0.0, 0.0)},
+    ),
+    "load at (0.20, 0, 0.25) m, one marker at the load point": (
+        (0.20, 0.0, 0.25),
+        {"M1": (0.20, 0.0, 0.25)},
+    ),
+}
+
+
+def main() -> None:
+    cell = read_cell(HERE / "joint_limits.toml")
+    lines = [
+        "# How far Table 2 is from the best possible plan",
+        "",
+        f"`assumptions.py`: ρ₀ of Table 2 over the certified bound on ρ₀ (pool of {CANDIDATES}, "
+        f"three poses per level), for {SETS} sets of twenty test poses drawn over the limits.",
+        "",
+        "| tool | ρ₀ of Table 2 over the bound | efficiency of Table 2 |",
+        "|---|---|---|",
+    ]
+    for name, (load, markers) in TOOLS.items():
+        tool = Tool(np.array(load), {k: np.array(v) for k, v in markers.items()})
+        ratio = np.array(margins(replace(cell, tool=tool)))
+        lines.append(
+            f"| {name} | {ratio.min():.2f} to {ratio.max():.2f} | "
+            f"{1 / ratio.max() ** 2:.2f} to {1 / ratio.min() ** 2:.2f} |"
+        )
+        print(lines[-1], flush=True)
+    (HERE / "assumptions.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def margins(cell: Cell) -> list[float]:
+    """ρ₀ of Table 2 over the bound, for each set of test poses."""
+    model = Model.from_cell(cell)
+    states, space = load_states(cell), joint_space(cell, model.chain)
+    drawn = draw(cell, model.chain, states, Feasibility(cell, model.chain), CANDIDATES, 0)
+    shares = shares_of(cell)
+    found = []
+    for seed in range(SETS):
+        targets = _test_poses(cell, space, np.random.default_rng(seed))
+        setup = set_up(model, states, drawn.q, drawn.load, 15, targets, Known(), seed)
+        pool = setup.pool(drawn.q, drawn.load, drawn.group)
+        q = table_2(model)
+        value = setup.value(q, np.full(len(q), ALL_LOADS))
+        found.append(float(np.sqrt(value / relax(setup.problem(pool, shares)).bound)))
+    return found
+
+
+def _test_poses(cell: Cell, space: object, rng: np.random.Generator) -> TargetPoses:
+    q = np.concatenate([space.poses(rng.uniform(size=(4, 5)), level) for level in range(5)])
+    T = len(q)
+    return TargetPoses(
+        q=q,
+        force=np.tile(cell.design.loads[-1], (T, 1)),
+        weight=np.full(T, 1 / T),
+        point=np.tile(cell.tool.load_point, (T, 1)),
+        stated=np.ones(T, dtype=bool),
+        source="drawn",
+    )
+
+
+if __name__ == "__main__":
+    main()

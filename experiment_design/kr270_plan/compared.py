@@ -1,0 +1,91 @@
+"""The plans that this study compares, and what each is worth by prediction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from elastocal.cell import Cell
+from elastocal.cell_reader import read_cell
+from elastocal.design.candidates import draw
+from elastocal.design.design import design
+from elastocal.design.feasibility.feasibility import Feasibility
+from elastocal.design.options import DesignOptions
+from elastocal.design.plan import Plan
+from elastocal.design.readings import ALL_LOADS, LoadStates, load_states
+from elastocal.design.setup import Known, Pool, Setup, set_up
+from elastocal.design.shares import shares_of
+from elastocal.design.target_poses import TargetPoses, test_poses
+from elastocal.manipulator.model import Model
+from elastocal.measurement_reader import read_plan
+
+HERE = Path(__file__).parent
+DEMO = Path(str(files("elastocal.demo")))
+SEED = 2013
+RANDOM_PLANS = 1000
+
+
+@dataclass(frozen=True)
+class Study:
+    """A cell, its model, and what evaluates any plan in it."""
+
+    name: str
+    cell: Cell
+    model: Model
+    states: LoadStates
+    feasibility: Feasibility
+    targets: TargetPoses
+    setup: Setup
+    pool: Pool
+
+    @classmethod
+    def of(cls, name: str, candidates: int) -> Study:
+        model = Model.from_cell(read_cell(HERE / f"{name}.toml"))
+        cell, chain = model.cell, model.chain
+        cell = replace(cell, design=replace(cell.design, candidates=candidates))
+        model = Model(chain, cell)
+        states, feasibility = load_states(cell), Feasibility(cell, chain)
+        targets = test_poses(cell, chain)
+        drawn = draw(cell, chain, states, feasibility, 2000, SEED)
+        n = int(shares_of(cell).sum())
+        setup = set_up(model, states, drawn.q, drawn.load, n, targets, Known(), SEED)
+        pool = setup.pool(drawn.q, drawn.load, drawn.group)
+        return cls(name, cell, model, states, feasibility, targets, setup, pool)
+
+    def rho(self, q: np.ndarray) -> float:
+        """Predicted ρ₀ in µm of the poses q (N, n)."""
+        value = self.setup.value(q, np.full(len(q), ALL_LOADS))
+        return self.setup.criterion.reported(value)[0]
+
+    def allowed(self, q: np.ndarray) -> np.ndarray:
+        """(N,) poses that the cell allows in every load state."""
+        return np.logical_and.reduce([self.feasibility.check(q, f).ok for f in self.states.forces])
+
+    def planned(self, criterion: str, effort: str, jobs: int) -> Plan:
+        cell = replace(self.cell, design=replace(self.cell.design, criterion=criterion))
+        options = DesignOptions(effort=effort, seed=SEED, jobs=jobs, fixed=("joint1.compliance",))
+        return design(cell, options, progress=lambda text: print(f"  {text}", flush=True))
+
+    def at_random(self) -> np.ndarray:
+        """ρ₀ in µm of RANDOM_PLANS plans of the same shares, drawn from feasible candidates."""
+        rng = np.random.default_rng(SEED)
+        shares = shares_of(self.cell)
+        found = np.empty(RANDOM_PLANS)
+        for k in range(RANDOM_PLANS):
+            chosen = np.concatenate(
+                [
+                    rng.choice(np.flatnonzero(self.pool.group == level), n, replace=False)
+                    for level, n in enumerate(shares)
+                ]
+            )
+            M = self.setup.gathered(self.pool.blocks[:, chosen])
+            found[k] = self.setup.criterion.reported(float(self.setup.criterion.value(M)))[0]
+        return found
+
+
+def table_2(model: Model) -> np.ndarray:
+    """The poses (15, 6) of Table 2 of Klimchik et al. 2013."""
+    return read_plan(DEMO / "plan.csv", joint_kinds=model.chain.kinds).q

@@ -1,0 +1,109 @@
+"""The files that `elastocal design` reads and writes: checked before the work, written after it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from elastocal.errors import InputError, require
+
+if TYPE_CHECKING:
+    from elastocal.cell import Array, Cell
+    from elastocal.design.order.execution import Execution
+    from elastocal.design.plan import Plan
+    from elastocal.manipulator.chain import Chain
+
+PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
+PICTURES = (".png", ".svg")
+
+
+def check_suffixes(programs: tuple[Path, ...], picture: Path | None) -> None:
+    """Refuse names that do not say which kind of file is wanted."""
+    for path in programs:
+        require(
+            path.suffix.lower() in PROGRAMS,
+            f"--program {path}: the suffix says the language, "
+            + " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items()),
+        )
+    require(
+        picture is None or picture.suffix.lower() in PICTURES,
+        f"--picture {picture}: name it {' or '.join(PICTURES)}",
+    )
+
+
+def check_programs(cell: Cell, programs: tuple[Path, ...]) -> None:
+    """Can these robot programs be written for this arm?  Told before the work, not after it."""
+    import numpy as np
+
+    from elastocal.cell_design import Motion
+    from elastocal.design.order.execution import Execution
+    from elastocal.manipulator.choice import load_chain
+
+    if programs:
+        chain = load_chain(cell)
+        nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0.0, 0, 0)
+        for path in programs:
+            _program(path, nothing, chain)
+
+
+def check_apart(written: list[Path], read: list[Path]) -> None:
+    """Refuse to write over an input, or two outputs into one file."""
+    inputs = {path.resolve() for path in read}
+    seen: set[Path] = set()
+    for path in written:
+        require(
+            path.resolve() not in inputs,
+            f"{path} is read for this plan and would be written over; name another output",
+        )
+        require(
+            path.resolve() not in seen, f"{path}: two outputs of the same name; name another one"
+        )
+        seen.add(path.resolve())
+
+
+def files_of(cell: Cell) -> tuple[Path | None, ...]:
+    """Files that the cell names and a plan depends on."""
+    robot, path = cell.robot, cell.design.test_path
+    meshes = [s.mesh for s in cell.workspace.obstacles]
+    meshes += [body.solid.mesh for body in cell.workspace.bodies]
+    return (robot.urdf, robot.dh, robot.masses, None if path is None else path.file, *meshes)
+
+
+def write_all(
+    plan: Plan, output: Path, report: Path, programs: tuple[Path, ...], picture: Path | None
+) -> None:
+    """plan.csv, plan.json, robot programs and picture, each whole or not at all."""
+    from elastocal.design.plan_file import plan_rows, write_plan, write_plan_json
+    from elastocal.files import atomic_write_text
+
+    chain = plan.model.chain
+    rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
+    write_plan(output, rows, chain.kinds)
+    write_plan_json(report, plan.to_json() | {"command": shlex.join(["elastocal", *sys.argv[1:]])})
+    for path in programs:
+        text = _program(path, plan.execution, chain, plan.configurations, plan.forces)
+        atomic_write_text(path, text)
+    if picture is not None:
+        from elastocal.report.plan_picture import write_plan_picture
+
+        write_plan_picture(
+            picture, plan.model.cell, chain, plan.q,
+            names=plan.configurations, group=plan.group, group_names=plan.group_names,
+        )  # fmt: skip
+
+
+def _program(
+    path: Path, execution: Execution, chain: Chain,
+    configurations: tuple[str, ...] = (), forces: Array | None = None,
+) -> str:  # fmt: skip
+    """The robot program to write to `path`."""
+    from elastocal.design.programs.krl import krl_program
+    from elastocal.design.programs.urscript import urscript_program
+
+    text = krl_program if path.suffix.lower() == ".src" else urscript_program
+    try:
+        return text(execution, chain, configurations, forces, name=path.stem)
+    except InputError as error:
+        raise InputError(f"--program {path}: {error}") from None
