@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Cell
 from elastocal.cell_workspace import Solid
-from elastocal.design.feasibility.bodies import HANGING, WORLD, Body, data_base
+from elastocal.design.feasibility.bodies import Body, data_base
+from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.pairs import Pair
 from elastocal.manipulator.chain import Chain
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from compared import DEMO, Study
@@ -24,15 +25,22 @@ CLOSE = 1e-9  # m: how near the calibrated model is brought to the target
 def realised(study: Study, q: np.ndarray, campaigns: int, jobs: int) -> np.ndarray:
     """Square mean over the test poses (campaigns,) in m² of the true arm's error after
     compensation with what each campaign identified."""
-    tool = Tool(study)
     seeds = np.random.SeedSequence(0).spawn(campaigns)
     chunks = [seeds[k::32] for k in range(32)]
-    parts = Parallel(n_jobs=jobs)(delayed(_some)(study, tool, q, chunk) for chunk in chunks)
+    parts = Parallel(n_jobs=jobs)(delayed(_some)(study.name, q, chunk) for chunk in chunks)
     return np.concatenate(parts)
 
 
-def _some(study: Study, tool: Tool, q: np.ndarray, seeds: list) -> np.ndarray:
+def _some(name: str, q: np.ndarray, seeds: list) -> np.ndarray:
+    study, tool = _instruments(name)
     return np.array([_one(study, tool, q, seed) for seed in seeds])
+
+
+@cache
+def _instruments(name: str) -> tuple[Study, Tool]:
+    """Each process has its own: symbolic models do not pickle."""
+    study = Study.of(name, 0)
+    return study, Tool(study)
 
 
 def _one(study: Study, tool: Tool, q: np.ndarray, seed: np.random.SeedSequence) -> float:

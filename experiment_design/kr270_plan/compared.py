@@ -11,6 +11,7 @@ import numpy as np
 from elastocal.cell import Cell
 from elastocal.cell_reader import read_cell
 from elastocal.design.candidates import draw
+from elastocal.design.checkpoint import Checkpoint
 from elastocal.design.design import design
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.options import DesignOptions
@@ -65,9 +66,11 @@ class Study:
         return np.logical_and.reduce([self.feasibility.check(q, f).ok for f in self.states.forces])
 
     def planned(self, criterion: str, effort: str, jobs: int) -> Plan:
+        """Our plan; what an interrupted run had finished is taken from runs/."""
         cell = replace(self.cell, design=replace(self.cell.design, criterion=criterion))
         options = DesignOptions(effort=effort, seed=SEED, jobs=jobs, fixed=("joint1.compliance",))
-        return design(cell, options, progress=lambda text: print(f"  {text}", flush=True))
+        done = Checkpoint(HERE / "runs" / f"{self.name}-{criterion}-{effort}")
+        return design(cell, options, done, lambda text: print(f"  {text}", flush=True))
 
     def at_random(self) -> np.ndarray:
         """ρ₀ in µm of RANDOM_PLANS plans of the same shares, drawn from feasible candidates."""

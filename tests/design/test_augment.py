@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
-from support.plans import FULL, all_loads, as_table, plan_cell, setup_of
+from support.design_cells import FULL, all_loads, as_table, plan_cell, setup_of
 
 from elastocal.cell import Cell, PolarNoise
 from elastocal.design.augment import measured

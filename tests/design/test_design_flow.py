@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from support.calibration import placement, random_chain
 from support.cells import DOWN
-from support.plans import FULL, any_cell, plan_cell, scara, sliding_chain
+from support.design_cells import FULL, any_cell, plan_cell, scara, sliding_chain
 from support.robots import packaged_urdf
 
 from elastocal.cell import Cell, Robot
@@ -265,8 +265,9 @@ def test_normal_effort_polishes_off_the_pool_and_stays_inside_the_rules(
 ) -> None:
     if make is plan_cell:
         monkeypatch.setitem(EFFORTS, "normal", Search(rounds=1, starts=4, points=256, ascents=1))
+    n = 40 if make is plan_cell else 150
     plans = {
-        effort: design(make(loads=DOWN[None], poses=4, candidates=40), DesignOptions(effort))
+        effort: design(make(loads=DOWN[None], poses=4, candidates=n), DesignOptions(effort))
         for effort in ("quick", "normal")
     }
     normal = plans["normal"]

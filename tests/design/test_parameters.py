@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -9,16 +10,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
-from support.plans import FULL, all_loads, any_cell, plan_cell, scara, setup_of, spread
+from support.design_cells import FULL, all_loads, any_cell, plan_cell, scara, setup_of, spread
 
 from elastocal.cell import Cell
+from elastocal.cell_design import TargetPose
 from elastocal.design import parameters
 from elastocal.design.information import PoseInformation
 from elastocal.design.readings import load_states
-from elastocal.design.setup import Known
+from elastocal.design.setup import Known, Setup
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.identification.identify import identify
+from elastocal.identification.options import Options
 from elastocal.manipulator.model import Model
+from elastocal.simulation.simulate import simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])
@@ -206,3 +211,38 @@ def test_a_combination_of_what_the_readings_add_up_is_known_and_its_parts_are_no
     alone = replace(cell, design=replace(cell.design, combination={"joint1.offset": 1.0}))
     with pytest.raises(InsufficientDataError, match=r"combination depends on joint1.offset.*base"):
         setup_of(alone, POSES)
+
+
+def test_a_plan_estimates_what_identification_will() -> None:
+    """Of fifteen poses both keep the same parameters; joint 6's offset, which only the load point
+    tells from the markers, is below the noise and held by both."""
+    cell = plan_cell(
+        ("base_frame", "joint_offset", "joint_compliance", "marker_position"),
+        "position",
+        loads=BOTH,
+    )
+    setup = setup_of(cell, TABLE_2, n_poses=len(TABLE_2))
+    model = setup.information.model
+    rows = setup.information.rows(*plan(), model.nominal)
+    data = simulate(model, rows, model.nominal, 3)
+    result = identify(model, data, Options(method="wls", faulty="keep"))
+    assert set(setup.information.names) == set(result.determined)
+    assert "joint6.offset" not in setup.information.names
+
+
+def test_what_is_held_and_moves_a_stated_point_is_told() -> None:
+    effects = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
+    told = TargetPose(TABLE_2[0], force=DOWN, point=np.array([0.2, 0.0, 0.25]))
+    cell = plan_cell(effects, "position", loads=BOTH, test_poses=(told,))
+    of_point = remaining(setup_of(cell, TABLE_2, n_poses=15))
+    cell = plan_cell(effects, "position", loads=BOTH, test_poses=(replace(told, point=None),))
+    of_markers = remaining(setup_of(cell, TABLE_2, n_poses=15))
+    # A milliradian about the flange, 0.2 m away; markers move as the readings told.
+    assert 100 < of_point < 400
+    assert of_markers < 5
+
+
+def remaining(setup: Setup) -> float:
+    """µm that held parameters move the test points by, as the warning tells; 0 without one."""
+    told = [text for text in setup.warnings if "joint6.offset" in text]
+    return float(re.findall(r"by ([0-9.]+) µm", told[0])[0]) if told else 0.0

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 from support.cells import DOWN, kr270_chain
-from support.plans import as_table, plan_cell
+from support.design_cells import as_table, plan_cell
 
 from elastocal.cell import Cell, PolarNoise
 from elastocal.design import target_poses
@@ -86,14 +86,14 @@ def check_promise(plan: Plan, found: NDArray, truth: NDArray) -> None:
     scatter = square.std() / np.sqrt(n)
     promise = (plan.reported * 1e-6) ** 2
     assert abs(square.mean() - promise) < 4 * scatter, np.sqrt(square.mean() / promise)
-    assert scatter < 0.15 * promise  # the number of campaigns can tell
+    assert scatter < 0.2 * promise  # the number of campaigns can tell
 
 
 def identified(plan: Plan, tables: list[Measurements], **options: Any) -> NDArray:
     return np.array([identify(plan.model, table, Options(**options)).x for table in tables])
 
 
-@pytest.mark.parametrize("number", [40, pytest.param(200, marks=pytest.mark.long)])
+@pytest.mark.parametrize("number", [25, pytest.param(200, marks=pytest.mark.long)])
 def test_deflections(number: int) -> None:
     plan = plan_of(plan_cell(loads=DOWN[None], poses=6))
     truth = plan.model.nominal * np.array([1.0, 1.05, 0.95, 1.05, 0.95, 1.02])

@@ -17,9 +17,8 @@ SIZES = np.full(6, 1e-7)
 
 def found(kept: list[int], dropped: list[int], mixing: np.ndarray) -> Estimable:
     none = np.zeros(0, dtype=np.int64)
-    return Estimable(
-        Reduction(np.array(kept), np.array(dropped, dtype=np.int64), mixing, none), SIZES
-    )
+    reduction = Reduction(np.array(kept), np.array(dropped, dtype=np.int64), mixing, none)
+    return Estimable(reduction, SIZES, reduction)
 
 
 ALL = found(list(range(6)), [], np.zeros((6, 0)))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
-from support.plans import (
+from support.design_cells import (
     FULL,
     all_loads,
     any_cell,
@@ -239,4 +239,4 @@ def test_scenarios_with_parameters_that_cannot_be_told_apart_are_weighed() -> No
     value = setup_of(cell, POSES).value(POSES[:30], all_loads(POSES[:30]))
     nominal = replace(cell, design=replace(cell.design, robust="none"))
     least = setup_of(nominal, POSES).value(POSES[:30], all_loads(POSES[:30]))
-    assert least <= value < 2 * least
+    assert least * (1 - 1e-9) <= value < 2 * least

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
 from support.cells import table_of as rows_with_markers
-from support.plans import FULL, any_cell, plan_cell, setup_of, sliding_chain, spread
+from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain, spread
 
 from elastocal.cell import Cell, Nominal
 from elastocal.cell_design import TargetPose

@@ -19,6 +19,7 @@ from elastocal.cli.app import (
     progress_line,
     reporting_errors,
 )
+from elastocal.cli.interrupts import Interrupts
 from elastocal.cli.plan_files import (
     check_apart,
     check_programs,
@@ -101,7 +102,12 @@ def design(
         "target": _target(target, poses),
         "candidates": candidates,
     }
-    with progress_line(quiet) as progress:
+    with progress_line(quiet) as tell, Interrupts() as interrupts:
+
+        def progress(message: str) -> None:
+            interrupts.check()
+            tell(message)
+
         progress("reading")
         wanted = _read(cell, asked)
         check_programs(wanted, programs)
@@ -109,15 +115,19 @@ def design(
         files = [p for p in (cell, augment, knowledge, *files_of(wanted)) if p is not None]
         check_apart(written, files)
         told = asked | {"fix": fix, "curve": curve, "effort": effort}
-        checkpoint = Checkpoint.beside(output, key_of(files, seed=seed, **told))
+        key = key_of(files, seed=seed, **told)
+        checkpoint = Checkpoint.beside(output, key, interrupts.check)
         if checkpoint.begun:
             progress("going on with the design that was interrupted")
         try:
             plan = run(wanted, options, checkpoint, progress)
-        except ElastocalError:
-            # The same input ends here again: there is nothing to go on with.
-            checkpoint.drop()
+        except Exception as error:
+            interrupts.check()
+            if isinstance(error, ElastocalError):
+                # The same input ends here again: there is nothing to go on with.
+                checkpoint.drop()
             raise
+        interrupts.check()
         write_all(plan, output, report, programs, picture)
         checkpoint.clear()
     if as_json:

@@ -9,7 +9,7 @@ import os
 import secrets
 import shutil
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,9 +33,13 @@ def key_of(files: Iterable[Path], **options: object) -> str:
 
 @dataclass(frozen=True)
 class Stage:
-    """What one stage of a design has finished so far; nowhere kept if `path` is None."""
+    """What one stage of a design has finished so far; nowhere kept if `path` is None.
+
+    `check` is called before anything is kept: it raises where the work was interrupted.
+    """
 
     path: Path | None
+    check: Callable[[], None] = lambda: None
 
     def load(self) -> dict[str, NDArray] | None:
         """What was saved last, None if nothing (readable) was."""
@@ -49,6 +53,7 @@ class Stage:
 
     def save(self, state: State) -> None:
         """Keep `state`, whole or not at all."""
+        self.check()
         if self.path is None:
             return
         text = io.BytesIO()
@@ -64,14 +69,15 @@ class Checkpoint:
     """The stages of one design, in a folder beside its output; nowhere if `folder` is None."""
 
     folder: Path | None = None
+    check: Callable[[], None] = lambda: None
 
     @classmethod
-    def beside(cls, output: Path, key: str) -> Checkpoint:
+    def beside(cls, output: Path, key: str, check: Callable[[], None] = lambda: None) -> Checkpoint:
         """In the folder `OUTPUT.resume`, apart from what other input or options left there.
 
         Nothing is written, nor anything of another design thrown away, before a stage is saved.
         """
-        return cls(output.with_name(output.name + ".resume") / key[:32])
+        return cls(output.with_name(output.name + ".resume") / key[:32], check)
 
     @property
     def begun(self) -> bool:
@@ -79,7 +85,8 @@ class Checkpoint:
         return self.folder is not None and any(self.folder.glob("*.npz"))
 
     def stage(self, name: str) -> Stage:
-        return Stage(None if self.folder is None else self.folder / f"{name}.npz")
+        path = None if self.folder is None else self.folder / f"{name}.npz"
+        return Stage(path, self.check)
 
     def drop(self) -> None:
         """This design ends without a plan: nothing to resume, but perhaps of another one."""

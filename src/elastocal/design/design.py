@@ -105,9 +105,9 @@ class _Design:
         )
         self.warnings += setup.warnings
         pool = setup.pool(q, load, group)
-        curve, shares = self._sizes(setup, pool, shares)
+        curve, shares, begun = self._sizes(setup, pool, shares)
         searches = Searches(setup.information, self.space, self.feasibility, self.feasibility.pairs)
-        found = select(setup, pool, shares, searches, options, self.checkpoint, progress)
+        found = select(setup, pool, shares, searches, options, self.checkpoint, progress, begun)
         return self._plan(setup, found, shares, counts, targets.source, curve, done)
 
     def _at_work(self) -> Feasibility:
@@ -141,11 +141,38 @@ class _Design:
 
     def _sizes(
         self, setup: Setup, pool: Pool, shares: IntArray
-    ) -> tuple[tuple[SizePoint, ...], IntArray]:
-        """The curve of criterion against number of poses, and the shares that meet the target."""
+    ) -> tuple[tuple[SizePoint, ...], IntArray, IntArray | None]:
+        """The curve of criterion against number of poses, and where there is a target the shares
+        that meet it and a plan that does."""
         target, numbers = self.cell.design.target, self.options.curve
         if target is None and not numbers:
-            return (), shares
+            return (), shares, None
+        stage = self.checkpoint.stage("sizes")
+        state = stage.load()
+        if state is None:
+            state = self._size_curve(setup, pool, target, numbers)
+            stage.save(state)
+        reported = setup.criterion.reported
+        points = tuple(
+            SizePoint(int(n), reported(value)[0], None if np.isnan(b) else reported(b)[0])
+            for n, value, b in zip(state["n"], state["value"], state["bound"], strict=True)
+        )
+        if target is None:
+            return points, shares, None
+        smallest = int(state["smallest"])
+        if not smallest:
+            last = points[-1]
+            raise InsufficientDataError(
+                f"{self.cell.path or self.cell.name}: no plan of up to {last.poses} poses meets "
+                f"the target of {target * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
+                "ask for less, measure more repeats, or take a better tracker"
+            )
+        return points, shares_of(self.cell, smallest), state["plan"]
+
+    def _size_curve(
+        self, setup: Setup, pool: Pool, target: float | None, numbers: tuple[int, ...]
+    ) -> dict[str, NDArray]:
+        """As `size_curve`: bounds NaN where there are none, `smallest` 0 where none meets."""
         found = size_curve(
             lambda n: setup.problem(pool, shares_of(self.cell, n)),
             numbers,
@@ -156,23 +183,15 @@ class _Design:
             jobs=self.options.jobs,
             progress=self.progress,
         )
-        reported = setup.criterion.reported
-        points = tuple(
-            SizePoint(
-                p.n_poses, reported(p.value)[0], None if p.bound is None else reported(p.bound)[0]
-            )
-            for p in found.points
-        )
-        if target is None:
-            return points, shares
-        if found.smallest is None:
-            last = points[-1]
-            raise InsufficientDataError(
-                f"{self.cell.path or self.cell.name}: no plan of up to {last.poses} poses meets "
-                f"the target of {target * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
-                "ask for less, measure more repeats, or take a better tracker"
-            )
-        return points, shares_of(self.cell, found.smallest)
+        plans = {p.n_poses: p.plan.chosen for p in found.points}
+        bounds = [np.nan if p.bound is None else p.bound for p in found.points]
+        return {
+            "n": np.array([p.n_poses for p in found.points]),
+            "value": np.array([p.value for p in found.points]),
+            "bound": np.array(bounds),
+            "smallest": np.array(found.smallest or 0),
+            "plan": plans.get(found.smallest or 0, np.zeros(0, dtype=np.int64)),
+        }
 
     def _target(self, setup: Setup, target: float) -> float:
         """Φ of a target in m."""

@@ -11,6 +11,7 @@ from scipy import linalg
 from elastocal.design.information import PoseInformation
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.reduction import Reduction, reduce
+from elastocal.identification.selection import WORTH_A_COLUMN
 from elastocal.manipulator.limits import joint_index
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
@@ -19,6 +20,7 @@ from elastocal.nearest import did_you_mean, listed, quoted
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+SURE = 1e3  # standard deviations that a typical deviation counts for where a prior is stated
 SAMPLE = 2000  # poses that show what is visible: more would not change a rank
 # Effects that say where things stand rather than what the arm is; D, A, E and O pass them over.
 NUISANCE = ("base_frame", "marker_position", "marker_orientation", "distance_sensor")
@@ -26,10 +28,16 @@ NUISANCE = ("base_frame", "marker_position", "marker_orientation", "distance_sen
 
 @dataclass(frozen=True)
 class Estimable:
-    """`reduction` over all parameters (kept, dropped, mixing) and `sizes` (parameters,)."""
+    """`reduction` over all parameters (kept, dropped, mixing), `sizes` (parameters,) and
+    `structure`: the reduction that any number of poses would come to.
+
+    Identification holds parameters that N poses show only below their noise; a plan of N poses
+    must promise what identification then does.  Such are in `structure.kept` alone.
+    """
 
     reduction: Reduction
     sizes: Array
+    structure: Reduction
 
     @property
     def columns(self) -> IntArray:
@@ -45,11 +53,19 @@ def typical_sizes(information: PoseInformation, q: Array, load: IntArray) -> Arr
 
 
 def estimable(
-    information: PoseInformation, q: Array, load: IntArray, free: IntArray, prior: Array
+    information: PoseInformation,
+    q: Array,
+    load: IntArray,
+    free: IntArray,
+    prior: Array,
+    n_poses: int,
+    stated: NDArray[np.bool_] | None = None,
 ) -> Estimable:
-    """A minimal complete set of the `free` parameters, from a sample of the poses q (N, n).
+    """A minimal complete set of the `free` parameters for plans of `n_poses` of the poses q (N, n).
 
-    `prior` (parameters, parameters): information known before, scaled by `information.sizes`.
+    As identification chooses it, from a sample of the poses weighed as `n_poses` of them.  `prior`
+    (parameters, parameters): information known before, scaled by `information.sizes`; parameters
+    with a `stated` prior (parameters,) are kept whatever the poses show of them.
     Raises InsufficientDataError where no pose shows anything.
     """
     model = information.model
@@ -57,23 +73,32 @@ def estimable(
     first = replace(information, scenarios=information.scenarios[:1])
     blocks = first.blocks(q[some], load[some])[0]
     columns = np.searchsorted(information.columns, free)
-    B = blocks.reshape(-1, blocks.shape[-1])[:, columns]
+    B = blocks.reshape(-1, blocks.shape[-1])[:, columns] * np.sqrt(n_poses / len(some))
     known = prior[np.ix_(free, free)]
     if known.any():
         values, vectors = linalg.eigh(known)
         B = np.vstack([B, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T])
-    sizes = information.sizes
-    parameters = tuple(model.parameters[c] for c in free)
-    # The columns are scaled already.
-    local = reduce(B, np.ones(len(free)), parameters, sigma=1.0, threshold=0.0)
-    if not len(local.kept):
+    if stated is not None:
+        B = np.vstack([B, SURE * np.eye(len(free))[stated[free]]])
+    structure, reduction = (
+        _reduced(model, B, free, information.sizes, threshold)
+        for threshold in (0.0, WORTH_A_COLUMN)
+    )
+    if not len(reduction.kept):
         raise InsufficientDataError(
             f"{model.cell.path or model.cell.name}: no feasible pose shows any parameter of the "
             "model; state the load that will hang ([design] loads_N), or choose other effects"
         )
+    return Estimable(reduction, information.sizes, structure)
+
+
+def _reduced(model: Model, B: Array, free: IntArray, sizes: Array, threshold: float) -> Reduction:
+    """The reduction of B (rows, free), whose columns are scaled by sizes, over all parameters."""
+    parameters = tuple(model.parameters[c] for c in free)
+    local = reduce(B, np.ones(len(free)), parameters, sigma=1.0, threshold=threshold)
     kept, dropped = free[local.kept], free[local.dropped]
     mixing = local.mixing * sizes[kept][:, None] / sizes[dropped][None, :]
-    return Estimable(Reduction(kept, dropped, mixing, free[local.invisible]), sizes)
+    return Reduction(kept, dropped, mixing, free[local.invisible])
 
 
 def interest_of(model: Model, found: Estimable) -> IntArray:
@@ -109,7 +134,12 @@ def interest_of(model: Model, found: Estimable) -> IntArray:
 
 def why(model: Model, found: Estimable, index: int) -> str:
     """Why parameter `index` is not among the kept ones, and what would help."""
-    name, r = model.names[index], found.reduction
+    name, r = model.names[index], found.structure
+    if index in r.kept:
+        return (
+            f"so many poses show less of {name} than their noise, and identification would hold "
+            "it; measure more poses or repeats, or state a prior (--knowledge)"
+        )
     if index in r.invisible:
         return (
             f"no feasible pose shows {name}: it moves no marker in any of them; change the load's "

@@ -46,8 +46,9 @@ def select(
     options: DesignOptions,
     checkpoint: Checkpoint,
     progress: Progress,
+    begun: IntArray | None = None,
 ) -> Selection:
-    """The best plan found and its certificates.
+    """The best plan found and its certificates, never worse than the plan `begun`, if given.
 
     In each round the exact plan is polished off the pool and the continuum is searched for poses
     of larger sensitivity; both join the pool, on which relaxation and exchange run again.  So the
@@ -57,7 +58,7 @@ def select(
     first = len(pool)
     search = _Rounds(setup, searches, shares, options, checkpoint, progress)
     relaxed = search.relax(pool)
-    chosen = search.exchange(pool, relaxed, None, 0)
+    chosen = search.exchange(pool, relaxed, begun, 0)
     effort = EFFORTS[options.effort]
     for k in range(1, effort.rounds + 1):
         grown, chosen = search.polish(pool, chosen, k)

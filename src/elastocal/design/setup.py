@@ -22,16 +22,23 @@ from elastocal.design.parameters import (
 from elastocal.design.problem import DesignProblem
 from elastocal.design.readings import LoadStates
 from elastocal.design.target_poses import TargetPoses
-from elastocal.design.targets import on_kept, prediction_rows, unpredictable
+from elastocal.design.targets import (
+    on_kept,
+    prediction_rows,
+    remaining_bias,
+    unpredictable,
+)
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.manipulator.model import Model
+from elastocal.nearest import listed
 from elastocal.simulation.simulate import draw_errors, values_from
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+WORTH_TELLING = 1e-7  # m
 SCENARIO_STREAM = 1  # of the seed's children; see design.py
 
 
@@ -117,14 +124,15 @@ def set_up(
     information = replace(raw, sizes=sizes)
     prior = _prior(model, known, sizes)
     free = fixed_and_free(model, known.fixed)
-    found = estimable(information, q, load, free, prior)
+    found = estimable(information, q, load, free, prior, n_poses, _stated(model, known))
     kept = found.columns
     information = replace(information, columns=kept, sizes=sizes[kept])
     interest = interest_of(model, found)
-    A = None
+    A, warnings = None, _unseen(model, found, free)
     if spec.criterion in ("test_pose", "I", "G"):
         rows = np.stack([prediction_rows(information, targets, x) for x in scenarios])
         A = on_kept(model, rows, found)
+        warnings += _held(model, found, remaining_bias(rows[0], targets.weight, found))
     criterion = make_criterion(
         spec.criterion,
         parameters=len(kept),
@@ -138,7 +146,7 @@ def set_up(
         robust=spec.robust,
     )
     prior = np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0)
-    return Setup(information, found, criterion, prior, _unseen(model, found, free))
+    return Setup(information, found, criterion, prior, warnings)
 
 
 def _scenarios(model: Model, known: Known, seed: int) -> Array:
@@ -169,6 +177,15 @@ def _prior(model: Model, known: Known, sizes: Array) -> Array:
     return information
 
 
+def _stated(model: Model, known: Known) -> NDArray[np.bool_]:
+    """(parameters,) those of which a size is known beforehand and asked to be counted."""
+    names = () if known.prior is None else known.prior.names
+    typical = model.cell.design.prior == "typical"
+    return np.array(
+        [p.name in names or (typical and p.typical is not None) for p in model.parameters]
+    )
+
+
 def _combination(model: Model, found: Estimable) -> Array | None:
     """The coefficients (kept,) of `[design] combination`, scaled."""
     wanted = model.cell.design.combination
@@ -195,4 +212,16 @@ def _unit(model: Model) -> str:
 
 def _unseen(model: Model, found: Estimable, free: IntArray) -> tuple[str, ...]:
     """A sentence per free parameter that no feasible pose shows at all."""
-    return tuple(why(model, found, int(i)) for i in found.reduction.invisible if i in free)
+    return tuple(why(model, found, int(i)) for i in found.structure.invisible if i in free)
+
+
+def _held(model: Model, found: Estimable, bias: float) -> tuple[str, ...]:
+    """A sentence on what ρ₀ leaves out, where that is worth one."""
+    held = [model.names[c] for c in found.structure.kept if c not in found.columns]
+    if bias < WORTH_TELLING or not held:
+        return ()
+    return (
+        f"so many poses show less of {listed(held)} than their noise; identification holds what it "
+        f"cannot see, and typical deviations of that move the test points by {bias * 1e6:.3g} µm "
+        "rms, which the criterion does not count",
+    )

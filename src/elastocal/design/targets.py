@@ -12,6 +12,7 @@ from elastocal.design.information import PoseInformation
 from elastocal.design.parameters import Estimable, why
 from elastocal.design.target_poses import TargetPoses
 from elastocal.errors import InsufficientDataError
+from elastocal.identification.reduction import Reduction
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
@@ -112,9 +113,23 @@ def on_kept(model: Model, A: Array, found: Estimable) -> Array:
 
 def unpredictable(A: Array, found: Estimable) -> tuple[int, int] | None:
     """A row of A (T, r, parameters) and a parameter by which no plan can predict it, if any."""
-    r, sizes = found.reduction, found.sizes
-    off = np.abs((A[..., r.dropped] - A[..., r.kept] @ r.mixing) * sizes[r.dropped]).max(axis=1)
+    r, sizes = found.structure, found.sizes
+    off = np.abs(_unexplained(A, r, sizes)).max(axis=1)
     if off.max(initial=0.0) <= OUTSIDE * float(np.abs(A * sizes).max()):
         return None
     dropped = int(off.max(axis=0).argmax())
     return int(off[:, dropped].argmax()), int(r.dropped[dropped])
+
+
+def remaining_bias(A: Array, weight: Array, found: Estimable) -> float:
+    """Rms in m of what typical deviations of held parameters move the test points by.
+
+    A (T, r, parameters), `weight` (T,): held are those that the poses show below their noise.
+    """
+    off = _unexplained(A, found.reduction, found.sizes)
+    return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
+
+
+def _unexplained(A: Array, r: Reduction, sizes: Array) -> Array:
+    """(T, r, dropped): A_D − A_K · mixing, times the sizes."""
+    return np.asarray((A[..., r.dropped] - A[..., r.kept] @ r.mixing) * sizes[r.dropped])

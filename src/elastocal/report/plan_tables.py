@@ -23,7 +23,7 @@ SERVES = "serves (standard deviation without it)"
 def print_plan(console: Console, plan: Plan) -> None:
     """Poses in the order of the plan, predicted intervals, and what the plan is worth in words."""
     wide = console.width >= WIDE
-    console.print(pose_table(plan, reasons=wide))
+    console.print(pose_table(plan) if wide else _narrow_poses(console, plan))
     if not wide:
         console.print(reason_table(plan))
     console.print(interval_table(plan))
@@ -35,13 +35,23 @@ def print_plan(console: Console, plan: Plan) -> None:
         console.print(Text.assemble((f"{label}: ", style), text))
 
 
-def pose_table(plan: Plan, reasons: bool = True) -> Table:
+def _narrow_poses(console: Console, plan: Plan) -> Table:
+    """The poses with as many decimals as there is room for; plan.csv has all of them."""
+    room = console.options.update(max_width=WIDE)
+    for decimals in (2, 1):
+        table = pose_table(plan, reasons=False, decimals=decimals)
+        if console.measure(table, options=room).maximum <= console.width:
+            return table
+    return pose_table(plan, reasons=False, decimals=0)
+
+
+def pose_table(plan: Plan, reasons: bool = True, decimals: int = 2) -> Table:
     """Joint values, load, place in the order of execution, and what the pose is there for."""
     table = _table("Poses")
     table.add_column("pose", justify="right")
     for i, kind in enumerate(plan.model.chain.kinds):
         unit = "°" if kind == "revolute" else "mm"
-        table.add_column(f"q{i + 1} {unit}", justify="right")
+        table.add_column(f"q{i + 1} {unit}", justify="right", overflow="fold")
     if len(plan.forces) > 1 and (plan.load >= 0).any():
         table.add_column("load N", justify="right")
     table.add_column("order", justify="right")
@@ -51,7 +61,8 @@ def pose_table(plan: Plan, reasons: bool = True) -> Table:
     for k, reason in enumerate(plan.reasons):
         row = [str(k + 1)]
         for value, kind in zip(plan.q[k], plan.model.chain.kinds, strict=True):
-            row.append(f"{np.degrees(value) if kind == 'revolute' else value * 1e3:.2f}")
+            shown = np.degrees(value) if kind == "revolute" else value * 1e3
+            row.append(f"{shown:.{decimals}f}")
         if len(plan.forces) > 1 and (plan.load >= 0).any():
             row.append(" ".join(f"{f:g}" for f in plan.forces[plan.load[k]]))
         row += [str(order[k]), *([served(reason)] if reasons else [])]

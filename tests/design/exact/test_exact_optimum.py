@@ -7,6 +7,7 @@ import pytest
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
 from elastocal.design.criteria.choose import make_criterion
+from elastocal.design.exact.exchange import exchange
 from elastocal.design.exact.plan import exact_plan
 from elastocal.design.problem import DesignProblem
 from elastocal.design.relaxation.relax import relax
@@ -77,33 +78,55 @@ def medium(name: str, seed: int, most: int = 1, prior: float = 0.0) -> DesignPro
     return DesignProblem(blocks, known, group, np.array([5, 3]), criterion, most)
 
 
-@pytest.mark.parametrize(("most", "prior"), [(1, 0.0), (2, 0.0), (1, 300.0)])
+def neighbours(problem: DesignProblem, chosen) -> np.ndarray:
+    """All plans that differ from `chosen` by one exchange within its group."""
+    found = []
+    for k, out in enumerate(chosen):
+        for into in np.flatnonzero(problem.group == problem.group[out]):
+            plan = np.sort(np.append(np.delete(chosen, k), into))
+            if into != out and (plan == into).sum() <= problem.most:
+                found.append(plan)
+    assert len(found) > 500
+    return np.array(found)
+
+
+@pytest.mark.parametrize("most", [1, 2])
 @pytest.mark.parametrize(
-    ("name", "relaxed"), [*((name, r) for name in CRITERIA for r in (False, True)), ("O2", False)]
+    ("name", "weights"),
+    [*((name, r) for name in CRITERIA for r in ("none", "relaxed", "misleading")), ("O2", "none")],
 )
-def test_no_single_exchange_on_the_whole_pool_betters_the_plan(
-    name, most, prior, relaxed, monkeypatch
-):
-    """With few near candidates, so that most of the pool is seen by the last passes alone; with
-    much known before, where Φ is nearly linear and its bounds leave no slack."""
-    monkeypatch.setattr("elastocal.design.exact.pool.NEAR_PER_POSE", 3)
-    problem = medium(name, 1, most, prior)
-    weights = relax(problem).weights if relaxed else None
-    found = exact_plan(problem, relaxed_weights=weights, starts=1, seed=1)
+def test_no_single_exchange_on_the_whole_pool_betters_the_plan(name, most, weights, monkeypatch):
+    """With few near candidates, so that most of the pool is seen by the last passes alone."""
+    monkeypatch.setattr("elastocal.design.exact.pool.NEAR_PER_POSE", 2)
+    problem = medium(name, 1, most)
+    given = {
+        "none": lambda: None,
+        "relaxed": lambda: relax(problem).weights,
+        "misleading": lambda: np.random.default_rng(0).random(problem.n_candidates) ** 9,
+    }[weights]()
+    found = exact_plan(problem, relaxed_weights=given, starts=1, seed=1)
     taken = np.bincount(problem.group[found.chosen], minlength=2)
     np.testing.assert_array_equal(taken, problem.shares)
     assert np.bincount(found.chosen).max() <= most
-    neighbours = []
-    for k, out in enumerate(found.chosen):
-        for into in np.flatnonzero(problem.group == problem.group[out]):
-            plan = np.append(np.delete(found.chosen, k), into)
-            if (plan == into).sum() <= most:
-                neighbours.append(plan)
-    values = all_values(problem, np.array(neighbours))
-    assert len(neighbours) > 500
+    assert all_values(problem, found.chosen[None])[0] == pytest.approx(found.value, rel=1e-12)
+    values = all_values(problem, neighbours(problem, found.chosen))
     assert values.min() >= found.value * (1 - 2e-9)
     assert found.values[0] == pytest.approx(found.value, rel=1e-9), "a start ends at an optimum"
-    assert all_values(problem, found.chosen[None])[0] == pytest.approx(found.value, rel=1e-12)
+
+
+@pytest.mark.parametrize("prior", [0.0, 300.0])
+@pytest.mark.parametrize("name", CRITERIA)
+def test_the_smallest_gains_are_made(name, prior):
+    """From plans just above an optimum; with much known before, Φ is nearly linear, its bounds
+    leave no slack, and gains are of 1e-4."""
+    problem = medium(name, 5, prior=prior)
+    best = exact_plan(problem, starts=1).chosen
+    near = neighbours(problem, best)
+    for begun in near[np.argsort(all_values(problem, near))[:5]]:
+        found = exchange(problem, begun)
+        assert found.value < all_values(problem, begun[None])[0]
+        values = all_values(problem, neighbours(problem, found.chosen))
+        assert values.min() >= found.value * (1 - 2e-9)
 
 
 @pytest.mark.parametrize("name", CRITERIA)

@@ -7,6 +7,8 @@ import pytest
 from small_pools import all_plans, all_values, random_problem
 
 from elastocal.design.criteria.choose import make_criterion
+from elastocal.design.exact import plan as module
+from elastocal.design.exact.exchange import Exchanged
 from elastocal.design.exact.size_curve import size_curve
 from elastocal.design.problem import DesignProblem
 from elastocal.errors import InputError, InsufficientDataError
@@ -41,7 +43,6 @@ def test_the_curve_falls_and_stays_above_its_bound():
 
 def test_the_curve_falls_even_where_the_search_for_the_larger_plan_finds_nothing(monkeypatch):
     """With random plans and no exchange, only the extension of the smaller plan keeps order."""
-    from elastocal.design.exact import plan as module
 
     def lame(pool, k, seed, begun=None):
         rng = np.random.default_rng(pool.problem.n_poses)
@@ -49,7 +50,12 @@ def test_the_curve_falls_even_where_the_search_for_the_larger_plan_finds_nothing
         M = pool.problem.prior + pool.problem.sum_of(chosen)
         return module.Finished(pool.kept[chosen], float(pool.problem.criterion.value(M)), 0)
 
+    def unmoved(problem, chosen):
+        M = problem.prior + problem.sum_of(chosen)
+        return Exchanged(chosen, float(problem.criterion.value(M)), 0)
+
     monkeypatch.setattr(module, "_start", lame)
+    monkeypatch.setattr(module, "exchange", unmoved)
     points = size_curve(problem_of(seed=4), range(4, 12), starts=1).points
     assert (np.diff([p.value for p in points]) < 0).all()
 

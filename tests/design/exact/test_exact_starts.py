@@ -8,6 +8,7 @@ from small_pools import random_problem
 
 from elastocal.design.criteria.choose import make_criterion
 from elastocal.design.exact.plan import exact_plan
+from elastocal.design.exact.regular import regular_plan
 from elastocal.design.problem import DesignProblem
 from elastocal.errors import InputError, InsufficientDataError
 
@@ -150,21 +151,25 @@ def test_the_only_plan_that_determines_all_is_found(name):
     assert np.isfinite(found.value)
 
 
-def test_a_regular_plan_is_found_where_no_exchange_leads_to_it():
-    """Ten large candidates span e1 and a direction of (e3, e4); only the two small others, (e1, e2)
-    and (e3, e4), make rank 4 together, and neither adds rank to any of the ten."""
+@pytest.mark.parametrize("large", [1.0, 1e3])
+def test_a_regular_plan_is_found_where_no_exchange_leads_to_it(large):
+    """Ten candidates span e1 and a direction of (e3, e4) each; only the last two make rank 4
+    together.  Neither adds rank to any of the ten, nor as much volume as one of the ten."""
     blocks = np.zeros((1, 12, 2, 4))
     for k in range(10):
-        blocks[0, k, 0, 0] = 10.0
-        blocks[0, k, 1, 2:] = 10.0 * np.cos(k), 10.0 * np.sin(k)
-    blocks[0, 10, :, :2] = 0.1 * np.eye(2)
-    blocks[0, 11, :, 2:] = 0.1 * np.eye(2)
+        blocks[0, k, 0, 0] = large
+        angle = np.pi * (k + 0.5) / 10
+        blocks[0, k, 1, 2:] = large * np.cos(angle), large * np.sin(angle)
+    blocks[0, 10] = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.1, 0.8, 0.6]]
+    blocks[0, 11] = [[0.0, 0.0, 1.0, 0.0], [0.3, 0.0, 0.0, 1.0]]
     criterion = make_criterion("D", parameters=4, interest=np.arange(4))
     problem = DesignProblem(
         blocks, np.zeros((1, 4, 4)), np.zeros(12, dtype=int), np.array([2]), criterion
     )
-    for seed in range(5):
-        np.testing.assert_array_equal(exact_plan(problem, starts=3, seed=seed).chosen, [10, 11])
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        np.testing.assert_array_equal(regular_plan(problem, np.array([2, 7]), rng), [10, 11])
+        np.testing.assert_array_equal(exact_plan(problem, starts=2, seed=seed).chosen, [10, 11])
 
 
 def test_too_few_poses_for_any_regular_plan_say_so():

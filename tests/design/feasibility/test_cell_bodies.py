@@ -9,7 +9,8 @@ from support.robots import packaged_urdf
 
 from elastocal.cell import Nominal, Robot
 from elastocal.cell_workspace import CarriedBody, HangingLoad, Solid, Workspace
-from elastocal.design.feasibility.bodies import HANGING, WORLD, cell_bodies
+from elastocal.design.feasibility.bodies import cell_bodies
+from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.shapes import hull, support
 from elastocal.errors import InputError
 from elastocal.manipulator.urdf import read_urdf

@@ -13,7 +13,7 @@ from support.robots import random_chain_urdf
 
 from elastocal.cell import Nominal, Tool
 from elastocal.cell_workspace import Workspace
-from elastocal.design.feasibility.bodies import HANGING, WORLD
+from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.collision import arm_configuration, arm_model
 from elastocal.design.feasibility.frames import Kinematics
 from elastocal.manipulator.model import Model

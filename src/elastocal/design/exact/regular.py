@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from elastocal.design.criteria.factor import SINGULAR, factorise
@@ -9,9 +11,11 @@ from elastocal.design.exact.pool import admissible, random_plan, without
 from elastocal.design.problem import Array, DesignProblem, IntArray
 from elastocal.errors import InsufficientDataError
 
-# Ridges, as shares of the pool's mean information, under which a regular plan is looked for.
+# Ridges, as shares of a candidate's mean information, under which a regular plan is looked for.
 RIDGES = (1e-3, 1e-6, 1e-9)
 ATTEMPTS = 20
+# Singular values of a block, relative to its largest, below which a direction is not shown.
+SHOWN = 1e-10
 
 
 def is_regular(M: Array) -> bool:
@@ -65,26 +69,37 @@ def ridge(problem: DesignProblem) -> Array:
 
 
 def regular_plan(problem: DesignProblem, chosen: IntArray, rng: np.random.Generator) -> IntArray:
-    """A plan of regular M near `chosen`: exchanges that raise Σ_s log det(M_s + δ ridge), δ → 0.
+    """A plan of regular M near `chosen`: exchanges that raise Σ_s log det(M_s + δ), δ → 0.
 
-    Large δ leads to well-conditioned plans.  Where they are of lower rank, random plans follow and
-    only the smallest δ, under which a determinant counts the rank first.  Raises
-    InsufficientDataError where none of them becomes regular.
+    For small δ a determinant counts the rank first.  Each candidate stands with an orthonormal
+    basis of what it shows, which leaves ranks as they are and lets no large candidate outweigh
+    one that shows what the others do not.  Random plans are tried where `chosen` leads to none;
+    raises InsufficientDataError where they do not either.
     """
-    unit, ridges = ridge(problem), RIDGES
+    if is_regular(problem.prior + problem.sum_of(chosen)):
+        return chosen
+    even = _evened(problem)
+    unit = np.eye(problem.blocks.shape[-1])
     for _ in range(ATTEMPTS):
-        for delta in ridges:
+        for delta in RIDGES:
+            chosen = _raise_determinant(even, chosen, delta * unit)
             if is_regular(problem.prior + problem.sum_of(chosen)):
                 return chosen
-            chosen = _raise_determinant(problem, chosen, delta * unit)
-        if is_regular(problem.prior + problem.sum_of(chosen)):
-            return chosen
-        chosen, ridges = random_plan(problem, rng), RIDGES[-1:]
-    p = problem.blocks.shape[-1]
+        chosen = random_plan(problem, rng)
     raise InsufficientDataError(
-        f"no plan of {problem.n_poses} poses that determines all {p} parameters was found; plan "
-        "more poses, other shares, or state a prior"
+        f"no plan of {problem.n_poses} poses that determines all {len(unit)} parameters was found; "
+        "plan more poses, other shares, or state a prior"
     )
+
+
+def _evened(problem: DesignProblem) -> DesignProblem:
+    """The problem with an orthonormal basis of its rows in place of each block, parameters in
+    units of their mean information beforehand."""
+    scale = 1 / np.sqrt(np.einsum("spp->sp", ridge(problem) + problem.prior))
+    _, size, basis = np.linalg.svd(problem.blocks * scale[:, None, None, :], full_matrices=False)
+    shown = size > SHOWN * size[..., :1]
+    prior = problem.prior * scale[:, :, None] * scale[:, None, :]
+    return replace(problem, blocks=basis * shown[..., None], prior=prior)
 
 
 def _raise_determinant(problem: DesignProblem, chosen: IntArray, extra: Array) -> IntArray:

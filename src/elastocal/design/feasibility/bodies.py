@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from elastocal.cell import Cell
 from elastocal.cell_workspace import CarriedBody, HangingLoad, Solid
+from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.shapes import capsule_between, support
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
@@ -23,8 +24,6 @@ from elastocal.nearest import did_you_mean, listed
 Array = NDArray[np.float64]
 Kind = Literal["arm", "carried", "load", "rope", "obstacle"]
 
-WORLD = -1  # fixed in the data's frame
-HANGING = -2  # at the load point, axes parallel to the data's frame
 UP = np.array([0.0, 0.0, 1.0])
 
 

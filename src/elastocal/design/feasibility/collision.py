@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell_workspace import HalfSpace
-from elastocal.design.feasibility.bodies import HANGING, WORLD, Body
+from elastocal.design.feasibility.bodies import Body
+from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.frames import Kinematics, Poses
 from elastocal.design.feasibility.pairs import Pair
 from elastocal.design.feasibility.shapes import coal_shape

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.design.feasibility.bodies import HANGING, WORLD, Body
+from elastocal.design.feasibility.bodies import Body
+from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.frames import Kinematics, Poses
 from elastocal.design.feasibility.pairs import Pair
 from elastocal.design.feasibility.shapes import few_points

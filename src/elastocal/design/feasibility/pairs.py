@@ -10,7 +10,8 @@ import numpy as np
 
 from elastocal.cell import Cell
 from elastocal.cell_workspace import HalfSpace, Workspace
-from elastocal.design.feasibility.bodies import WORLD, Body, distal_placements
+from elastocal.design.feasibility.bodies import Body, distal_placements
+from elastocal.design.feasibility.carriers import WORLD
 from elastocal.design.feasibility.shapes import hull, touches
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell_workspace import Solid
-from elastocal.design.feasibility.bodies import WORLD, Body
+from elastocal.design.feasibility.bodies import Body
+from elastocal.design.feasibility.carriers import WORLD
 from elastocal.design.feasibility.collision import Collisions
 from elastocal.design.feasibility.frames import Kinematics, Poses
 from elastocal.design.feasibility.pairs import Pair

@@ -9,7 +9,7 @@ import numpy as np
 
 from elastocal.cell import Cell
 from elastocal.cell_workspace import Solid
-from elastocal.design.feasibility.bodies import WORLD
+from elastocal.design.feasibility.carriers import WORLD
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from elastocal.cell import Cell
 from elastocal.cell_workspace import HalfSpace
-from elastocal.design.feasibility.bodies import HANGING, WORLD, Body, data_base
+from elastocal.design.feasibility.bodies import Body, data_base
+from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.contact_rules import POSE_SLACK
 from elastocal.design.feasibility.pairs import Pair
 from elastocal.design.feasibility.shapes import few_points

@@ -87,7 +87,7 @@ def setup_of(
     seed: int = 0,
     load: NDArray | None = None,
     targets: TargetPoses | None = None,
-    n_poses: int = 15,
+    n_poses: int = 10**9,  # so many show whatever can be shown
 ) -> Setup:
     """What a design knows before it chooses among candidates q (N, n)."""
     chain = chain or kr270_chain()

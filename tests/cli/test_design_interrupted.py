@@ -1,0 +1,186 @@
+"""An interrupted design goes on where it was, and ends as if nothing had happened."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from support.design_commands import (
+    DEFLECTION,
+    altered,
+    design,
+    elastocal,
+    everything_in,
+    write_cell,
+)
+
+from elastocal.design import select
+from elastocal.design.checkpoint import Stage
+
+GOING_ON = "going on with the design that was interrupted"
+# A child may inherit that SIGINT is ignored; here it must not.
+PROGRAM = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from elastocal.cli import main; main()"
+)
+STAGES = ("candidates", "exchange0", "polish1", "continuum1", "exchange1")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """plan.csv of the design that is not interrupted, by its seed."""
+    folder = tmp_path_factory.mktemp("whole")
+    cell = write_cell(folder)
+    plans = {}
+    for seed in (0, 1):
+        assert design(cell, "--seed", seed).exit_code == 0
+        plans[seed] = (folder / "plan.csv").read_bytes()
+    return plans
+
+
+def interrupt_after(monkeypatch, saves):
+    """Ctrl-C right after so many states were saved."""
+    save, count = Stage.save, [0]
+
+    def saving(self, state):
+        save(self, state)
+        count[0] += 1
+        if count[0] == saves:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Stage, "save", saving)
+
+
+def interrupted(cell, monkeypatch, saves, *extra):
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, saves)
+        result = design(cell, *extra)
+    assert result.exit_code == 130
+    assert result.stderr == "elastocal: interrupted\n"
+    assert everything_in(cell.parent) == ["cell.toml", "plan.csv.resume"]
+
+
+@pytest.mark.parametrize("saves", [1, 3])
+def test_it_goes_on_and_ends_with_the_same_plan(tmp_path, monkeypatch, whole, saves):
+    cell = write_cell(tmp_path)
+    interrupted(cell, monkeypatch, saves)
+    result = design(cell, quiet=False)
+    assert result.exit_code == 0 and GOING_ON in result.stderr
+    assert "drawing candidates" not in result.stderr
+    assert (tmp_path / "plan.csv").read_bytes() == whole[0]
+    assert everything_in(tmp_path) == ["cell.toml", "plan.csv", "plan.json"]
+
+
+def test_another_seed_starts_anew(tmp_path, monkeypatch, whole):
+    cell = write_cell(tmp_path)
+    interrupted(cell, monkeypatch, 2)
+    result = design(cell, "--seed", "1", quiet=False)
+    assert result.exit_code == 0 and GOING_ON not in result.stderr
+    assert (tmp_path / "plan.csv").read_bytes() == whole[1]
+    assert everything_in(tmp_path) == ["cell.toml", "plan.csv", "plan.json"]
+
+
+def test_an_edited_cell_starts_anew(tmp_path, monkeypatch):
+    cell = write_cell(tmp_path)
+    interrupted(cell, monkeypatch, 2)
+    write_cell(tmp_path, altered(DEFLECTION, poses="4"))
+    result = design(cell, quiet=False)
+    assert result.exit_code == 0 and GOING_ON not in result.stderr
+    assert len((tmp_path / "plan.csv").read_text().splitlines()) == 5
+
+
+def test_a_refused_run_in_between_throws_nothing_away(tmp_path, monkeypatch, whole):
+    cell = write_cell(tmp_path)
+    interrupted(cell, monkeypatch, 2)
+    assert design(cell, "--target", "0.01").exit_code == 1
+    assert design(cell, "--fix", "nothing").exit_code == 2
+    result = design(cell, quiet=False)
+    assert result.exit_code == 0 and GOING_ON in result.stderr
+    assert (tmp_path / "plan.csv").read_bytes() == whole[0]
+
+
+def test_a_curve_is_kept_too(tmp_path, monkeypatch):
+    cell = write_cell(tmp_path)
+    options = ("--curve", "3,4", "--poses", "4")
+    interrupted(cell, monkeypatch, 2, *options)
+    result = design(cell, *options, quiet=False)
+    assert result.exit_code == 0 and "4 poses: " not in result.stderr
+    resumed = (tmp_path / "plan.json").read_text("utf-8")
+    assert design(cell, *options).exit_code == 0
+    assert (tmp_path / "plan.json").read_text("utf-8") == resumed
+
+
+def test_an_interrupt_that_a_solver_catches_is_not_lost(tmp_path, monkeypatch):
+    """CasADi catches it inside IPOPT and returns a search cut short, which must not be kept."""
+    polish = select.polish
+
+    def interrupted_polish(*arguments, **options):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            options["progress"] = lambda message: None
+        return polish(*arguments, **options)
+
+    cell = write_cell(tmp_path, altered(DEFLECTION, poses="2", candidates="20"))
+    arguments = ("design", cell, "-o", tmp_path / "plan.csv", "-q")
+    with monkeypatch.context() as patch:
+        patch.setattr(select, "polish", interrupted_polish)
+        result = elastocal(*arguments)
+    assert result.exit_code == 130
+    (state,) = (tmp_path / "plan.csv.resume").iterdir()
+    assert everything_in(state) == ["candidates.npz", "exchange0.npz"]
+
+
+def stopped(cell, output, stage, number):
+    """Exit code and stderr of a process that gets a signal once a stage is saved."""
+    arguments = ["design", str(cell), "-o", str(cell.parent / output), "--effort"]
+    effort = "quick" if stage in STAGES[:2] else "normal"
+    command = [sys.executable, "-c", PROGRAM, *arguments, effort]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        folder = cell.parent / f"{output}.resume"
+        while not list(folder.glob(f"*/{stage}.npz")):
+            assert process.poll() is None, process.stderr.read().decode()
+            time.sleep(0.01)
+        process.send_signal(number)
+        told = process.communicate()[1].decode()
+    return process.returncode, told
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_process_that_is_stopped(tmp_path, whole, number):
+    cell = write_cell(tmp_path)
+    code, told = stopped(cell, "plan.csv", "candidates", number)
+    if number == signal.SIGINT:
+        assert code == 130
+        assert told.endswith("elastocal: interrupted\n") and "Traceback" not in told
+    else:
+        assert code == -signal.SIGKILL
+    assert everything_in(tmp_path) == ["cell.toml", "plan.csv.resume"]
+    result = design(cell, quiet=False)
+    assert result.exit_code == 0 and GOING_ON in result.stderr
+    assert (tmp_path / "plan.csv").read_bytes() == whole[0]
+    assert everything_in(tmp_path) == ["cell.toml", "plan.csv", "plan.json"]
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("stage", STAGES[2:])
+def test_a_process_that_is_stopped_in_any_stage(tmp_path, stage, number):
+    cell = write_cell(tmp_path)
+    code, _ = stopped(cell, "plan.csv", stage, number)
+    assert code == (130 if number == signal.SIGINT else -signal.SIGKILL)
+    plans = []
+    for output in ("plan.csv", "whole.csv"):
+        assert elastocal("design", cell, "-o", tmp_path / output, "-q").exit_code == 0
+        plans.append((tmp_path / output).read_bytes())
+    assert plans[0] == plans[1]
+
+
+def test_the_command_line_does_not_wait_for_what_help_does_not_need():
+    heavy = ("casadi", "pinocchio", "cvxpy", "scipy.stats", "pandas", "matplotlib", "numpy")
+    code = f"import sys, elastocal.cli; print([m for m in {heavy} if m in sys.modules])"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout == "[]\n"
