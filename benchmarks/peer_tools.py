@@ -41,6 +41,10 @@ class Row:
     def wall(self) -> float:
         return self.took.wall if self.took else 0.0
 
+    @property
+    def cpu(self) -> float:
+        return self.took.cpu if self.took else 0.0
+
 
 def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
     wall, cpu = time.perf_counter(), time.process_time()

@@ -18,18 +18,16 @@ from elastocal.design.exact.size_curve import size_curve
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space
 from elastocal.design.options import EFFORTS, DesignOptions
-from elastocal.design.order.blockers import Blockers
-from elastocal.design.order.schedule import schedule
+from elastocal.design.ordered import ordered
 from elastocal.design.plan import Candidates, Plan, SizePoint
 from elastocal.design.polish.searches import Searches
-from elastocal.design.readings import load_states
+from elastocal.design.readings import load_states, readings_each
 from elastocal.design.reasons import predicted, reasons
 from elastocal.design.select import Selection, select
 from elastocal.design.setup import Known, Pool, Setup, set_up
 from elastocal.design.shares import check_available, most_poses, shares_of
 from elastocal.design.target_poses import test_poses
 from elastocal.errors import InsufficientDataError, require
-from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
 from elastocal.nearest import did_you_mean, listed, quoted
 
@@ -38,7 +36,6 @@ IntArray = NDArray[np.int64]
 Progress = Callable[[str], None]
 
 MOST_POSES = 100  # that a target is sought with
-VIA = 200  # candidates through which a blocked move may go
 
 
 def design(
@@ -207,27 +204,17 @@ class _Design:
         self, setup: Setup, found: Selection, shares: IntArray, counts: Candidates, targets: str,
         curve: tuple[SizePoint, ...], done: object,
     ) -> Plan:  # fmt: skip
-        pool, chosen = found.pool, found.chosen
-        # In the order of levels, so that the table reads like Table 2.
-        chosen = chosen[np.lexsort((chosen, pool.group[chosen]))]
-        q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
         self.progress("order of execution")
+        found, execution, told = ordered(
+            setup, found, shares, self.feasibility, self.options.seed, self.progress
+        )
+        self.warnings += told
+        pool, chosen = found.pool, found.chosen
+        q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
         spec = self.cell.design
-        execution = schedule(
-            q, spec.motion, self.feasibility,
-            loads=self.states.forces,
-            load=load if self.states.chosen else None,
-            limits=joint_limits(self.cell, self.chain),
-            via=pool.q[:: max(len(pool) // VIA, 1)],
-            blockers=Blockers(self.feasibility),
-            seed=self.options.seed, progress=self.progress,
-        )  # fmt: skip
-        if execution.one_sided:
-            told = ", ".join(str(k + 1) for k in execution.one_sided)
-            self.warnings.append(f"approached from one side only, as the other is blocked: {told}")
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
-        numbers = blocks.shape[1] * blocks.shape[2] * spec.repeats
+        numbers = blocks.shape[1] * blocks.shape[2] * readings_each(self.cell)
         numbers += getattr(done, "numbers", 0)
         value, unit = setup.criterion.reported(found.value)
         bound = found.certificate.bound_pool

@@ -128,9 +128,10 @@ def pose_covariance(model: Model, seen: Observations, n_poses: int, states: Load
 
     Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction: deflections share their unloaded
     reading, and what the arm does not repeat (τ, `[design] repeatability_um`) is common to the
-    markers of a visit.
+    markers of a visit.  A pose that is approached from both sides is visited twice.
     """
     spec = model.cell.design
+    visits = 2 if spec.motion.both_directions else 1
     single = reading_covariance(model, seen) / spec.repeats
     size, rows = single.shape[1], len(seen.table) // n_poses
     full = np.zeros((n_poses, rows, size, rows, size))
@@ -146,4 +147,9 @@ def pose_covariance(model: Model, seen: Observations, n_poses: int, states: Load
         same = (force[:, None] == force[None]).all(axis=2).astype(float)
         moved = np.diag(np.arange(size) < 3).astype(float)
         covariance = covariance + spec.repeatability**2 * np.kron(same, moved)
-    return covariance
+    return covariance / visits
+
+
+def readings_each(cell: Cell) -> int:
+    """How often a plan reads each pose in each load state: repeats, from one side or from both."""
+    return cell.design.repeats * (2 if cell.design.motion.both_directions else 1)

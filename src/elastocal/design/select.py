@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +28,41 @@ Progress = Callable[[str], None]
 class Selection:
     """The plan as indices `chosen` (k,) into the `pool`, which has grown; Φ `value`.
 
-    `polished`: poses of the plan that came from local searches and not from the first pool.
+    From index `first` on the pool holds what came from local searches and the continuum.
     """
 
     pool: Pool
     chosen: IntArray
     value: float
     certificate: Certificate
-    polished: int
+    first: int
+
+    @property
+    def polished(self) -> int:
+        """Poses of the plan that are not candidates of the first pool."""
+        return int((self.chosen >= self.first).sum())
+
+    def without(self, lost: IntArray, setup: Setup, shares: IntArray) -> Selection:
+        """The best plan found without the candidates `lost`, from what is left of this one.
+
+        The bounds hold: those of a pool are those of every part of it.
+        """
+        kept = np.setdiff1d(np.arange(len(self.pool)), lost)
+        pool = self.pool.take(kept)
+        left = np.searchsorted(kept, np.setdiff1d(self.chosen, lost))
+        found = exact_plan(setup.problem(pool, shares), warm=left, starts=1)
+        c = self.certificate
+        worse = self.value / found.value
+        certificate = replace(
+            c,
+            pool=len(pool),
+            efficiency_pool=None if c.efficiency_pool is None else c.efficiency_pool * worse,
+            efficiency_continuum=None
+            if c.efficiency_continuum is None
+            else c.efficiency_continuum * worse,
+        )
+        first = self.first - int((lost < self.first).sum())
+        return Selection(pool, found.chosen, found.value, certificate, first)
 
 
 def select(
@@ -67,7 +94,7 @@ def select(
         chosen = search.exchange(pool, relaxed, chosen, k)
     value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
     certificate = search.certificate(pool, relaxed, value)
-    return Selection(pool, chosen, value, certificate, int((chosen >= first).sum()))
+    return Selection(pool, chosen, value, certificate, first)
 
 
 @dataclass(frozen=True)

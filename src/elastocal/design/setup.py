@@ -67,6 +67,9 @@ class Pool:
     def n_groups(self) -> int:
         return int(self.group.max()) + 1
 
+    def take(self, kept: IntArray) -> Pool:
+        return Pool(self.q[kept], self.load[kept], self.group[kept], self.blocks[:, kept])
+
     def joined(self, other: Pool) -> Pool:
         return Pool(
             np.vstack([self.q, other.q]),

@@ -23,16 +23,11 @@ def is_regular(M: Array) -> bool:
     return bool((factorise(M).condition < SINGULAR / 10).all())
 
 
-def fewest_poses(problem: DesignProblem) -> int:
-    """The smallest number of poses that gives as many equations as there are parameters."""
-    _, _, r, p = problem.blocks.shape
-    return -(-(p - _known(problem)) // r)
-
-
 def check_enough(problem: DesignProblem) -> None:
     """Raise InsufficientDataError where no plan of these shares can determine all parameters."""
     _, _, r, p = problem.blocks.shape
-    n, known, needed = problem.n_poses, _known(problem), fewest_poses(problem)
+    n, known = problem.n_poses, _known(problem)
+    needed = -(-(p - known) // r)
     if n < needed:
         prior = f" and the prior {known}" if known else ""
         raise InsufficientDataError(

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 from elastocal.design.exact.exchange import IMPROVEMENT
 from elastocal.design.exact.plan import ExactPlan, Progress, exact_plan
-from elastocal.design.exact.regular import fewest_poses
 from elastocal.design.problem import DesignProblem
 from elastocal.design.relaxation.relax import Relaxed, relax
 from elastocal.errors import InsufficientDataError, require
@@ -55,9 +54,10 @@ def size_curve(
 
     `problem_of(n)` states the problem of n poses, on the same candidates for all n.  Where no
     group's share falls with n, Φ of the points does not rise: the smaller plan, extended, is one
-    of the starts of the larger.  The bound falls with n too; bisection finds the first n in
-    `between` at which it allows the target.  From there plans are sought with doubled steps, then
-    between the last that failed and the first that met it.
+    of the starts of the larger (O2 and O4, which more information may raise, excepted).  The
+    bound falls with n too; bisection finds the first n in `between` at which it allows the target.
+    From there plans are sought with doubled steps, then between the last that failed and the
+    first that met it.
 
     Raises InputError for no number and no target, an empty range, or a target that is not
     positive; InsufficientDataError where no plan of one of `numbers` determines all parameters.
@@ -73,7 +73,7 @@ def size_curve(
     require(1 <= low <= high, f"no number of poses lies between {low} and {high}")
     require(target > 0, f"the target must be positive, got {target}")
     allowed = _first_with(lambda n: (sizes.bound(n) or 0.0) <= target, low, high + 1)
-    _seek(sizes, target, max(allowed, fewest_poses(problem_of(high))), high)
+    _seek(sizes, target, allowed, high)
     points = sizes.points()
     smallest = min((p.n_poses for p in points if p.value <= target), default=None)
     return SizeCurve(points, smallest, allowed - 1)

@@ -14,14 +14,23 @@ from elastocal.design.order.visits import Costs
 from elastocal.errors import InsufficientDataError
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 # The bodies in the way of the straight move between two joint vectors (n,), with or without load.
 Blockers = Callable[[Array, Array, bool], Sequence[str]]
 
 MOST_NAMED = 3
 
 
+class Unreachable(InsufficientDataError):
+    """Some poses of a plan cannot be reached: `poses` are their indices."""
+
+    def __init__(self, message: str, poses: IntArray) -> None:
+        super().__init__(message)
+        self.poses = poses
+
+
 def check_reachable(moves: Moves, blockers: Blockers | None) -> None:
-    """Raise InsufficientDataError for a pose that cannot be approached from either side, where
+    """Raise Unreachable for a pose that cannot be approached from either side, where
     it has to be, or that no chain of free moves joins to the others (or home) of its load state."""
     for roadmap in moves.maps:
         here = moves.loaded[moves.visits.load] == roadmap.loaded
@@ -35,7 +44,7 @@ def check_reachable(moves: Moves, blockers: Blockers | None) -> None:
             continue
         _, *lost = roadmap.parts(needed)
         if lost:
-            raise InsufficientDataError(_unreachable(moves, roadmap, lost[0], blockers))
+            raise _unreachable(moves, roadmap, lost[0], blockers)
 
 
 def _check_approaches(
@@ -43,36 +52,40 @@ def _check_approaches(
 ) -> None:
     for v in np.flatnonzero(here & ~np.isfinite(moves.visits.inside).any(axis=1)):
         pose, (below, above) = int(moves.visits.leave[v]), moves.visits.entry[v].tolist()
-        raise InsufficientDataError(
+        raise Unreachable(
             f"{_name(moves, pose)} cannot be approached{_carrying(roadmap)}, neither from below"
             f"{_in_the_way(roadmap, below, pose, blockers)} nor from above"
             f"{_in_the_way(roadmap, above, pose, blockers)}; lower overshoot_deg in "
-            "[design.motion], or raise clearance_mm in [workspace]"
+            "[design.motion], or raise clearance_mm in [workspace]",
+            moves.visits.pose[[v]],
         )
 
 
 def refuse_impossible(
     moves: Moves, tour: list[int], costs: Costs, blockers: Blockers | None
 ) -> None:
-    """Raise InsufficientDataError where the tour holds a move for which no way is left."""
+    """Raise Unreachable where the tour holds a move for which no way is left."""
     for u, v in pairwise([0, *tour, 0]):
         roadmap, way = moves.way(u, v, costs)
         if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
             lost = [int(moves.visits.leave[(v or u) - 1])]
-            raise InsufficientDataError(_unreachable(moves, roadmap, lost, blockers))
+            raise _unreachable(moves, roadmap, lost, blockers)
 
 
-def _unreachable(moves: Moves, roadmap: Roadmap, lost: list[int], blockers: Blockers | None) -> str:
+def _unreachable(
+    moves: Moves, roadmap: Roadmap, lost: list[int], blockers: Blockers | None
+) -> Unreachable:
     named = ", ".join(_name(moves, point) for point in lost[:MOST_NAMED])
     more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
     others = np.setdiff1d(np.arange(len(moves.points)), lost)
     between = moves.times[lost][:, others]
     i, j = np.unravel_index(int(np.argmin(between)), between.shape)
     by = _in_the_way(roadmap, int(others[j]), lost[int(i)], blockers)
-    return (
+    return Unreachable(
         f"{named}{more} cannot be reached{_carrying(roadmap)} by collision-free joint moves, "
         f"neither directly nor through home and other poses{by}; give "
-        "another home in [design.motion], free the way, or narrow [limits] to exclude such poses"
+        "another home in [design.motion], free the way, or narrow [limits] to exclude such poses",
+        np.unique(moves.visits.pose[np.isin(moves.visits.leave, lost)]),
     )
 
 
