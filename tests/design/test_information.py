@@ -90,6 +90,14 @@ def test_a_configuration_effect_bounds_what_repeats_can_tell() -> None:
     assert relative(gathered(found, TABLE_2), B.T @ B / tau**2) < 1e-4
 
 
+def test_both_directions_are_two_visits() -> None:
+    once = cell_for("deflection", AXIS, loads=DOWN[None], repeatability=40e-6)
+    motion = replace(once.design.motion, both_directions=True)
+    twice = replace(once, design=replace(once.design, motion=motion))
+    found = gathered(information_of(twice), TABLE_2)
+    assert relative(found, 2 * gathered(information_of(once), TABLE_2)) < 1e-12
+
+
 def test_markers_have_their_own_noise_where_stated() -> None:
     sigmas = {"M1": 10e-6, "M2": 20e-6, "M3": 40e-6}
     cell = cell_for("position", None, marker_sigma=sigmas)

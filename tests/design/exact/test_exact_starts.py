@@ -172,6 +172,24 @@ def test_a_regular_plan_is_found_where_no_exchange_leads_to_it(large):
         np.testing.assert_array_equal(exact_plan(problem, starts=2, seed=seed).chosen, [10, 11])
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_a_nuisance_parameter_that_no_near_candidate_shows_is_determined(given, monkeypatch):
+    """Candidates 0 and 1 show the last parameter and nothing else: worthless but indispensable."""
+    monkeypatch.setattr("elastocal.design.exact.pool.NEAR_PER_POSE", 2)
+    blocks = np.random.default_rng(0).normal(size=(1, 40, 2, 5))
+    blocks[..., 4] = 0.0
+    blocks[:, :2] = 0.0
+    blocks[:, :2, 0, 4] = 1.0
+    criterion = make_criterion("D", parameters=5, interest=np.arange(4))
+    problem = DesignProblem(
+        blocks, np.zeros((1, 5, 5)), np.zeros(40, dtype=int), np.array([4]), criterion
+    )
+    weights = np.full(40, 0.1) if given else None
+    found = exact_plan(problem, relaxed_weights=weights, starts=4)
+    assert (found.chosen < 2).sum() == 1
+    assert np.isfinite(found.values).all()
+
+
 def test_too_few_poses_for_any_regular_plan_say_so():
     """Enough equations in number, but two poses of a kind see only two of four parameters each."""
     blocks = np.zeros((1, 12, 3, 6))

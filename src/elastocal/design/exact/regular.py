@@ -57,9 +57,11 @@ def log_det_gain(M: Array, blocks: Array) -> Array:
 def ridge(problem: DesignProblem) -> Array:
     """Diagonal matrices (S, p, p): the mean information of the candidates, parameter by parameter.
 
-    Parameters that differ in scale by orders of magnitude are so treated alike.
+    Parameters that differ in scale by orders of magnitude are so treated alike; 1 where no
+    candidate shows a parameter.
     """
     mean = np.einsum("snrp,snrp->sp", problem.blocks, problem.blocks) / problem.n_candidates
+    mean = np.where(mean > 0, mean, 1.0)
     return np.asarray(mean[:, :, None] * np.eye(mean.shape[1]))
 
 

@@ -99,7 +99,10 @@ def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
             StaticTorque(cell, chain),
             tuple(f"joint{i + 1}" for i in range(len(bound))),
         )
-        yield Bound("torque", torque, -bound, bound, labels, "a torque_limits_Nm", ("N m",))
+        yield Bound(
+            "torque", lambda p: np.abs(torque(p)), np.zeros(len(bound)), bound, labels,
+            "a torque_limits_Nm", ("N m",),
+        )  # fmt: skip
 
 
 def _line_of_sight(cell: Cell, kinematics: Kinematics, bodies: Sequence[Body]) -> Iterator[Rule]:
