@@ -32,11 +32,12 @@ def greedy_plan(problem: DesignProblem, begun: IntArray | None = None) -> IntArr
 
 
 def fitted(problem: DesignProblem, chosen: IntArray) -> IntArray:
-    """A plan (n_poses,) of these shares from one of others.
+    """A plan (n_poses,), sorted, of these shares from one of others.
 
     Where a group holds more than its share, the poses that Φ misses least go; then `greedy_plan`
     fills up.  Where no share is smaller than before the result is therefore never worse.
     """
+    chosen = np.sort(chosen)
     while True:
         taken = np.bincount(problem.group[chosen], minlength=len(problem.shares))
         surplus = np.flatnonzero((taken > problem.shares)[problem.group[chosen]])
