@@ -121,6 +121,7 @@ class _Rounds:
         found = exact_plan(
             self.setup.problem(pool, self.shares),
             relaxed_weights=None if relaxed is None else relaxed.weights,
+            tangent=None if relaxed is None else relaxed.tangent,
             warm=warm,
             starts=EFFORTS[self.options.effort].starts,
             seed=self.options.seed,
