@@ -34,6 +34,7 @@ SENTENCES = {
     "excluded": "left out as faulty",
     "share": "too large a share for reading errors",
     "lack": "Configurations scatter more than their repeats",
+    "computed": "they are computed, not measured",
 }
 
 

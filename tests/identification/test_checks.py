@@ -16,9 +16,10 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.checks import check_limits, check_table, fixed_and_free, limits
+from elastocal.identification.checks import check_limits, check_table, fixed_and_free
 from elastocal.identification.identify import Options, identify
 from elastocal.manipulator.chain import Chain, Joint
+from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
 
 
@@ -78,7 +79,7 @@ def test_controllers_may_overshoot_a_little(model):
 def test_the_cells_limits_narrow_the_robots():
     cell = replace(cell_of(GEOMETRY), limits={"joint2": (-0.5, 0.5), "joint3": (-9.0, 9.0)})
     model = Model(planar_chain(), cell)
-    lower, upper = limits(model)
+    lower, upper = joint_limits(model.cell, model.chain)
     np.testing.assert_allclose(lower, [-3.0, -0.5, -2.5])
     np.testing.assert_allclose(upper, [3.0, 0.5, 2.5])
     q = np.zeros((20, 3))

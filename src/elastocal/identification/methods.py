@@ -29,10 +29,10 @@ Mask = NDArray[np.bool_]
 # lacks looks like that.  Setting them apart would hide it.
 MOST_SET_ASIDE = 0.1
 # Residuals below this, in m, are rounding: no instrument resolves it, and it tells of no noise.
-EXACT = 1e-9
+EXACT = 1e-11
 COMPUTED = (
-    "the readings agree with the model to a nanometre: they are computed, not measured, and tell "
-    "nothing of the noise"
+    "The readings agree with the model to rounding: they are computed, not measured, and tell "
+    "nothing of the noise."
 )
 
 
