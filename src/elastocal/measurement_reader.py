@@ -49,12 +49,16 @@ def read_measurements(
     configuration = raw.labels.get("configuration")
     if configuration is None:
         configuration = Labels(np.arange(n), tuple(str(i) for i in range(1, n + 1)))
-    force, torque, sigma = _si(raw, "force"), _si(raw, "torque"), _sigma(raw)
-    q, time, temperature = _si(raw, "q"), _si(raw, "time"), _si(raw, "temperature")
-    distance = _si(raw, "distance")
+    force, torque, sigma = si_columns(raw, "force"), si_columns(raw, "torque"), _sigma(raw)
+    q, time, temperature = (
+        si_columns(raw, "q"),
+        si_columns(raw, "time"),
+        si_columns(raw, "temperature"),
+    )
+    distance = si_columns(raw, "distance")
     if distance is not None:
         _check(raw, "distance", distance > 0, "a distance must be positive")
-    approach = _si(raw, "approach")
+    approach = si_columns(raw, "approach")
     if approach is not None:
         good = np.isin(approach, (-1.0, 0.0, 1.0))
         _check(raw, "approach", good, "an approach direction is -1, 0 or 1")
@@ -68,8 +72,8 @@ def read_measurements(
         marker=marker.codes,
         marker_names=marker.names,
         force=np.zeros((n, 3)) if force is None else force,
-        position=_si(raw, "position"),
-        rotation=_rotation(raw),
+        position=si_columns(raw, "position"),
+        rotation=rotation_column(raw),
         distance=None if distance is None else distance[:, 0],
         torque=torque,
         sigma=sigma,
@@ -90,7 +94,7 @@ def read_plan(path: str | Path, *, joint_kinds: tuple[str, ...]) -> Measurements
     return read_measurements(path, joint_kinds=joint_kinds, observe="plan")
 
 
-def _si(raw: RawTable, family: str) -> Array | None:
+def si_columns(raw: RawTable, family: str) -> Array | None:
     """The columns of a family side by side (n, k) in SI units, None where the file has none."""
     if family not in raw.layout.columns:
         return None
@@ -116,7 +120,7 @@ def _check(raw: RawTable, family: str, good: np.ndarray, rule: str) -> None:
 
 def _sigma(raw: RawTable) -> Array | None:
     for family in ("sigma_cartesian", "sigma_polar"):
-        sigma = _si(raw, family)
+        sigma = si_columns(raw, family)
         if sigma is not None:
             _check(raw, family, sigma > 0, "a standard deviation must be positive")
             return sigma
@@ -124,7 +128,7 @@ def _sigma(raw: RawTable) -> Array | None:
 
 
 def _repeat(raw: RawTable) -> IntArray:
-    repeat = _si(raw, "repeat")
+    repeat = si_columns(raw, "repeat")
     if repeat is None:
         return np.zeros(len(raw.row), dtype=np.int64)
     whole = (repeat == np.round(repeat)) & (np.abs(repeat) <= LARGEST_EXACT_INTEGER)
@@ -132,10 +136,11 @@ def _repeat(raw: RawTable) -> IntArray:
     return repeat[:, 0].astype(np.int64)
 
 
-def _rotation(raw: RawTable) -> Array | None:
-    quaternion = _si(raw, "quaternion")
+def rotation_column(raw: RawTable) -> Array | None:
+    """Rotation vectors (n, 3) in rad from rx … or the quaternion, None where there is neither."""
+    quaternion = si_columns(raw, "quaternion")
     if quaternion is None:
-        return _si(raw, "rotation")
+        return si_columns(raw, "rotation")
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
     off = ~(np.abs(norm - 1.0) <= QUATERNION_NORM_TOLERANCE)

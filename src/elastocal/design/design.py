@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell import Cell
-from elastocal.design.augment import measured
+from elastocal.design.augment import Done, measured
 from elastocal.design.candidates import draw
 from elastocal.design.checkpoint import Checkpoint
 from elastocal.design.checks import check_cell
@@ -202,7 +202,7 @@ class _Design:
 
     def _plan(
         self, setup: Setup, found: Selection, shares: IntArray, counts: Candidates, targets: str,
-        curve: tuple[SizePoint, ...], done: object,
+        curve: tuple[SizePoint, ...], done: Done | None,
     ) -> Plan:  # fmt: skip
         self.progress("order of execution")
         found, execution, told = ordered(
@@ -215,7 +215,7 @@ class _Design:
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
         numbers = blocks.shape[1] * blocks.shape[2] * readings_each(self.cell)
-        numbers += getattr(done, "numbers", 0)
+        numbers += 0 if done is None else done.numbers
         value, unit = setup.criterion.reported(found.value)
         bound = found.certificate.bound_pool
         return Plan(

@@ -116,9 +116,9 @@ def interest_of(model: Model, found: Estimable) -> IntArray:
         return np.array(own or range(len(kept)), dtype=np.int64)
     chosen: set[int] = set()
     for name in wanted:
-        meant = [i for i, p in enumerate(model.parameters) if name in (p.name, p.where, p.effect)]
+        meant = model.meant_by(name)
         if not meant:
-            valid = sorted({v for p in model.parameters for v in (p.name, p.where, p.effect)})
+            valid = model.all_names
             raise InputError(
                 f"{where} names {quoted(name)}, which is no parameter, place or effect of the model"
                 f"{did_you_mean(name, valid)}; there are {listed(valid)}"

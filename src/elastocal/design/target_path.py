@@ -13,17 +13,15 @@ from elastocal.csv_source import read_csv
 from elastocal.errors import InputError, require
 from elastocal.measurement_columns import families
 from elastocal.measurement_header import NUMBERED, Column, Layout, layout_of
+from elastocal.measurement_reader import rotation_column, si_columns
 from elastocal.nearest import listed, quoted
 from elastocal.parquet_source import read_parquet
 from elastocal.raw_table import RawTable
-from elastocal.rotation_vector import rotation_vector
-from elastocal.units import to_si
 
 Array = NDArray[np.float64]
 
 WEIGHT = "weight"
 TAKEN = ("q", "position", "rotation", "quaternion", "force")
-NORM_TOLERANCE = 1e-3
 MOST_POSES = 10_000
 
 
@@ -62,7 +60,7 @@ def read_path(path: Path, joint_kinds: Sequence[str]) -> PathTable:
         f"{raw.source}: {len(raw.row)} poses; a path takes at most {MOST_POSES}; thin it out: "
         "neighbouring poses say the same",
     )
-    weight = _si(raw, WEIGHT)
+    weight = si_columns(raw, WEIGHT)
     if weight is not None and not (weight > 0).all():
         i = int(np.argmin(weight[:, 0] > 0))
         raise InputError(
@@ -71,10 +69,10 @@ def read_path(path: Path, joint_kinds: Sequence[str]) -> PathTable:
         )
     return PathTable(
         raw=raw,
-        q=_si(raw, "q"),
-        position=_si(raw, "position"),
-        rotation=_rotation(raw),
-        force=_si(raw, "force"),
+        q=si_columns(raw, "q"),
+        position=si_columns(raw, "position"),
+        rotation=rotation_column(raw),
+        force=si_columns(raw, "force"),
         weight=np.ones(len(raw.row)) if weight is None else weight[:, 0],
     )
 
@@ -119,28 +117,3 @@ def _columns(
             f"{source}: {columns['q'][0].header} … says the rotation too; drop {other} …"
         )
     return {name: family for name, family in columns.items() if name in TAKEN}
-
-
-def _si(raw: RawTable, family: str) -> Array | None:
-    """The columns of a family side by side (N, k) in SI units, None where the file has none."""
-    if family not in raw.layout.columns:
-        return None
-    return np.column_stack(
-        [to_si(raw.numbers[c.header], c.unit) for c in raw.layout.columns[family]]
-    )
-
-
-def _rotation(raw: RawTable) -> Array | None:
-    quaternion = _si(raw, "quaternion")
-    if quaternion is None:
-        return _si(raw, "rotation")
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(quaternion, axis=1)
-    off = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
-    if off.any():
-        i = int(np.argmax(off))
-        raise InputError(
-            f"{raw.where(i, 'qw')}: the quaternion's norm is {norm[i]:.6g}, not 1; check the "
-            "order qw, qx, qy, qz and the digits"
-        )
-    return rotation_vector(quaternion)

@@ -137,12 +137,11 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
     """
     held = set()
     for name in fixed:
-        match = [i for i, p in enumerate(model.parameters) if name in (p.name, p.where, p.effect)]
+        match = model.meant_by(name)
         if not match:
-            valid = sorted({v for p in model.parameters for v in (p.name, p.where, p.effect)})
             raise InputError(
                 f"cannot fix '{name}': the model has no such parameter, place or effect"
-                f"{did_you_mean(name, valid)}"
+                f"{did_you_mean(name, model.all_names)}"
             )
         held |= set(match)
     free = np.array([i for i in range(len(model.parameters)) if i not in held], dtype=np.int64)

@@ -77,6 +77,15 @@ class Model:
     def names(self) -> tuple[str, ...]:
         return tuple(p.name for p in self.parameters)
 
+    def meant_by(self, name: str) -> list[int]:
+        """Indices of the parameters that a parameter's, place's or effect's name stands for."""
+        return [i for i, p in enumerate(self.parameters) if name in (p.name, p.where, p.effect)]
+
+    @property
+    def all_names(self) -> list[str]:
+        """Every name that `meant_by` understands."""
+        return sorted({v for p in self.parameters for v in (p.name, p.where, p.effect)})
+
     @property
     def nominal(self) -> Array:
         return np.array([p.nominal for p in self.parameters])
