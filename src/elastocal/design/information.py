@@ -14,7 +14,7 @@ from elastocal.design.readings import (
     rows_of,
 )
 from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.manipulator.observation import Observations, observe
 from elastocal.measurements import Measurements
 from elastocal.simulation.simulate import simulate
 
@@ -66,10 +66,18 @@ class PoseInformation:
         return marker_sigmas(self.model.cell, table)
 
     def _whitened(self, q: Array, load: IntArray, x: Array) -> Array:
-        n = len(q)
-        table = self.rows(q, load, x)
-        seen = observe(table, self.model.observe)
-        at = self.model.regressor(table, x, self.columns, seen)
-        B = at.B.reshape(n, -1, len(self.columns)) * self.sizes
-        factor = np.linalg.cholesky(pose_covariance(self.model, seen, n, self.states))
-        return np.linalg.solve(factor, B)
+        seen, factor = self._noise(q, load, x)
+        at = self.model.regressor(seen.table, x, self.columns, seen)
+        B = at.B.reshape(len(q), -1, len(self.columns)) * self.sizes
+        return np.asarray(np.linalg.solve(factor, B), dtype=np.float64)
+
+    def whitener(self, q: Array, load: int) -> Array:
+        """W (S, r, r) of one pose q (n,): W B is its block before scaling."""
+        one = q[None], np.array([load])
+        return np.stack([np.linalg.inv(self._noise(*one, x)[1][0]) for x in self.scenarios])
+
+    def _noise(self, q: Array, load: IntArray, x: Array) -> tuple[Observations, Array]:
+        """What is read at the poses, and the Cholesky factors (N, r, r) of its covariance."""
+        seen = observe(self.rows(q, load, x), self.model.observe)
+        covariance = pose_covariance(self.model, seen, len(q), self.states)
+        return seen, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from elastocal.design.criteria.base import Criterion
 from elastocal.design.information import PoseInformation
-from elastocal.design.readings import pose_covariance
-from elastocal.manipulator.observation import observe
 from elastocal.manipulator.symbolic import SymbolicArm
 from elastocal.manipulator.symbolic_rows import configuration_rows
 
@@ -62,7 +60,7 @@ def symbolic_blocks(information: PoseInformation, q: Array, load: int) -> Symbol
         rows.adjoint,
         information.scenarios,
         information.sizes,
-        _whitener(information, q, load),
+        information.whitener(q, load),
     )
 
 
@@ -70,17 +68,7 @@ def whitened_at(
     blocks: SymbolicBlocks, information: PoseInformation, q: Array, load: int
 ) -> SymbolicBlocks:
     """The same expression with the noise of a reading at q (n,)."""
-    return replace(blocks, whitener=_whitener(information, q, load))
-
-
-def _whitener(information: PoseInformation, q: Array, load: int) -> Array:
-    model, states = information.model, information.states
-    found = []
-    for x in information.scenarios:
-        table = information.rows(q[None], np.array([load]), x)
-        seen = observe(table, model.observe)
-        found.append(np.linalg.inv(np.linalg.cholesky(pose_covariance(model, seen, 1, states)[0])))
-    return np.stack(found)
+    return replace(blocks, whitener=information.whitener(q, load))
 
 
 class Goal(Protocol):
