@@ -76,12 +76,16 @@ class EffectChoice:
 
 @dataclass(frozen=True)
 class Nominal:
-    """Nominal values and start hints; compliances in rad/(N m), base rotation (3, 3)."""
+    """Nominal values and start hints; compliances in rad/(N m), base rotation (3, 3).
+
+    `settings`: place → key → value of the constants that effects do not fit, in the key's unit.
+    """
 
     joint_compliance: tuple[float, ...] | None = None
     base_position: Array | None = None
     base_rotation: Array | None = None
     gravity_compensator: dict[str, Any] | None = None
+    settings: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,7 @@ class ModelSpec:
     deflection_model: Literal["equilibrium", "linear"] = "equilibrium"
     compliance_levels: dict[str, tuple[float, ...]] = field(default_factory=dict)
     gear_ripple_orders: tuple[float, ...] = ()
+    thermal_driver: Literal["time", "temperature"] = "time"
     nominal: Nominal = field(default_factory=Nominal)
 
 

@@ -171,6 +171,7 @@ def _model(path: Path, table: ModelTable, known_effects: tuple[str, ...] | None)
         deflection_model=table.deflection_model or "equilibrium",
         compliance_levels=levels,
         gear_ripple_orders=tuple(table.gear_ripple_orders or ()),
+        thermal_driver=table.thermal_driver or "time",
         nominal=_nominal(table.nominal or NominalTable()),
     )
 
@@ -182,6 +183,7 @@ def _nominal(table: NominalTable) -> Nominal:
         base_position=None if table.base_position_m is None else np.array(table.base_position_m),
         base_rotation=None if table.base_rpy_deg is None else rotation_from_rpy(table.base_rpy_deg),
         gravity_compensator=None if spring is None else spring.model_dump(exclude_none=True),
+        settings=table.settings or {},
     )
 
 

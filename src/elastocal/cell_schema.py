@@ -65,6 +65,9 @@ class NominalTable(Table):
     base_position_m: Vector3 | None = key("three numbers in m")
     base_rpy_deg: Vector3 | None = key("three numbers in degrees: roll, pitch, yaw")
     gravity_compensator: CompensatorTable | None = key('a table with joint = "joint2"')
+    settings: dict[str, dict[str, float]] | None = key(
+        "a table per place, as in settings.joint2 = { jump_time_s = 720.0 }"
+    )
 
 
 class ModelTable(Table):
@@ -79,6 +82,7 @@ class ModelTable(Table):
         "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]"
     )
     gear_ripple_orders: list[Positive] | None = key("a list of positive numbers")
+    thermal_driver: Literal["time", "temperature"] | None = key('"time" or "temperature"')
     nominal: NominalTable | None = key("a table")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import casadi as ca
+
 from elastocal.cell import Cell
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
@@ -45,6 +47,29 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
                 raise InputError(_unknown(f"place of {name}", where, list(places), cell))
         chosen += [(effect, place) for place in places if None in asked or place in asked]
     return chosen
+
+
+def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[str, ca.SX]:
+    """Values of the effect's settings at a place: the cell's, else their defaults.
+
+    Raises InputError where one has neither, or lies outside its range.
+    """
+    given = cell.model.nominal.settings.get(place, {})
+    values = {}
+    for setting in effect.settings(place, chain, cell):
+        value = given.get(setting.key, setting.default)
+        where = f"{cell.path or cell.name}: [model.nominal.settings.{place}] {setting.key}"
+        if value is None:
+            raise InputError(
+                f"{where} is missing, which {effect.name} at {place} needs; `elastocal diagnose` "
+                "searches for it"
+            )
+        if not setting.lower <= value <= setting.upper:
+            raise InputError(
+                f"{where} takes {setting.lower:g} to {setting.upper:g}; found {value:g}"
+            )
+        values[setting.key] = ca.SX(value)
+    return values
 
 
 def _unknown(what: str, found: str, valid: list[str], cell: Cell) -> str:

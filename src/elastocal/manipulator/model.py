@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,6 +13,7 @@ from elastocal.cell import Cell, EffectChoice
 from elastocal.errors import ElastocalError
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.choice import load_chain
+from elastocal.manipulator.effects.base import Effect
 from elastocal.manipulator.inputs import row_inputs
 from elastocal.manipulator.observation import Observations, observe
 from elastocal.manipulator.symbolic import SymbolicArm
@@ -40,12 +42,13 @@ class Model:
     """p_i = h(q_i, f_i, …; X) for a chain with effects; CasADi differentiates it exactly.
 
     `parameters` are those of all active effects, in order; `nominal` their nominal values.
+    `extra` effects with their places act besides those that the cell chooses.
     """
 
-    def __init__(self, chain: Chain, cell: Cell) -> None:
+    def __init__(self, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]] = ()) -> None:
         self.chain, self.cell = chain, cell
         self.observe = cell.model.observe
-        self._symbolic = SymbolicArm(chain, cell)
+        self._symbolic = SymbolicArm(chain, cell, extra)
         self.parameters = self._symbolic.parameters
 
     @classmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -23,6 +24,23 @@ class ParameterSpec:
     typical: float | None
     lower: float = -np.inf
     upper: float = np.inf
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A constant inside an effect's expression that is set, not fitted: an order, a time.
+
+    The amplitude of the effect vanishes at nominal, and with it every derivative with respect to
+    such a constant, so a fit cannot find it; a search over `lower` to `upper` can.  The value
+    comes from `[model.nominal.settings.PLACE]`, else `default`; None: there is none, and the
+    model asks for it.  `key` carries the unit, as table columns do ("jump_time_s").
+    """
+
+    key: str
+    kind: Literal["order", "change_time", "time_constant"]
+    default: float | None
+    lower: float
+    upper: float
 
 
 @dataclass(frozen=True)

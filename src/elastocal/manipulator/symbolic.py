@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -10,7 +11,8 @@ from elastocal.cell import Cell
 from elastocal.manipulator import rigid
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.choice import choose_effects
+from elastocal.manipulator.choice import choose_effects, set_constants
+from elastocal.manipulator.effects.base import Effect
 from elastocal.manipulator.equilibrium import Equilibrium
 from elastocal.manipulator.parameter import Parameter
 from elastocal.manipulator.tape import Tape
@@ -20,16 +22,17 @@ class SymbolicArm:
     """h(inputs, X, θ) and F(inputs, X, θ) = θ − law(τ) of one row, as CasADi expressions.
 
     `parameters` are those of all active effects, in order; `arm.inputs` what a row must give.
+    `extra` effects with their places act besides those that the cell chooses.
     """
 
-    def __init__(self, chain: Chain, cell: Cell) -> None:
+    def __init__(self, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]] = ()) -> None:
         arm = Arm(chain, cell)
-        chosen = choose_effects(chain, cell)
+        chosen = [*choose_effects(chain, cell), *extra]
         parameters: list[Parameter] = []
         symbols: list[ca.SX] = []
         bound = []
         for effect, place in chosen:
-            own = {}
+            own = set_constants(effect, place, chain, cell)
             for spec in effect.parameters(place, chain, cell):
                 own[spec.key] = ca.SX.sym(f"{place}.{spec.key}")
                 symbols.append(own[spec.key])

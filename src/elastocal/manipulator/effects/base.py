@@ -9,7 +9,7 @@ import casadi as ca
 
 from elastocal.cell import Cell
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.parameter import ParameterSpec
+from elastocal.manipulator.parameter import ParameterSpec, Setting
 
 if TYPE_CHECKING:
     from elastocal.manipulator.arm import Arm
@@ -30,11 +30,14 @@ class Effect:
       as a function of the elastic deflections.
     - `read`: changes what the instrument reports; called last.
 
-    Parameter symbols arrive as a mapping from the keys of `parameters` to CasADi scalars.
+    Parameter symbols arrive as a mapping from the keys of `parameters` and `settings` to CasADi
+    scalars.
     """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
+    # What the table must say for the effect to show, of "time", "approach", "temperature", "load".
+    needs: ClassVar[tuple[str, ...]] = ()
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         """Every place where this effect makes sense on this arm, e.g. ("joint1", …)."""
@@ -42,6 +45,10 @@ class Effect:
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         """The parameters at one place; loads may have none."""
+        return ()
+
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        """Constants of the expression at one place that are set or searched, not fitted."""
         return ()
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
