@@ -86,6 +86,7 @@ torque = "measured"
 link_gravity = true
 deflection_model = "linear"
 gear_ripple_orders = [121, 88.5]
+thermal_driver = "temperature"
 [model.compliance_levels]
 joint2_deg = [-90, 0.0]
 joint3_rad = [0.5]
@@ -94,6 +95,8 @@ joint_compliance = [1e-6, 0]
 base_position_m = [1, 2, 3]
 base_rpy_deg = [0, 0, 90]
 gravity_compensator = { joint = "joint2", stiffness_N_per_m = 1e5, anchor_m = [0.7, 0.1] }
+settings.joint2 = { jump_time_s = 720, ripple_order = 88.5 }
+settings."marker:M1" = { slip_time_s = -60.0 }
 [limits]
 joint1_deg = [-180, 90]
 joint2_rad = [-1, 1]
@@ -123,6 +126,7 @@ poses = 20
     assert (cell.model.torque, cell.model.link_gravity) == ("measured", True)
     assert cell.model.deflection_model == "linear"
     assert cell.model.gear_ripple_orders == (121.0, 88.5)
+    assert cell.model.thermal_driver == "temperature"
     assert cell.model.compliance_levels == {"joint2": (-np.pi / 2, 0.0), "joint3": (0.5,)}
     assert cell.model.nominal.joint_compliance == (1e-6, 0.0)
     assert cell.model.nominal.base_position.tolist() == [1.0, 2.0, 3.0]
@@ -130,6 +134,10 @@ poses = 20
         "joint": "joint2",
         "stiffness_N_per_m": 1e5,
         "anchor_m": [0.7, 0.1],
+    }
+    assert cell.model.nominal.settings == {
+        "joint2": {"jump_time_s": 720.0, "ripple_order": 88.5},
+        "marker:M1": {"slip_time_s": -60.0},
     }
     assert cell.limits["joint1"] == (-np.pi, np.pi / 2)
     assert cell.limits["joint2"] == (-1.0, 1.0)
@@ -211,6 +219,12 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest_valid_one(refusal, t
         ("[model]\neffects = [':joint2']", ["model.effects[0]"]),
         ("[model]\neffects = ['joint_offset', 'joint_offset']", ["model.effects[1]", "repeats"]),
         ("[model]\ngear_ripple_orders = [0]", ["model.gear_ripple_orders"]),
+        ("[model]\nthermal_driver = 'temperatur'", ["model.thermal_driver", "'temperature'"]),
+        ("[model.nominal]\nsettings.joint2 = 3", ["model.nominal.settings", "table"]),
+        (
+            "[model.nominal]\nsettings.joint2 = { jump_time_s = 'noon' }",
+            ["model.nominal.settings.joint2", "{ jump_time_s = 720.0 }", "'noon'"],
+        ),
         ("[model.nominal]\njoint_compliance = [-1e-6]", ["model.nominal.joint_compliance"]),
         (
             "[model.nominal]\ngravity_compensator = { joint = 'elbow' }",

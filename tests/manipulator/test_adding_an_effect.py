@@ -22,13 +22,14 @@ PAGE = Path(__file__).parents[2] / "docs" / "adding-an-effect.md"
 def effect(tmp_path, monkeypatch):
     """The page's file, imported, and the page's line in the catalogue."""
     code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S).group(1)
-    path = tmp_path / "gear_eccentricity.py"
+    path = tmp_path / "joint_temperature.py"
     path.write_text(code, encoding="utf-8")
-    spec = importlib.util.spec_from_file_location("gear_eccentricity", path)
+    spec = importlib.util.spec_from_file_location("joint_temperature", path)
     module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "gear_eccentricity", module)
+    monkeypatch.setitem(sys.modules, "joint_temperature", module)
     spec.loader.exec_module(module)
-    added = module.GearEccentricity()
+    added = module.JointTemperature()
+    assert added.name not in CATALOGUE
     monkeypatch.setitem(CATALOGUE, added.name, added)
     return added
 
@@ -40,14 +41,14 @@ def model_with(effects):
 
 
 def test_it_is_one_more_entry_of_the_catalogue(effect):
-    model = model_with(["gear_eccentricity"])
-    assert len(model.parameters) == 12
-    assert model.names[2:4] == ("joint2.eccentricity_sin", "joint2.eccentricity_cos")
-    assert model_with(["gear_eccentricity:joint2"]).names == model.names[2:4]
+    model = model_with(["joint_temperature"])
+    assert len(model.parameters) == 6
+    assert model.names[1] == "joint2.temperature_shift"
+    assert model_with(["joint_temperature:joint2"]).names == model.names[1:2]
 
 
 def test_its_columns_are_derivatives(effect):
-    model = model_with(["gear_eccentricity"])
+    model = model_with(["joint_temperature"])
     table = random_table(model.chain, 5, seed=1, markers=("M1",))
     B = model.regressor(table).B
     for k in range(len(model.parameters)):
@@ -57,12 +58,12 @@ def test_its_columns_are_derivatives(effect):
 
 
 def test_identification_knows_it_at_once(effect):
-    model = model_with(["gear_eccentricity:joint2", "gear_eccentricity:joint3"])
-    truth = np.array([3e-4, -2e-4, 1e-4, 4e-4])
+    model = model_with(["joint_temperature:joint2", "joint_temperature:joint3"])
+    truth = np.array([3e-5, -2e-5])
     table = random_table(model.chain, 40, seed=2, markers=("M1",))
     rng = np.random.default_rng(3)
     exact = model.predict(table, truth).reshape(-1, 3)
     found = identify(model, replace(table, position=exact + 2e-5 * rng.normal(size=exact.shape)))
     for value, estimate in zip(truth, found.estimates, strict=True):
-        assert estimate.std < 1e-4
+        assert estimate.std < 1e-5
         assert abs(estimate.value - value) < 4 * estimate.std

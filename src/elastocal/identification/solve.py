@@ -67,7 +67,7 @@ def solve(
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    sizes = _sizes_and_check(problem)
+    sizes = sizes_and_check(problem)
     settled = settle(problem, sizes, progress)
     problem, found, reduction = settled.problem, settled.fit, settled.reduction
     heldout = heldout_of(problem, found)
@@ -104,13 +104,13 @@ def settle(problem: Problem, sizes: Array, progress: Progress = lambda message: 
     placed = problem.free[is_placed(model)[problem.free]]
     if len(placed):
         progress("placing base and markers")
-        base = _tied_fit(replace(problem, free=placed), sizes, PLACING)
+        base = tied_fit(replace(problem, free=placed), sizes, PLACING)
         problem = replace(problem, x0=base.x)
         nominal = base.residual
     else:
         nominal = residual_at(model, problem.parts, problem.x0)
     progress("first fit, tied weakly to the start")
-    found = _tied_fit(problem, sizes, CHOOSING)
+    found = tied_fit(problem, sizes, CHOOSING)
     progress("choosing the parameters that the data determine")
     sigma, kept, triangle = residual_sigma(found, 0), None, found.triangle
     for _ in range(5):
@@ -129,7 +129,7 @@ def is_placed(model: Model) -> NDArray[np.bool_]:
     return np.array([p.effect in PLACED_EFFECTS for p in model.parameters], dtype=bool)
 
 
-def _sizes_and_check(problem: Problem) -> Array:
+def sizes_and_check(problem: Problem) -> Array:
     """Typical sizes (parameters,) at the start; refuses where the equations are too few."""
     model, seen, free = problem.model, problem.observations, problem.free
     every = np.arange(len(model.parameters))
@@ -145,7 +145,7 @@ def _sizes_and_check(problem: Problem) -> Array:
     return sizes
 
 
-def _tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
+def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
     """Fit of all free parameters with weak ties, scaled by a noise level found on the way.
 
     A large table starts where such a fit to a sample of it ends.

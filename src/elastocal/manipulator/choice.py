@@ -29,24 +29,51 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
     """(effect, place) for everything active, in the catalogue's order.
 
     The table's force always acts (`payload`); link weights act where `link_gravity` says so.
-    Raises InputError for an unknown effect or place, with the nearest valid one.
+    Raises InputError for an unknown effect, place or setting, with the nearest valid one, and
+    for an effect that has no place on this arm.
     """
+    check_settings(chain, cell)
     wanted: dict[str, list[str | None]] = {"payload": [None]}
     if cell.model.link_gravity:
         wanted["link_gravity"] = [None]
     for choice in cell.model.effects:
         if choice.name not in CATALOGUE:
-            raise InputError(_unknown("effect", choice.name, list(CATALOGUE), cell))
+            raise InputError(_unknown("effects", "effect", choice.name, list(CATALOGUE), cell))
         wanted.setdefault(choice.name, []).append(choice.where)
     chosen = []
     for name, effect in CATALOGUE.items():
         places = effect.places(chain, cell)
         asked = wanted.get(name, [])
+        if asked and not places:
+            raise InputError(
+                f"{cell.path or cell.name}: [model] effects: {name} has no place on robot "
+                f"'{chain.name}' with observe = \"{cell.model.observe}\"; leave it out"
+            )
         for where in asked:
             if where is not None and where not in places:
-                raise InputError(_unknown(f"place of {name}", where, list(places), cell))
+                raise InputError(_unknown("effects", f"place of {name}", where, list(places), cell))
         chosen += [(effect, place) for place in places if None in asked or place in asked]
     return chosen
+
+
+def check_settings(chain: Chain, cell: Cell) -> None:
+    """InputError where the cell sets what no effect of the catalogue has on this arm."""
+    given = cell.model.nominal.settings
+    if not given:
+        return
+    known: dict[str, list[str]] = {}
+    for effect in CATALOGUE.values():
+        for place in effect.places(chain, cell):
+            keys = [setting.key for setting in effect.settings(place, chain, cell)]
+            if keys:
+                known.setdefault(place, []).extend(keys)
+    for place, values in given.items():
+        if place not in known:
+            raise InputError(_unknown("nominal.settings", "place", place, list(known), cell))
+        for key in values:
+            if key not in known[place]:
+                what = f"setting of {place}"
+                raise InputError(_unknown("nominal.settings", what, key, known[place], cell))
 
 
 def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[str, ca.SX]:
@@ -72,8 +99,8 @@ def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[
     return values
 
 
-def _unknown(what: str, found: str, valid: list[str], cell: Cell) -> str:
+def _unknown(key: str, what: str, found: str, valid: list[str], cell: Cell) -> str:
     return (
-        f"{cell.path or cell.name}: [model] effects: unknown {what} '{found}'"
+        f"{cell.path or cell.name}: [model] {key}: unknown {what} '{found}'"
         f"{did_you_mean(found, valid)}; valid: {listed(valid)}"
     )

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "tracker"]
 Symbols = Mapping[str, ca.SX]
+REVOLUTE = "revolute"
 
 
 class Effect:
@@ -47,9 +48,18 @@ class Effect:
         """The parameters at one place; loads may have none."""
         return ()
 
+    def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
+        """Values of some parameters from which to look for the others, where nominal ones say
+        nothing about this arm."""
+        return ()
+
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         """Constants of the expression at one place that are set or searched, not fitted."""
         return ()
+
+    def needed(self, cell: Cell) -> tuple[str, ...]:
+        """`needs` for this cell: what shows an effect may depend on the model around it."""
+        return self.needs
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         """Change the pieces of the chain before it is assembled."""
@@ -64,6 +74,16 @@ class Effect:
 def joints(chain: Chain) -> tuple[str, ...]:
     """Places "joint1" … "jointN"."""
     return tuple(f"joint{i + 1}" for i in range(chain.n_joints))
+
+
+def turning_joints(chain: Chain) -> tuple[str, ...]:
+    """Those of `joints` that are revolute."""
+    return tuple(j for j, kind in zip(joints(chain), chain.kinds, strict=True) if kind == REVOLUTE)
+
+
+def motion_unit(place: str, chain: Chain) -> str:
+    """Unit of the motion of "jointN": rad, or m where it slides."""
+    return "rad" if chain.kinds[index(place)] == REVOLUTE else "m"
 
 
 def links(chain: Chain) -> tuple[str, ...]:

@@ -31,13 +31,14 @@ class DrivenEffect(Effect):
 
     @abstractmethod
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        """u (entry.size,) of the row, linear in the parameters."""
+        """u of the row, linear in the parameters: (entry.size,) of every entered place, stacked."""
 
     def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
-        """The places of the entry that u acts on; several get the same u each."""
+        """The places of the entry that u acts on, in the order in which u stacks them."""
         return (place,)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        u = self.drive(arm, place, p)
-        for where in self.entered_at(place, arm.chain):
+        places = self.entered_at(place, arm.chain)
+        motions = ca.vertsplit(self.drive(arm, place, p), self.entry.size)
+        for where, u in zip(places, motions, strict=True):
             self.entry.enter(arm, where, u)

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import casadi as ca
+
 from elastocal.cell import Cell
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
+from elastocal.manipulator.effects.base import Symbols, index
+from elastocal.manipulator.effects.driven import DrivenEffect
+from elastocal.manipulator.effects.entry import JointMotion
 from elastocal.manipulator.parameter import ParameterSpec
 
 
-class EncoderScale(Effect):
+class EncoderScale(DrivenEffect):
     """δq = a·q with the commanded joint value q; a is dimensionless."""
 
     name = "encoder_scale"
     stage = "transmission"
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return joints(chain)
+    entry = JointMotion()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (ParameterSpec("encoder_scale", "1", 0.0, 3e-4),)
 
-    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        i = index(place)
-        arm.q[i] += p["encoder_scale"] * arm.q_commanded[i]
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        return p["encoder_scale"] * arm.q_commanded[index(place)]

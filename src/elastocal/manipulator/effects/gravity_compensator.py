@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from elastocal.cell import Cell
 from elastocal.manipulator.arm import Arm
@@ -47,6 +48,19 @@ class GravityCompensator(Effect):
             ParameterSpec("compensator_anchor_y", "m", float(anchor_y), 1e-2),
             ParameterSpec("compensator_arm", "m", float(given["arm_m"]), 1e-2),
             ParameterSpec("compensator_free_length", "m", float(given["free_length_m"]), 1e-2),
+        )
+
+    def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
+        if cell.model.nominal.gravity_compensator is not None:
+            return ()
+        x, y = EXAMPLE["anchor_m"]
+        turns = np.radians(np.arange(0, 360, 30))
+        return tuple(
+            {
+                "compensator_anchor_x": float(np.cos(t) * x - np.sin(t) * y),
+                "compensator_anchor_y": float(np.sin(t) * x + np.cos(t) * y),
+            }
+            for t in turns
         )
 
     def load(self, arm: Arm, place: str, p: Symbols) -> None:

@@ -6,9 +6,10 @@ import casadi as ca
 
 from elastocal.cell import Cell
 from elastocal.errors import require
-from elastocal.manipulator.arm import Arm, Spring
+from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
+from elastocal.manipulator.effects.base import Symbols, index, joints
+from elastocal.manipulator.effects.torque import TorqueEffect, add_deflection
 from elastocal.manipulator.parameter import ParameterSpec
 
 
@@ -23,7 +24,7 @@ def nominal_compliance(chain: Chain, cell: Cell) -> tuple[float, ...] | None:
     return given
 
 
-class JointCompliance(Effect):
+class JointCompliance(TorqueEffect):
     """δq_j = k_j τ_j, k_j in rad/(N m) (m/N for a prismatic joint).
 
     τ_j is the load's torque about the joint axis, either computed at the deflected pose from
@@ -63,9 +64,4 @@ class JointCompliance(Effect):
             chosen = arm.input(f"level:{place}", len(levels))
             values = ca.vertcat(*[p[f"compliance_level{n + 1}"] for n in range(len(levels))])
             k = ca.dot(chosen, values)
-        if arm.cell.model.torque == "measured":
-            # Known torque: the deflection is explicit, no equilibrium to solve.
-            arm.q[i] += k * arm.input("torque", arm.chain.n_joints)[i]
-            return
-        joint = arm.chain.joints[i]
-        arm.add_spring(Spring.linear(place, place, joint.kind, joint.axis, k))
+        add_deflection(arm, i, place, lambda tau: k * tau)

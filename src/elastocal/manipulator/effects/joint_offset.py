@@ -5,7 +5,7 @@ from __future__ import annotations
 from elastocal.cell import Cell
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
+from elastocal.manipulator.effects.base import Effect, Symbols, index, joints, motion_unit
 from elastocal.manipulator.parameter import ParameterSpec
 
 
@@ -19,8 +19,7 @@ class JointOffset(Effect):
         return joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        unit = "rad" if chain.kinds[index(place)] == "revolute" else "m"
-        return (ParameterSpec("offset", unit, 0.0, 1e-3),)
+        return (ParameterSpec("offset", motion_unit(place, chain), 0.0, 1e-3),)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         arm.q[index(place)] += p["offset"]

@@ -7,8 +7,9 @@ import numpy as np
 from elastocal.cell import Cell
 from elastocal.manipulator.arm import Arm, Spring
 from elastocal.manipulator.chain import Array, Chain
-from elastocal.manipulator.effects.base import Effect, Symbols, index, joints
+from elastocal.manipulator.effects.base import Symbols, index, joints
 from elastocal.manipulator.effects.joint_compliance import nominal_compliance
+from elastocal.manipulator.effects.torque import LoadedEffect
 from elastocal.manipulator.parameter import ParameterSpec
 
 
@@ -23,7 +24,7 @@ def transverse_axes(axis: Array) -> tuple[Array, Array]:
     return x, np.cross(axis, x)
 
 
-class OffAxisCompliance(Effect):
+class OffAxisCompliance(LoadedEffect):
     """Tilt of the joint about its two transverse axes, θ_x = k_x M_x and θ_y = k_y M_y.
 
     M_x, M_y are the transverse moments of the load at the joint; the axes are fixed to the
