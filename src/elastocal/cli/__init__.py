@@ -6,7 +6,8 @@ import os
 # It must be said before numpy is loaded, and the user's own setting wins.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from elastocal.cli import demo, design, identify, simulate  # noqa: F401  (registers the commands)
+# Importing a command registers it.
+from elastocal.cli import demo, design, diagnose, identify, simulate  # noqa: F401
 from elastocal.cli.app import app
 
 

@@ -1,0 +1,115 @@
+"""elastocal diagnose: why the real arm still differs from the model."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from elastocal.cli.app import (
+    CellFile,
+    Json,
+    Seed,
+    app,
+    check_outputs,
+    console,
+    progress_line,
+    reporting_errors,
+)
+from elastocal.cli.diagnosis_files import Outputs, write_diagnosis
+from elastocal.cli.identify import _load
+from elastocal.cli.plan_files import check_apart, files_of
+from elastocal.errors import require
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from elastocal.diagnosis.result import Diagnosis
+    from elastocal.manipulator.model import Model
+    from elastocal.measurements import Measurements
+
+MOST_POSES = 10
+# Verdicts that leave rivals to be told apart by more poses.
+OPEN = ("ambiguous", "unknown_effect")
+
+
+@app.command()
+@reporting_errors
+def diagnose(
+    cell: CellFile,
+    data: Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Write the diagnosis as JSON.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(help="Write extra poses (CSV) that tell the rivals apart, where there are."),
+    ] = None,
+    poses: Annotated[
+        int | None,
+        typer.Option(min=1, help=f"Most extra poses of --plan.  [default: {MOST_POSES}]"),
+    ] = None,
+    cell_out: Annotated[
+        Path | None, typer.Option(help="Write the cell (TOML) with the effects found added.")
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(help="Take an effect out of the catalogue; repeatable."),
+    ] = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Why does the real arm still differ from the model?
+
+    Says where the gap lies, which effect of the catalogue causes it, or that none does, and how
+    far the error of fresh poses falls once it is added.
+
+    Example: elastocal diagnose cell.toml data.csv -o diagnosis.json --report diagnosis.html
+    """
+    from elastocal.diagnosis.diagnose import diagnose as run
+    from elastocal.diagnosis.options import DiagnosisOptions
+    from elastocal.diagnosis.published import publish
+
+    # What can be wrong with the options is told before any file is read.
+    options = DiagnosisOptions(seed=seed, without=tuple(without or ()))
+    require(
+        poses is None or plan is not None,
+        f"--poses {poses} has no meaning without --plan; name the file for the extra poses",
+    )
+    outputs = Outputs(output, report, plan, cell_out)
+    check_outputs(*outputs.wanted)
+    with progress_line(quiet) as progress:
+        progress("reading")
+        model, (table,) = _load(cell, [data])
+        read = [cell, data, *(path for path in files_of(model.cell) if path is not None)]
+        check_apart(outputs.wanted, read)
+        found = run(model, table, options, progress)
+        if plan is not None and found.verdict in OPEN:
+            most = MOST_POSES if poses is None else poses
+            found = _with_extra_poses(model, table, found, most, seed, progress)
+        content = publish(found, model, str(data))
+        told = write_diagnosis(outputs, found, content, model, cell, data, seed)
+    if as_json:
+        typer.echo(json.dumps(content, indent=1, allow_nan=False))
+        return
+    from elastocal.report.diagnosis_tables import print_diagnosis
+
+    print_diagnosis(console(), found, model.chain.kinds)
+    for line in told:
+        typer.echo(line)
+
+
+def _with_extra_poses(
+    model: Model, table: Measurements, found: Diagnosis, most: int, seed: int,
+    progress: Callable[[str], None],
+) -> Diagnosis:  # fmt: skip
+    """The diagnosis with the fewest of at most `most` poses that tell its rivals apart."""
+    from elastocal.diagnosis.separate import plan_extra
+
+    progress("looking for poses that tell the rivals apart")
+    return replace(found, extra=plan_extra(model, table, found, most=most, seed=seed))

@@ -1,0 +1,113 @@
+"""The files that `elastocal diagnose` writes: JSON, report, extra poses, extended cell."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from elastocal.files import atomic_write_text
+
+if TYPE_CHECKING:
+    from elastocal.diagnosis.result import Diagnosis
+    from elastocal.manipulator.model import Model
+    from elastocal.measurements import Measurements
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Where to write what; None is not asked for."""
+
+    json: Path | None = None
+    report: Path | None = None
+    plan: Path | None = None
+    cell: Path | None = None
+
+    @property
+    def wanted(self) -> list[Path]:
+        return [p for p in (self.json, self.report, self.plan, self.cell) if p is not None]
+
+
+def write_diagnosis(
+    outputs: Outputs,
+    diagnosis: Diagnosis,
+    content: dict[str, Any],
+    model: Model,
+    cell: Path,
+    data: Path,
+    seed: int,
+) -> list[str]:
+    """Write what was asked for, each file whole or not at all; a sentence per file.
+
+    `content` is the published diagnosis; `cell` and `data` were read for it.
+    """
+    told = []
+    if outputs.json is not None:
+        atomic_write_text(outputs.json, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        told.append(f"wrote {outputs.json}")
+    if outputs.report is not None:
+        from elastocal.report.diagnosis_page import write_diagnosis_report
+
+        command = shlex.join(["elastocal", *sys.argv[1:]])
+        write_diagnosis_report(
+            diagnosis, model, outputs.report, data=str(data), command=command,
+            inputs=[cell, data], seed=seed,
+        )  # fmt: skip
+        told.append(f"wrote {outputs.report}")
+    if outputs.plan is not None:
+        told.append(_write_plan(outputs.plan, diagnosis, model.chain.kinds))
+    if outputs.cell is not None:
+        from elastocal.diagnosis.extended_cell import write_extended_cell
+
+        write_extended_cell(cell, outputs.cell, diagnosis.effects)
+        added = ", ".join(f"{f.effect}:{f.where}" for f in diagnosis.effects)
+        told.append(f"wrote {outputs.cell} with {added or 'no further effect'}")
+    return told
+
+
+def _write_plan(path: Path, diagnosis: Diagnosis, kinds: Sequence[str]) -> str:
+    """Write the extra poses, and say so; or why there are none to write."""
+    extra = diagnosis.extra
+    if extra is None:
+        return f"{path} not written: there are no rivals to tell apart"
+    if extra.plan is None:
+        return f"{path} not written: no pose tells the rivals apart"
+    write_extra_poses(path, extra.plan, kinds)
+    return f"wrote {path}: {extra.n_poses} poses, {len(extra.plan)} visits"
+
+
+def write_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str]) -> None:
+    """Write visits (rows of `plan`, in the order of measuring) as plan.csv, which `simulate` reads.
+
+    Angles in degrees, travel in mm, force, approach direction and time where the plan has them.  A
+    pose that is visited again under the same force is a configuration of its own: 4, 4/2, ….
+    Raises InputError where the place cannot be written.
+    """
+    import numpy as np
+
+    from elastocal.design.plan_file import PlanRows, write_plan
+
+    names = []
+    visits: Counter[tuple[int, bytes]] = Counter()
+    for code, force in zip(plan.configuration, plan.force + 0.0, strict=True):
+        visits[key := (int(code), force.tobytes())] += 1
+        again = f"/{visits[key]}" if visits[key] > 1 else ""
+        names.append(plan.configuration_labels[code] + again)
+    approach = None if plan.approach is None else plan.approach.astype(np.int64)
+    # `simulate` takes the time of a plan's row as that of its readings.
+    time = {} if plan.time is None else {"time_s": [repr(float(t)) for t in plan.time]}
+    rows = PlanRows(
+        configuration=tuple(names),
+        q=plan.q,
+        level=np.ones(len(plan), dtype=np.int64),
+        order=np.arange(1, len(plan) + 1),
+        force=plan.force,
+        approach=approach,
+        notes=time,
+    )
+    write_plan(path, rows, kinds)

@@ -1,0 +1,76 @@
+"""The gap, step by step: from the nominal arm through the fitted effects to the noise floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.heldout import left_out_residual, noise_rms, rms_with_interval
+from elastocal.diagnosis.model_set import ModelSet, fit_columns
+from elastocal.diagnosis.noise import NoisyData, project
+from elastocal.diagnosis.result import Gap, Step
+from elastocal.diagnosis.scene import Scene
+from elastocal.diagnosis.search import Found
+from elastocal.identification.solve import PLACED_EFFECTS
+from elastocal.manipulator.effects import CATALOGUE
+
+Array = NDArray[np.float64]
+
+
+def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, tuple[Step, ...]]:
+    """Held-out 3-D errors of each step, and the gap they add up to.
+
+    `scene` is about the fit without further effects.
+    """
+    nothing, chosen = found.nothing, found.chosen
+    steps = [
+        _step(name, data, nothing, rng) for name, data in _fitted_steps(scene)
+    ]  # fmt: skip
+    known = [k for k, item in enumerate(chosen.items) if item.known]
+    for n in range(len(known)):
+        part = known[: n + 1]
+        items = tuple(chosen.items[k] for k in part)
+        scales = tuple(chosen.scales[k] for k in part)
+        data = fit_columns(found.scene, replace(chosen, items=items), scales)
+        steps.append(_step(items[-1].label.replace(" at ", ":"), data, chosen, rng))
+    floor = noise_rms(chosen.data, chosen.noise)
+    calibrated = steps[len(steps) - len(known) - 1].heldout_rms
+    nominal = steps[0].heldout_rms
+    gap = Gap(nominal, calibrated, steps[-1].heldout_rms, floor)
+    return gap, (*steps, Step("noise_floor", floor, (floor, floor)))
+
+
+def _step(name: str, data: NoisyData, fitted: ModelSet, rng: np.random.Generator) -> Step:
+    residual = left_out_residual(project(data, fitted.noise))
+    rms, interval = rms_with_interval(data, residual, rng)
+    return Step(name, rms, interval)
+
+
+def _fitted_steps(scene: Scene) -> list[tuple[str, NoisyData]]:
+    """The model's own effects, stage by stage, those of later steps held at nominal."""
+    stage = np.array([_stage(effect) for effect in scene.fitted.effect])
+    names = ("base_frame", "geometry", "compliance")
+    steps = []
+    for k, name in enumerate(names):
+        if k > 0 and not (stage == k).any():
+            continue
+        free = stage <= k
+        held = scene.data.X[:, :, ~free] @ scene.fitted.moved[~free]
+        data = scene.data
+        steps.append(
+            (
+                name,
+                replace(
+                    data, r=data.r + held, X=data.X[:, :, free], precision=data.precision[free]
+                ),
+            )
+        )
+    return steps
+
+
+def _stage(effect: str) -> int:
+    if effect in PLACED_EFFECTS:
+        return 0
+    return 2 if CATALOGUE[effect].stage in ("compliance", "load") else 1

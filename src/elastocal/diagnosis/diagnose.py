@@ -1,0 +1,159 @@
+"""Why the arm still differs from its model: the whole diagnosis, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.budget import budget
+from elastocal.diagnosis.confirm import Shrinkage, shrinkage
+from elastocal.diagnosis.curves import curves_of
+from elastocal.diagnosis.extend import settings_of
+from elastocal.diagnosis.floor import noise_floor
+from elastocal.diagnosis.generic import generic_blocks
+from elastocal.diagnosis.hypotheses import Hypothesis, possible
+from elastocal.diagnosis.listing import candidates, too_small, warnings
+from elastocal.diagnosis.locate import location, structure_tests
+from elastocal.diagnosis.model_set import ModelSet, fit_set
+from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.diagnosis.refit import refit
+from elastocal.diagnosis.result import Diagnosis, Finding
+from elastocal.diagnosis.scene import scene_of
+from elastocal.diagnosis.screen import screen
+from elastocal.diagnosis.search import Found, Search
+from elastocal.diagnosis.verdict import Answer, judge
+from elastocal.errors import InsufficientDataError
+from elastocal.identification.checks import check_table
+from elastocal.manipulator.model import Model
+from elastocal.measurements import Measurements
+
+Progress = Callable[[str], None]
+
+FEWEST = 8  # configurations
+WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as the truth
+
+
+def diagnose(
+    model: Model,
+    table: Measurements,
+    options: DiagnosisOptions | None = None,
+    progress: Progress = lambda message: None,
+) -> Diagnosis:
+    """Where the gap between model and measurement lies, what causes it, how far it shrinks.
+
+    The cell's effects are fitted; noise floor and faulty readings come first; every effect of the
+    catalogue at every place, and smooth dependences without a name, are then judged by their
+    marginal likelihood; what is claimed has to beat the whole family under sign flips.
+
+    Raises InputError for data that contradict robot or cell, InsufficientDataError where there
+    are too few configurations to tell an effect from noise.
+    """
+    options = options or DiagnosisOptions()
+    check_table(model, table)
+    _check_enough(table)
+    progress("fitting the model as it is")
+    base = fit_baseline(model, table, options.seed)
+    hypotheses, untested = possible(model, table, options.without)
+    progress("columns of what could be missing")
+    scene = scene_of(base, hypotheses)
+    progress("noise floor")
+    complete = scene
+    scene, noise = screen(complete)
+    progress("searching for what is missing")
+    generic = generic_blocks(scene)
+    found = Search(scene, generic, noise, options.false_alarm, options.seed).run()
+    if found.chosen.items:
+        # Beside a large effect nothing looks faulty, or the wrong readings do.
+        first = scene.data.X.shape[2]
+        data = found.chosen.data
+        again, noise = screen(complete, data.X[:, :, first:], data.precision[first:])
+        if (again.data.left_out != scene.data.left_out).any():
+            progress("searching again without faulty readings")
+            scene = again
+            found = Search(scene, generic, noise, options.false_alarm, options.seed).run()
+    answer = judge(found)
+    progress("confirming")
+    rng = np.random.default_rng(options.seed)
+    gap, steps = budget(scene, found, rng)
+    findings = _findings(found, answer, rng)
+    tests = structure_tests(found.first)
+    chosen = found.chosen
+    p_first = (1 + int((found.first.flipped >= found.first.odds).sum())) / (
+        1 + len(found.first.flipped)
+    )
+    each, nothing = found.slots[0].probabilities()
+    unknown = sum(
+        float(p) for item, p in zip(found.slots[0].items, each, strict=True) if not item.known
+    )
+    return Diagnosis(
+        verdict=answer.verdict,
+        gap=gap,
+        budget=steps,
+        effects=findings,
+        candidates=candidates(scene, found, answer),
+        indistinguishable=answer.indistinguishable,
+        location=location(found, tests),
+        noise=noise_floor(found.scene, chosen.data, chosen.noise),
+        structure=tests,
+        probability_nothing=nothing,
+        probability_unknown=unknown,
+        p_value=found.p_values[0] if found.p_values else p_first,
+        curves=curves_of(found.scene, chosen),
+        untested=(*untested, *too_small(scene, found)),
+        warnings=warnings(scene, found),
+        n_readings=scene.blocks.n,
+        n_configurations=len(scene.blocks.member),
+    )
+
+
+def _check_enough(table: Measurements) -> None:
+    n = len(np.unique(table.configuration))
+    if n < FEWEST:
+        raise InsufficientDataError(
+            f"{table.source}: {n} configurations are too few to tell a missing effect from noise; "
+            f"measure {FEWEST} at least, better 30 or more"
+        )
+
+
+def _findings(found: Found, answer: Answer, rng: np.random.Generator) -> tuple[Finding, ...]:
+    """The known items with their probabilities, parameters and confirmed shrinkage."""
+    chosen, scene = found.chosen, found.scene
+    known = [k for k, item in enumerate(chosen.items) if item.known]
+    if not known:
+        return ()
+    parameters = refit(scene, chosen)
+    findings = []
+    for k in known:
+        what = chosen.items[k].what
+        assert isinstance(what, Hypothesis)
+        fall = _shrinkage(found, answer, k, rng)
+        findings.append(
+            Finding(
+                what.name,
+                what.where,
+                answer.probability[k],
+                fall.reduction,
+                fall.ci90,
+                fall.ci95,
+                parameters[what.name, what.where],
+                settings_of(chosen.items[k]),
+            )
+        )
+    return tuple(findings)
+
+
+def _shrinkage(found: Found, answer: Answer, k: int, rng: np.random.Generator) -> Shrinkage:
+    """How far adding item k shrinks the error, the other items being in the model already."""
+    chosen, scene = found.chosen, found.scene
+    before = found.nothing if len(chosen.items) == 1 else fit_set(
+        scene, chosen.without(k), chosen.noise
+    )  # fmt: skip
+    truths: list[tuple[ModelSet, float]] = [(chosen, answer.probability[k])]
+    for item, p in answer.rivals[k][1:]:
+        if p > WORTH_A_DRAW:
+            items = (*chosen.items[:k], replace(item, log_prior=0.0), *chosen.items[k + 1 :])
+            truths.append((fit_set(scene, items, chosen.noise), p))
+    return shrinkage(before, chosen, truths, rng)

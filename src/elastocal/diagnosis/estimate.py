@@ -1,0 +1,44 @@
+"""Linear estimates of a set: posterior means of what its columns stand for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.model_set import Item, ModelSet
+from elastocal.diagnosis.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+def posterior_mean(chosen: ModelSet) -> Array:
+    """Mean (p,) of the coefficients of the set's data: fitted columns first, then the items'."""
+    at, data = chosen.at, chosen.data
+    return np.asarray(at.beta_deviation.T @ np.einsum("cmp,cm->p", at.H, data.masked(data.r)))
+
+
+def linear_estimates(scene: Scene, chosen: ModelSet) -> dict[str, float]:
+    """Linear estimates of the known items' parameters by name."""
+    mean = posterior_mean(chosen)
+    first = scene.data.X.shape[2]
+    out: dict[str, float] = {}
+    for item in chosen.items:
+        count = item_width(scene, item)
+        if isinstance(item.what, Hypothesis):
+            size = scene.sizes[item.what.name, item.what.where]
+            values = mean[first : first + count] * size
+            for p, v in zip(item.what.parameters, values, strict=True):
+                out[f"{item.what.where}.{p.key}"] = float(v) + p.nominal
+        first += count
+    return out
+
+
+def item_width(scene: Scene, item: Item) -> int:
+    """Number of columns of an item."""
+    if isinstance(item.what, Hypothesis):
+        return len(item.what.parameters)
+    if item.what.columns is not None:
+        return item.what.columns.shape[2]
+    assert item.what.drive is not None
+    return item.what.drive.shape[3]

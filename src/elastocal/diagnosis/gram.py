@@ -1,0 +1,54 @@
+"""Spectra of hypotheses and blocks beside a model, each entry's sums computed once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.columns import EntryKey, entry_key, is_driven
+from elastocal.diagnosis.evidence import SCALES, UNSIZED_SCALES, Spectrum
+from elastocal.diagnosis.generic import Generic
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.noise import NoisyData, Projection
+from elastocal.diagnosis.scene import Scene
+from elastocal.diagnosis.sums import EntrySums, direct
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Grams:
+    """Spectra against `data` under the noise of its projection `at`."""
+
+    scene: Scene
+    data: NoisyData
+    at: Projection
+    _entries: dict[EntryKey, EntrySums] = field(init=False, default_factory=dict)
+
+    def entry(self, key: EntryKey) -> EntrySums:
+        if key not in self._entries:
+            E = self.data.masked(self.scene.entry(key))
+            self._entries[key] = EntrySums.of(E, self.scene.places, self.at)
+        return self._entries[key]
+
+    def of_hypothesis(self, h: Hypothesis, settings: Array | None = None) -> Spectrum:
+        """At every one of the `settings` (G, …), by default those of the search."""
+        if not is_driven(h):
+            return direct(self.data.masked(self.scene.packed(h, np.zeros(0))), self.at)
+        if settings is None:
+            settings = self.scene.grids[h.name, h.where].values
+        key = entry_key(h, self.scene.base.model)
+        return self.entry(key).driven(self.scene.drive(h, settings))
+
+    def of_block(self, g: Generic) -> Spectrum:
+        if g.columns is not None:
+            return direct(self.data.masked(g.columns), self.at)
+        assert g.entry is not None and g.drive is not None
+        return self.entry(g.entry).driven(g.drive[None])
+
+
+def scales_of(h: Hypothesis) -> Array:
+    """Scales of the size prior: wider where no typical size is known."""
+    return UNSIZED_SCALES if any(p.typical is None for p in h.parameters) else SCALES

@@ -1,0 +1,54 @@
+"""Errors on configurations left out of the fit, in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.blocks import Blocks
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, Projection, covariance
+
+Array = NDArray[np.float64]
+
+DRAWS = 1000
+
+
+def left_out_residual(at: Projection) -> Array:
+    """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others."""
+    P = at.inverse - at.H @ at.H.transpose(0, 2, 1)
+    return np.asarray(np.linalg.solve(P, at.u[..., None])[..., 0])
+
+
+def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
+    """Per configuration: Σ of squared 3-D lengths of `packed` (C, m), and the number of readings.
+
+    Of a pose the position counts, of a distance its one component.
+    """
+    C, M = data.blocks.member.shape
+    size = data.blocks.size
+    used = ~data.left_out.reshape(C, M, size)[:, :, 0]
+    part = packed.reshape(C, M, size)[:, :, : min(size, 3)]
+    return ((part**2).sum(axis=2) * used).sum(axis=1), used.sum(axis=1)
+
+
+def rms_with_interval(
+    data: NoisyData, packed: Array, rng: np.random.Generator
+) -> tuple[float, tuple[float, float]]:
+    """3-D rms in m of residuals (C, m) and its 95 % interval by resampling configurations."""
+    squares, count = squared_lengths(data, packed)
+    rms = float(np.sqrt(squares.sum() / count.sum()))
+    weight = rng.dirichlet(np.ones(len(squares)), DRAWS)
+    drawn = np.sqrt((weight @ squares) / (weight @ count))
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return rms, (float(low), float(high))
+
+
+def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
+    """3-D rms in m that the noise alone gives a reading."""
+    V = covariance(data, noise)
+    variance = np.diagonal(V, axis1=1, axis2=2) * ~data.left_out
+    blocks: Blocks = data.blocks
+    C, M = blocks.member.shape
+    part = variance.reshape(C, M, blocks.size)[:, :, : min(blocks.size, 3)]
+    used = ~data.left_out.reshape(C, M, blocks.size)[:, :, 0]
+    return float(np.sqrt(part.sum() / used.sum()))

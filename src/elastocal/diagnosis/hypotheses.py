@@ -1,0 +1,92 @@
+"""What might be missing from the model: every effect at every place where it could act."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from elastocal.cell import Cell, EffectChoice
+from elastocal.diagnosis.result import Untested
+from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.effects.base import Effect, Stage
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.parameter import ParameterSpec, Setting
+from elastocal.measurements import Measurements
+
+# What each need of an effect asks the user to record.
+RECORD = {
+    "time": ("the table has no time column", "record time_s or time_min of every reading"),
+    "approach": (
+        "the table does not say from which side each joint came to rest",
+        "record approach_1 … (+1 or -1), and visit some poses from both sides",
+    ),
+    "temperature": ("the table has no temperature column", "record temperature_C"),
+    "load": ("no reading is loaded", "measure some poses with and without a load"),
+}
+ALWAYS = ("payload", "link_gravity")  # loads without parameters
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One effect at one place that the model does not have."""
+
+    effect: Effect
+    where: str
+    parameters: tuple[ParameterSpec, ...]
+    settings: tuple[Setting, ...]
+
+    @property
+    def name(self) -> str:
+        return self.effect.name
+
+    @property
+    def stage(self) -> Stage:
+        return self.effect.stage
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} at {self.where}"
+
+    @property
+    def choice(self) -> EffectChoice:
+        return EffectChoice(self.name, self.where)
+
+
+def possible(
+    model: Model, table: Measurements, without: tuple[str, ...] = ()
+) -> tuple[list[Hypothesis], list[Untested]]:
+    """Hypotheses that the table's columns can test, and the effects it cannot, with advice."""
+    chain, cell = model.chain, model.cell
+    active = {(p.effect, p.where) for p in model.parameters}
+    hypotheses: list[Hypothesis] = []
+    untested: list[Untested] = []
+    for name, effect in CATALOGUE.items():
+        if name in without or name in ALWAYS:
+            continue
+        if name == "marker_orientation" and cell.model.observe != "pose":
+            continue
+        if name == "distance_sensor" and cell.model.observe != "distance":
+            continue
+        places = [w for w in effect.places(chain, cell) if (name, w) not in active]
+        lacking = [need for need in effect.needed(cell) if not recorded(table, need)]
+        if lacking:
+            reason, advice = RECORD[lacking[0]]
+            untested += [Untested(name, w, reason, advice) for w in places]
+            continue
+        hypotheses += [_at(effect, w, chain, cell) for w in places]
+    return [h for h in hypotheses if h.parameters], untested
+
+
+def recorded(table: Measurements, need: str) -> bool:
+    """Whether the table says what an effect needs, with more than one value of it."""
+    if need == "load":
+        return bool(np.any(table.force != 0))
+    values = getattr(table, need)
+    return values is not None and bool(np.any(values != values[:1]))
+
+
+def _at(effect: Effect, where: str, chain: Chain, cell: Cell) -> Hypothesis:
+    parameters = effect.parameters(where, chain, cell)
+    return Hypothesis(effect, where, parameters, effect.settings(where, chain, cell))

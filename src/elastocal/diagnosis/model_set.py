@@ -1,0 +1,152 @@
+"""A set of additions to the model, with the noise that goes with it and its evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from elastocal.diagnosis.columns import is_driven
+from elastocal.diagnosis.evidence import SCALES
+from elastocal.diagnosis.generic import Generic
+from elastocal.diagnosis.gram import Grams, scales_of
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.noise import (
+    NoiseValues,
+    NoisyData,
+    Projection,
+    fit_noise,
+    log_prior,
+    project,
+)
+from elastocal.diagnosis.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Item:
+    """One addition: a hypothesis at its settings, or a block without a name.
+
+    `log_prior` is the log of its prior odds, the search over its settings included.
+    """
+
+    what: Hypothesis | Generic
+    settings: Array
+    log_prior: float
+
+    @property
+    def known(self) -> bool:
+        return isinstance(self.what, Hypothesis)
+
+    @property
+    def label(self) -> str:
+        return self.what.label
+
+    @property
+    def scales(self) -> Array:
+        return scales_of(self.what) if isinstance(self.what, Hypothesis) else SCALES
+
+    def same_as(self, other: Item) -> bool:
+        return self.what is other.what
+
+
+@dataclass(frozen=True)
+class ModelSet:
+    """Additions `items` to the fitted model, noise fitted beside them, and the log posterior.
+
+    `score` = log evidence at the fitted noise, sizes mixed, + log prior of noise and items.
+    `data` holds the items' columns at the best of their scales, `scales` (items,).
+    """
+
+    items: tuple[Item, ...]
+    noise: NoiseValues
+    data: NoisyData
+    score: float
+    scales: tuple[float, ...]
+
+    @cached_property
+    def at(self) -> Projection:
+        return project(self.data, self.noise)
+
+    @property
+    def unknown(self) -> bool:
+        return any(not item.known for item in self.items)
+
+    def without(self, k: int) -> tuple[Item, ...]:
+        return self.items[:k] + self.items[k + 1 :]
+
+
+def packed_columns(scene: Scene, item: Item) -> Array:
+    """Columns (C, m, k) of an item, scaled to its typical sizes."""
+    what = item.what
+    if isinstance(what, Hypothesis):
+        return scene.packed(what, item.settings)
+    if what.columns is not None:
+        return what.columns
+    assert what.entry is not None and what.drive is not None
+    E = scene.entry(what.entry)  # (C, m, d)
+    drive = np.einsum("cmv,cvdk->cmdk", scene.places.one_hot, what.drive)
+    return np.einsum("cmd,cmdk->cmk", E, drive)
+
+
+def fit_set(scene: Scene, items: tuple[Item, ...], start: NoiseValues | None = None) -> ModelSet:
+    """Fit the noise beside the items, twice where their best scale is not the typical one."""
+    columns = [scene.data.masked(packed_columns(scene, item)) for item in items]
+
+    def joined(scales: tuple[float, ...]) -> NoisyData:
+        data = scene.data
+        for C, s in zip(columns, scales, strict=True):
+            data = data.with_columns(C, np.full(C.shape[2], 1 / s**2))
+        return data
+
+    scales = tuple(1.0 for _ in items)
+    noise, start = start, start
+    options = list(product(*[item.scales for item in items]))
+    for _ in range(2):
+        noise = fit_noise(joined(scales), noise)
+        each = np.array([project(joined(s), noise).marginal for s in options])
+        best = options[int(np.argmax(each))]
+        if best == scales:
+            break
+        scales = best
+    assert noise is not None
+    mixed = float(logsumexp(each)) - np.log(len(options))
+    prior = sum(item.log_prior for item in items) - 0.5 * log_prior(scene.data.stated, noise)[0]
+    return ModelSet(items, noise, joined(scales), mixed + prior, scales)
+
+
+def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
+    """Item k's settings refined between the grid's points, at the set's noise."""
+    item = chosen.items[k]
+    what = item.what
+    if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
+        return chosen
+    (setting,) = what.settings
+    if setting.kind == "change_time":
+        return chosen
+    others = replace(chosen, items=chosen.without(k))
+    data = fit_columns(scene, others, chosen.scales[:k] + chosen.scales[k + 1 :])
+    grams = Grams(scene, data, project(data, chosen.noise))
+    grid = scene.grids[what.name, what.where]
+    near = int(np.abs(grid.values[:, 0] - item.settings[0]).argmin())
+    width, centre = float(grid.step[near, 0]), float(item.settings[0])
+    for _ in range(3):
+        trial = np.clip(centre + np.linspace(-width, width, 21), setting.lower, setting.upper)
+        found = grams.of_hypothesis(what, trial[:, None]).evidence(item.scales)
+        centre, width = float(trial[int(np.argmax(found))]), width / 8
+    refined = replace(item, settings=np.array([centre]))
+    return fit_set(scene, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), chosen.noise)
+
+
+def fit_columns(scene: Scene, chosen: ModelSet, scales: tuple[float, ...]) -> NoisyData:
+    """The scene's data with the set's columns at the given scales."""
+    data = scene.data
+    for item, s in zip(chosen.items, scales, strict=True):
+        C = scene.data.masked(packed_columns(scene, item))
+        data = data.with_columns(C, np.full(C.shape[2], 1 / s**2))
+    return data

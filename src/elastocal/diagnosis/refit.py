@@ -1,0 +1,52 @@
+"""The nonlinear fit of the model with the found effects in it, weighted by the fitted noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.estimate import linear_estimates
+from elastocal.diagnosis.extend import extended
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.model_set import ModelSet
+from elastocal.diagnosis.noise import project
+from elastocal.diagnosis.result import FittedParameter
+from elastocal.diagnosis.scene import Scene, widths
+
+Array = NDArray[np.float64]
+
+
+def refit(scene: Scene, chosen: ModelSet) -> dict[tuple[str, str], tuple[FittedParameter, ...]]:
+    """Parameters of the known items with standard deviations, by effect and place.
+
+    Levenberg–Marquardt on the exact model from the linear estimate, then one step with the full
+    covariance of the noise at its end.
+    """
+    known = [item for item in chosen.items if item.known]
+    model = extended(scene.base.model, known)
+    start = dict(zip(scene.base.model.names, scene.base.x, strict=True)) | linear_estimates(
+        scene, chosen
+    )
+    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
+    base = fit_baseline(model, scene.base.seen.table, x0=x0)
+    seen, width = base.seen, widths(base)
+    at = model.regressor(seen.table, base.x, observations=seen)
+    B = at.B.reshape(len(seen.lead), seen.size, -1) * width
+    data = scene.data
+    data = replace(
+        data, r=scene.blocks.pack(at.residual.reshape(-1, seen.size, 1))[:, :, 0],
+        X=scene.blocks.pack(B), precision=np.ones(B.shape[2]),
+    )  # fmt: skip
+    fit = project(data, chosen.noise)
+    step = fit.beta_deviation.T @ np.einsum("cmp,cm->p", fit.H, data.masked(data.r))
+    x = base.x + width * step
+    std = width * np.linalg.norm(fit.beta_deviation, axis=0)
+    out: dict[tuple[str, str], list[FittedParameter]] = {}
+    for k, p in enumerate(model.parameters):
+        found = FittedParameter(p.name, float(x[k]), p.unit, float(std[k]))
+        out.setdefault((p.effect, p.where), []).append(found)
+    keys = [(i.what.name, i.what.where) for i in known if isinstance(i.what, Hypothesis)]
+    return {key: tuple(out[key]) for key in keys}

@@ -1,0 +1,195 @@
+"""What a diagnosis says: verdict, effects, candidates, location, noise floor, budget."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from elastocal.diagnosis.separate_result import ExtraPlan
+from elastocal.manipulator.effects.base import Stage
+
+Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class EffectAt:
+    """An effect at a place, e.g. gear_eccentricity at joint2."""
+
+    effect: str
+    where: str
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A parameter of an added effect after the nonlinear refit, in `unit` (SI)."""
+
+    name: str
+    value: float
+    unit: str
+    std: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect held to be real (or, where the verdict is ambiguous, the likeliest of a set).
+
+    `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
+    the 3-D error of noise-free fresh poses falls when the effect joins the model, with 90 and 95 %
+    intervals.  `settings` are its searched constants (orders, times) by their keys.
+    """
+
+    effect: str
+    where: str
+    probability: float
+    gap_reduction: float
+    gap_reduction_ci90: Interval
+    gap_reduction_ci95: Interval
+    parameters: tuple[FittedParameter, ...]
+    settings: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis that was tried.
+
+    `score` is the log of its marginal likelihood over that of no further effect (nats);
+    `detectable` the distance d, in standard deviations, that its typical size moves the data
+    once the fitted parameters have followed: below about 3 these data could not show it.
+    """
+
+    effect: str
+    where: str
+    stage: Stage
+    probability: float
+    score: float
+    detectable: float
+    settings: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Untested:
+    """An effect the data cannot test, why, and what to record or measure so that they can."""
+
+    effect: str
+    where: str
+    reason: str
+    advice: str
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the gap budget: 3-D rms error (m) on configurations left out of the fit."""
+
+    step: str
+    heldout_rms: float
+    ci95: Interval
+
+
+@dataclass(frozen=True)
+class Gap:
+    """3-D rms marker errors in m on held-out poses; the noise floor is what noise alone gives."""
+
+    nominal: float
+    calibrated: float
+    explained: float
+    noise_floor: float
+
+
+@dataclass(frozen=True)
+class StructureTest:
+    """Does the residual depend on `driver` at all?  Names no effect.
+
+    `driver` is "joint2 angle", "joint3 torque", "time", "load", "approach of joint1", ….
+    `p_value` by sign flips of whole configurations, for the largest statistic of the driver's
+    tests; `p_family` the same against the largest over all drivers.
+    """
+
+    driver: str
+    p_value: float
+    p_family: float
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The shape of an unknown dependence: motion of `entry` as a smooth function of `driver`.
+
+    `x` in `x_unit` over the measured range, `y` and its standard deviation `sd` in `y_unit`.
+    One curve per component of the entry that moves.
+    """
+
+    driver: str
+    x_unit: str
+    entry: str
+    y_unit: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    sd: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where the gap lies.  `evidence`: probability of each stage and of each place, and p-values
+    that name no effect."""
+
+    stage: Stage
+    where: str
+    probability: float
+    stages: dict[str, float]
+    places: dict[str, float]
+    drivers: dict[str, float]
+
+
+@dataclass(frozen=True)
+class FaultyReading:
+    """A reading left out: line of the table, configuration, marker, error in m and in sigmas."""
+
+    line: int
+    configuration: str
+    marker: str
+    error: float
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """The noise that the data themselves show.
+
+    `stated_factor`: tracker noise in units of what is stated (`stated` says whether anything
+    was).  `reading_sigma` (m): rms per axis of a single reading.  `repeatability` (joints,) in rad
+    or m: scatter of each joint from visit to visit.  `shared`: scatter common to all visits of
+    a configuration, as a multiple of it.  `pure_error` (m): rms per axis within repeats, None
+    without repeats.
+    """
+
+    stated: bool
+    stated_factor: float
+    reading_sigma: float
+    repeatability: tuple[float, ...]
+    shared: float
+    pure_error: float | None
+    faulty: tuple[FaultyReading, ...] = ()
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole answer.  `p_value`: of what was found, against the whole family of hypotheses."""
+
+    verdict: Verdict
+    gap: Gap
+    budget: tuple[Step, ...]
+    effects: tuple[Finding, ...]
+    candidates: tuple[Candidate, ...]
+    indistinguishable: tuple[tuple[EffectAt, ...], ...]
+    location: Location | None
+    noise: NoiseFloor
+    structure: tuple[StructureTest, ...]
+    probability_nothing: float
+    probability_unknown: float
+    p_value: float
+    curves: tuple[Curve, ...] = ()
+    untested: tuple[Untested, ...] = ()
+    warnings: tuple[str, ...] = ()
+    n_readings: int = 0
+    n_configurations: int = 0
+    extra: ExtraPlan | None = field(default=None)

@@ -1,0 +1,217 @@
+"""Everything that a diagnosis looks at: readings in blocks, fitted columns, what could be added."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.diagnosis.blocks import Blocks
+from elastocal.diagnosis.columns import (
+    Columns,
+    Drive,
+    EntryKey,
+    compute_columns,
+    entry_key,
+    is_driven,
+    typical_sizes,
+)
+from elastocal.diagnosis.hypotheses import Hypothesis, recorded
+from elastocal.diagnosis.noise import NoisyData
+from elastocal.diagnosis.settings_grid import Grid, grid_of
+from elastocal.diagnosis.sums import VisitPlaces
+from elastocal.identification.solve import is_placed
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.model import Model
+from elastocal.measurements import Measurements
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough
+# to leave them to the data, narrow enough that what no reading shows stays where it is.
+FITTED, FITTED_COMPLIANCE = 5.0, 1.0
+PLACED = 5e-3  # m or rad: base and markers, which the fit has placed already
+KEPT = 1_000_000  # numbers of a search's drives that are kept from scan to scan
+# The load hangs on a flange frame that the markers' freedom leaves undetermined to millimetres.
+LOAD_POINT_TOLERANCE = 2e-3
+
+
+@dataclass(frozen=True)
+class FittedColumns:
+    """What the columns of the data's X are: `effect` of each, `width` (p,) by which it is scaled,
+    and `moved` (p,), how far the fit is from nominal in that width."""
+
+    effect: tuple[str, ...]
+    width: Array
+    moved: Array
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A baseline with the columns of all hypotheses, packed by configuration.
+
+    `data` holds residual, fitted columns (scaled to their prior deviations) and noise shapes.
+    """
+
+    base: Baseline
+    columns: Columns
+    hypotheses: tuple[Hypothesis, ...]
+    blocks: Blocks
+    places: VisitPlaces
+    data: NoisyData
+    fitted: FittedColumns
+
+    @cached_property
+    def _kept(self) -> dict[tuple[str, str, bytes], Array]:
+        return {}
+
+    @cached_property
+    def visit_table(self) -> Measurements:
+        """One row for each visit (C·v), the first of its readings."""
+        return self.base.seen.table.take(
+            self.base.seen.lead[np.maximum(self.places.example, 0)].ravel()
+        )
+
+    @property
+    def present(self) -> Mask:
+        """Which of the visits' places (C, v) hold one."""
+        return self.places.example >= 0
+
+    def pack(self, rows: Array) -> Array:
+        """Per table row (n_rows, size, k) → packed (C, m, k), zero where left out."""
+        return self.data.masked(self.blocks.pack(self.columns.observed(rows)))
+
+    def entry(self, key: EntryKey) -> Array:
+        return self.pack(self.columns.entry(key))
+
+    @cached_property
+    def sizes(self) -> dict[tuple[str, str], Array]:
+        """Typical size of every hypothesis' parameters, by effect and place."""
+        return {(h.name, h.where): self._sizes(h) for h in self.hypotheses}
+
+    def _sizes(self, h: Hypothesis) -> Array:
+        if is_driven(h):
+            return np.array([p.typical or 0.0 for p in h.parameters])
+        return typical_sizes(h, self.columns.observed(self.columns.of(h)))
+
+    @cached_property
+    def drives(self) -> dict[tuple[str, str], Drive]:
+        return {
+            (h.name, h.where): Drive(h, self.base.model) for h in self.hypotheses if is_driven(h)
+        }
+
+    @cached_property
+    def grids(self) -> dict[tuple[str, str], Grid]:
+        """Settings that are searched, by effect and place."""
+        table, model = self.visit_table.take(self.present.ravel()), self.base.model
+        return {
+            (h.name, h.where): grid_of(h, table, model.chain)
+            for h in self.hypotheses
+            if is_driven(h)
+        }
+
+    def drive(self, h: Hypothesis, settings: Array) -> Array:
+        """D (G, C, v, d, k) at each visit, per typical size, at `settings` (G, …)."""
+        key = h.name, h.where, settings.tobytes()
+        if key in self._kept:
+            return self._kept[key]
+        D = self.drives[h.name, h.where](self.visit_table, settings)
+        D = D.reshape(len(settings), *self.present.shape, *D.shape[2:])
+        D = D * self.present[None, :, :, None, None] * self.sizes[h.name, h.where]
+        if D.size < KEPT:
+            self._kept[key] = D
+        return D
+
+    def packed(self, h: Hypothesis, settings: Array) -> Array:
+        """Columns (C, m, k) of a hypothesis at one value of its `settings` (…,), scaled."""
+        size = self.sizes[h.name, h.where]
+        if not is_driven(h):
+            return self.pack(self.columns.of(h)) * size
+        D = self.drives[h.name, h.where](self.base.seen.table, settings[None])[0]
+        rows = self.columns.entry(entry_key(h, self.base.model)) @ D
+        return self.pack(rows) * size
+
+    def without(self, faulty: Mask) -> Scene:
+        """The same with the observations where `faulty` (N,) holds left out."""
+        return replace(self, data=self.data.without(faulty))
+
+
+def scene_of(
+    base: Baseline,
+    hypotheses: list[Hypothesis],
+    around: Model | None = None,
+    x: Array | None = None,
+) -> Scene:
+    """Compute all columns at the baseline's fit and gather them by configuration.
+
+    `around` is the base's model with some of the hypotheses in it, at its values x: columns are
+    those there, and the residual is the baseline's.
+    """
+    model, seen = base.model, base.seen
+    hook = _load_hypothesis(base)
+    known = {(h.name, h.where) for h in hypotheses}
+    asked = [*hypotheses, *(h for h in hook if (h.name, h.where) not in known)]
+    if around is None or x is None:
+        around, x = model, base.x
+    columns = compute_columns(base, asked, dict(zip(around.names, x, strict=True)))
+    blocks = base.blocks
+    own = np.array([around.names.index(name) for name in model.names], dtype=np.int64)
+    at = around.regressor(seen.table, x, own, seen)
+    width = widths(base)
+    moved = (base.x - model.nominal) / width
+    effects = [p.effect for p in model.parameters]
+    B = at.B.reshape(len(seen.lead), seen.size, -1) * width
+    for h in hook:
+        keys = [k for k, p in enumerate(h.parameters) if p.key.startswith("load_point")]
+        shift = columns.observed(columns.of(h)[:, :, keys]) * LOAD_POINT_TOLERANCE
+        B = np.concatenate([B, shift], axis=2)
+        width = np.append(width, np.full(len(keys), LOAD_POINT_TOLERANCE))
+        moved, effects = np.append(moved, np.zeros(len(keys))), effects + [h.name] * len(keys)
+    used = np.abs(B).max(axis=(0, 1), initial=0.0) > 0
+    B = B[:, :, used]
+    n_joints = model.chain.n_joints
+    names = [("joint_motion", f"joint{i + 1}") for i in range(n_joints)]
+    G = np.concatenate([columns.rows[:, :, columns.places[k]] for k in names], axis=2)[seen.lead]
+    stated = base.stated
+    if stated is None:
+        each = base.residual.reshape(-1, seen.size)
+        stated = np.tile(np.diag(np.maximum(each.var(axis=0), 1e-18)), (len(each), 1, 1))
+    data = NoisyData(
+        blocks=blocks,
+        r=blocks.pack(base.residual.reshape(-1, seen.size, 1))[:, :, 0],
+        X=blocks.pack(B),
+        precision=np.ones(B.shape[2]),
+        covariance=blocks.pack_square(stated),
+        G=blocks.pack(G),
+        same_visit=blocks.same_visit,
+        left_out=blocks.absent,
+        stated=base.stated is not None,
+    )
+    fitted = FittedColumns(
+        tuple(e for e, u in zip(effects, used, strict=True) if u), width[used], moved[used]
+    )
+    return Scene(base, columns, tuple(hypotheses), blocks, VisitPlaces.of(blocks), data, fitted)
+
+
+def widths(base: Baseline) -> Array:
+    """Prior standard deviation (parameters,) of each fitted parameter about the fit."""
+    compliant = [p.effect.endswith("compliance") for p in base.model.parameters]
+    wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
+    return np.where(is_placed(base.model), PLACED, wide)
+
+
+def _load_hypothesis(base: Baseline) -> list[Hypothesis]:
+    """The load's own error, whose hook point has a tolerance in any case."""
+    effect, model = CATALOGUE["payload_error"], base.model
+    if not recorded(base.seen.table, "load") or model.cell.model.torque == "measured":
+        return []
+    if any(p.effect == effect.name for p in model.parameters):
+        return []
+    return [
+        Hypothesis(effect, w, effect.parameters(w, model.chain, model.cell), ())
+        for w in effect.places(model.chain, model.cell)
+    ]

@@ -1,0 +1,231 @@
+"""Forward selection of what is missing, each step re-examined, under noise fitted beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from elastocal.diagnosis.generic import Generic
+from elastocal.diagnosis.model_set import Item, ModelSet, fit_set, refine
+from elastocal.diagnosis.noise import NoiseValues, log_prior
+from elastocal.diagnosis.prior import ANOTHER, Prior
+from elastocal.diagnosis.relinearise import is_far, relinearised, restarted
+from elastocal.diagnosis.scan import Scan, scan
+from elastocal.diagnosis.scene import Scene
+
+Array = NDArray[np.float64]
+
+FLIPS = 199
+CLOSE = 6  # candidates whose noise is fitted for themselves
+HOPELESS = -6.0  # score below which none is
+# Probability that nothing (more) is there above which nothing is claimed.
+DOUBT, DOUBT_MORE = 0.5, 0.05
+CLOSE_BLOCKS = 3
+MOST_EFFECTS = 4
+
+
+@dataclass(frozen=True)
+class Slot:
+    """What could stand in one place of the set, the other items given.
+
+    `options` are candidates with log posterior scores relative to nothing in that place; they
+    hold every hypothesis and block.
+    """
+
+    items: tuple[Item, ...]
+    scores: Array
+
+    def best_of(self, other: Slot) -> Slot:
+        """The same options, each with the higher score: both are bounds from below on what it
+        would be under the noise that suits it best."""
+        higher = other.scores > self.scores
+        items = tuple(
+            b if up else a for a, b, up in zip(self.items, other.items, higher, strict=True)
+        )
+        return Slot(items, np.maximum(self.scores, other.scores))
+
+    def probabilities(self) -> tuple[Array, float]:
+        """Of each option (K,), and of nothing."""
+        total = float(logsumexp(np.append(self.scores, 0.0)))
+        return np.exp(self.scores - total), float(np.exp(-total))
+
+
+@dataclass(frozen=True)
+class Found:
+    """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
+    p-value of every step against all that could have been found by chance.
+
+    `scene` is the one that the set was fitted on: columns about a fit with its large effects.
+    `first` is the scan beside nothing under its own noise, `alone` under the final noise.
+    """
+
+    scene: Scene
+    chosen: ModelSet
+    slots: tuple[Slot, ...]
+    p_values: tuple[float, ...]
+    nothing: ModelSet
+    first: Scan
+    alone: Scan
+
+
+def base_score(scene: Scene, current: ModelSet, seen: Scan) -> float:
+    """Log posterior of the set as it is under the scan's noise."""
+    items = sum(item.log_prior for item in current.items)
+    return seen.at.marginal + items - 0.5 * log_prior(scene.data.stated, seen.noise)[0]
+
+
+@dataclass
+class Search:
+    """The search's means: scene, blocks, flips of signs, and the level of a claim."""
+
+    scene: Scene
+    generic: list[Generic]
+    noise: NoiseValues
+    level: float
+    seed: int
+    signs: Array = field(init=False)
+    _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(self.seed)
+        C = len(self.scene.blocks.member)
+        self.signs = rng.choice([-1.0, 1.0], (FLIPS, C))
+
+    def run(self) -> Found:
+        scene = self.scene
+        nothing = current = fit_set(scene, (), self.noise)
+        seen = first = self._scan(current, flips=True)
+        slots: list[Slot] = []
+        p_values: list[float] = []
+        while True:
+            best, slot = self._best_addition(current, seen)
+            if best is None or len(current.items) >= MOST_EFFECTS:
+                break
+            # Score all again under the noise beside the winner: an effect that is still missing
+            # looks like noise, and hides others with it.
+            observed = self._scan(current, best.noise)
+            better, again = self._best_addition(current, observed)
+            best, slot = better, slot.best_of(again)
+            doubt = DOUBT_MORE if current.items else DOUBT
+            if best is None or slot.probabilities()[1] > doubt:
+                break
+            after = self._scan(best, flips=True)
+            p = (1 + int((after.flipped >= observed.odds).sum())) / (1 + len(after.flipped))
+            if p > self.level:
+                break
+            current, seen = best, after
+            slots.append(slot)
+            p_values.append(p)
+            if is_far(self.scene, current):
+                self.scene = relinearised(self.scene, current)
+                self._fitted.clear()
+                current = restarted(self.scene, current)
+                seen = self._scan(current)
+            if len(current.items) > 1:
+                current, slots, seen = self._reexamined(current, slots, seen)
+        if not slots:
+            slots = [slot]
+        alone = self._scan(nothing, current.noise) if current.items else first
+        return Found(self.scene, current, tuple(slots), tuple(p_values), nothing, first, alone)
+
+    def _scan(
+        self, current: ModelSet, noise: NoiseValues | None = None, flips: bool = False
+    ) -> Scan:
+        something = ANOTHER if current.items else None
+        prior = self._prior(something)
+        return scan(
+            self.scene,
+            self.generic,
+            prior,
+            current.data,
+            noise or current.noise,
+            self.signs if flips else self.signs[:0],
+        )
+
+    def _prior(self, something: float | None) -> Prior:
+        if something is None:
+            return Prior.of(self.scene.hypotheses, self.generic)
+        return Prior.of(self.scene.hypotheses, self.generic, something)
+
+    def _best_addition(self, current: ModelSet, seen: Scan) -> tuple[ModelSet | None, Slot]:
+        """The best set with one item more (None: none is better), and the slot it fills."""
+        options = self._options(current, seen)
+        slot = Slot(tuple(item for item, _ in options), np.array([s for _, s in options]))
+        base = current.score
+        close = self._close(slot)
+        best: ModelSet | None = None
+        scores = slot.scores.copy()
+        for k in close:
+            item = slot.items[k]
+            if any(item.same_as(other) for other in current.items):
+                scores[k] = -np.inf
+                continue
+            fitted = self._with(current, item)
+            scores[k] = fitted.score - base
+            if best is None or fitted.score > best.score:
+                best = fitted
+        if best is not None and best.score <= base:
+            best = None
+        return best, Slot(slot.items, scores)
+
+    def _options(self, current: ModelSet, seen: Scan) -> list[tuple[Item, float]]:
+        prior = self._prior(ANOTHER if current.items else None)
+        # Scores count from the set as it is, under the noise that suits it best.
+        offset = base_score(self.scene, current, seen) - current.score
+        options = []
+        for h, s, w in zip(self.scene.hypotheses, seen.scored, prior.hypotheses, strict=True):
+            # What the search over settings costs stays with the item.
+            item = Item(h, s.settings, float(w + s.evidence - s.best))
+            options.append((item, float(w + s.evidence + offset)))
+        for g, s, w in zip(self.generic, seen.blocks, prior.blocks, strict=True):
+            options.append((Item(g, s.settings, float(w)), float(w + s.evidence + offset)))
+        return options
+
+    def _with(self, current: ModelSet, item: Item) -> ModelSet:
+        """The set with one item more, its noise and settings fitted; kept, since it is asked for
+        again."""
+        items = (*current.items, item)
+        key = tuple((id(i.what), i.settings.tobytes(), i.log_prior) for i in items)
+        if key not in self._fitted:
+            fitted = fit_set(self.scene, items, current.noise)
+            self._fitted[key] = refine(self.scene, fitted, len(items) - 1)
+        return self._fitted[key]
+
+    def _close(self, slot: Slot) -> NDArray[np.int64]:
+        known = np.array([item.known for item in slot.items])
+        order = np.argsort(-slot.scores, kind="stable")
+        order = order[slot.scores[order] > HOPELESS]
+        hypotheses = order[known[order]][:CLOSE]
+        blocks = order[~known[order]][:CLOSE_BLOCKS]
+        return np.concatenate([hypotheses, blocks])
+
+    def _reexamined(
+        self, current: ModelSet, slots: list[Slot], seen: Scan
+    ) -> tuple[ModelSet, list[Slot], Scan]:
+        """Every item against all that could stand in its place, the others given."""
+        for _ in range(2):
+            changed = False
+            k = 0
+            while k < len(current.items):
+                others = fit_set(self.scene, current.without(k), current.noise)
+                beside = self._scan(others, current.noise)
+                best, slot = self._best_addition(others, beside)
+                slots[k] = slot
+                if best is None:  # no longer needed
+                    current, changed = others, True
+                    del slots[k]
+                    continue
+                if best.score > current.score + 1e-6 and not best.items[-1].same_as(
+                    current.items[k]
+                ):
+                    items = list(best.items)
+                    items.insert(k, items.pop())
+                    current = fit_set(self.scene, tuple(items), best.noise)
+                    changed = True
+                k += 1
+            if not changed:
+                break
+        return current, slots, self._scan(current)

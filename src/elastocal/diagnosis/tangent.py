@@ -1,0 +1,67 @@
+"""Columns of effects whose other parameters say nothing while the first is zero.
+
+The geometry of a spring has no derivative at stiffness zero.  So the stiffness is estimated for
+each start that the effect proposes, the best start is kept, and the geometry's columns are those
+at that stiffness.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import observe
+
+Array = NDArray[np.float64]
+
+ROWS = 3000  # of the equations, as many as tell one start from another
+
+
+def with_tangents(
+    whole: Model, hypotheses: list[Hypothesis], base: Baseline, x: Array, B: Array
+) -> Array:
+    """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none."""
+    for h in hypotheses:
+        own = [
+            k for k, p in enumerate(whole.parameters) if (p.effect, p.where) == (h.name, h.where)
+        ]
+        shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
+        if shown.all() or shown.sum() != 1:
+            continue
+        B = B.copy()
+        B[:, :, own] = _tangent(whole, h, base, x, B, own, int(np.flatnonzero(shown)[0]))
+    return B
+
+
+def _tangent(
+    whole: Model, h: Hypothesis, base: Baseline, x: Array, B: Array, own: list[int], first: int
+) -> Array:
+    """Columns (n_rows, size, k) at the best start and the amplitude that the residual asks for."""
+    table, model = base.seen.table, base.model
+    seen = observe(table, whole.observe)
+    names = {name: k for k, name in enumerate(whole.names)}
+    fitted = [names[name] for name in model.names]
+    X = base.seen.apply(B[:, :, fitted]).reshape(len(base.residual), -1) * base.sizes
+    rows = np.unique(np.linspace(0, len(X) - 1, min(ROWS, len(X))).astype(int))
+    best, columns = np.inf, B[:, :, own]
+    for start in h.effect.starts(h.where, model.chain, model.cell) or ({},):
+        at = x.copy()
+        for key, value in start.items():
+            at[names[f"{h.where}.{key}"]] = value
+        column = whole.regressor(table, at, np.array(own[first : first + 1]), seen).B
+        c = base.seen.apply(column.reshape(len(table), seen.size, 1)).ravel()
+        size = max(float(np.abs(c).max()), 1e-300)
+        A = np.column_stack([X, c / size])[rows]
+        solution, *_ = np.linalg.lstsq(A, base.residual[rows], rcond=1e-9)
+        rest = float(((base.residual[rows] - A @ solution) ** 2).sum())
+        if rest >= best:
+            continue
+        best = rest
+        at[own[first]] += solution[-1] / size
+        columns = whole.regressor(table, at, np.array(own), seen).B
+        columns = columns.reshape(len(table), seen.size, -1)
+        columns[:, :, first] = column.reshape(len(table), seen.size)
+    return columns

@@ -1,0 +1,145 @@
+"""The cell with effects added: the same cell otherwise, wherever and however it was written."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel
+from support.diagnoses import ECCENTRICITY, JUMP
+from support.robots import KR270
+
+from elastocal.cell import EffectChoice
+from elastocal.cell_reader import read_cell
+from elastocal.cell_schema import CellTable
+from elastocal.diagnosis.extended_cell import PATHS, write_extended_cell
+from elastocal.errors import InputError
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.model import Model
+
+ROOT = Path(__file__).parents[2]
+SLIP = replace(JUMP, effect="marker_slip", where="marker:M1", settings={"slip_time_s": 61.5})
+DRIFT = replace(JUMP, effect="base_drift", where="base", settings={"time_constant_s": 900.0})
+FOUND = (ECCENTRICITY, JUMP, SLIP, DRIFT)
+FILES = ("arm.urdf", "fixture.stl", "path.csv", "dh.csv", "links.csv", "load.stl")
+
+# The same things said in the ways that TOML has.
+LAYOUTS = (
+    '[robot]\nurdf = "arm.urdf"\n',
+    'robot = { dh = "dh.csv", masses = "./links.csv" }\nmodel.effects = []\n'
+    "model.nominal.base_position_m = [0, 0, 1]\n",
+    '[model.nominal.settings.joint1]\njump_time_s = 3\nripple_order = 101.0\n'
+    '[robot]\nurdf = "../cell/arm.urdf"\n'
+    '[model]\neffects = ["base_frame", "gear_eccentricity:joint2"]  # one is there already\n',
+    'model = { nominal = { settings = { "marker:M1" = { slip_time_s = 1.0 } } } }\n'
+    '[robot]\nurdf = "arm.urdf"\n[workspace.load]\nshape = "mesh"\nfile = "load.stl"\n'
+    '[[workspace.body]]\nname = "b"\nshape = "mesh"\nfile = "fixture.stl"\n',
+)
+
+
+def documented() -> str:
+    """The cell of docs/file-formats.md with every table it shows."""
+    text = (ROOT / "docs" / "file-formats.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```toml(?: workspace| design)?\n(.*?)```", text, re.S)
+    assert len(blocks) == 3
+    return "\n".join(blocks)
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Equal, with arrays by value and paths by the file they lead to."""
+    if is_dataclass(one):
+        return type(one) is type(other) and all(
+            alike(getattr(one, f.name), getattr(other, f.name)) for f in fields(one)
+        )
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other)
+    if isinstance(one, Path):
+        return os.path.samefile(one, other)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(alike, one, other))
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(alike(one[k], other[k]) for k in one)
+    return one == other
+
+
+@given(
+    layout=st.sampled_from((*LAYOUTS, documented())),
+    found=st.lists(st.sampled_from(FOUND), unique_by=id),
+    folder=st.sampled_from(("cell", ".", "other", "cell/deep/er", "link", "link/../..")),
+    absolute=st.booleans(),
+)
+@settings(max_examples=60, deadline=None)
+def test_reading_it_back_gives_the_same_cell_and_the_additions(layout, found, folder, absolute):
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        for path in ("cell/deep/er", "other", "far/away"):
+            (root / path).mkdir(parents=True)
+        (root / "link").symlink_to(root / "far" / "away")
+        for file in FILES:
+            (root / "cell" / file).write_text("x")
+        source = root / "cell" / "kr.toml"
+        text = layout.replace('"arm.urdf"', f'"{root}/cell/arm.urdf"') if absolute else layout
+        source.write_text(text, encoding="utf-8")
+        target = root / folder / "new.toml"
+        before, after = read_cell(source), write_extended_cell(source, target, found)
+
+        added = [EffectChoice(f.effect, f.where) for f in found]
+        known = before.model.effects
+        effects = (*known, *(choice for choice in added if choice not in known))
+        constants = {place: dict(keys) for place, keys in before.model.nominal.settings.items()}
+        for f in found:
+            if f.settings:
+                constants.setdefault(f.where, {}).update(f.settings)
+        nominal = replace(before.model.nominal, settings=constants)
+        expected = replace(
+            before, path=target, model=replace(before.model, effects=effects, nominal=nominal)
+        )
+        assert alike(after, expected)
+        assert alike(read_cell(target), expected)
+        assert source.read_text(encoding="utf-8") == text
+
+
+def test_every_path_of_the_schema_is_redirected():
+    def paths(table: type[BaseModel], above: tuple[str, ...]) -> set[tuple[str, ...]]:
+        found = set()
+        for key, known in table.model_fields.items():
+            if "the path of" in (known.description or ""):
+                found.add((*above, key))
+            stack = [known.annotation]
+            while stack:
+                annotation = stack.pop()
+                stack += get_args(annotation)
+                if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+                    found |= paths(annotation, (*above, key))
+        return found
+
+    assert paths(CellTable, ()) == {(*table, key) for table, keys in PATHS for key in keys}
+
+
+def test_the_model_gains_the_parameters_of_the_effects_and_no_others(tmp_path):
+    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
+    source = tmp_path / "cell.toml"
+    source.write_text('[robot]\nurdf = "arm.urdf"\n[model]\neffects = ["base_frame"]\n')
+    (tmp_path / "out").mkdir()
+    cell = write_extended_cell(source, tmp_path / "out" / "cell.toml", (ECCENTRICITY, JUMP))
+    names = set(Model.from_cell(cell).names)
+    before = set(Model.from_cell(read_cell(source)).names)
+    assert names - before == {p.name for f in (ECCENTRICITY, JUMP) for p in f.parameters}
+    assert before < names
+    assert all(choice.name in CATALOGUE for choice in cell.model.effects)
+
+
+@pytest.mark.parametrize("text", ["[robot", "[robot]\n", '[robot]\nurdf = "missing.urdf"\n'])
+def test_a_bad_cell_is_refused_and_nothing_written(tmp_path, text):
+    (tmp_path / "cell.toml").write_text(text)
+    with pytest.raises(InputError, match=r"cell\.toml"):
+        write_extended_cell(tmp_path / "cell.toml", tmp_path / "new.toml", FOUND)
+    assert [p.name for p in tmp_path.iterdir()] == ["cell.toml"]

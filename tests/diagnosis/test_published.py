@@ -1,0 +1,82 @@
+"""The JSON of a diagnosis: complete, in the stated units, without numbers that JSON lacks."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields, replace
+
+import pytest
+from support.cells import kr270_cell, kr270_chain
+from support.diagnoses import EXPLAINED, EXTRA, UNKNOWN, VERDICTS
+
+from elastocal.diagnosis.published import publish
+from elastocal.diagnosis.result import Diagnosis, Gap, Step
+from elastocal.manipulator.model import Model
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return Model(kr270_chain(), kr270_cell(("base_frame",)))
+
+
+@pytest.mark.parametrize("name", VERDICTS)
+def test_what_is_written_reads_back_alike(name, model):
+    content = publish(VERDICTS[name], model, "data.csv")
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+
+
+def test_every_part_of_the_result_is_published(model):
+    """A field added to the result must not be forgotten here; one has another name."""
+    renamed = {"extra": "extra_plan"}
+    names = {renamed.get(f.name, f.name) for f in fields(Diagnosis)}
+    assert names <= set(publish(EXPLAINED, model, "data.csv"))
+
+
+def test_keys_and_units_of_the_design(model):
+    content = publish(EXPLAINED, model, "data.csv")
+    assert content["schema"] == "elastocal/diagnosis/1"
+    assert content["verdict"] == "explained"
+    assert content["gap"] == pytest.approx(
+        {"nominal_um": 3200, "calibrated_um": 84, "explained_um": 21, "noise_floor_um": 19}
+    )
+    last = content["budget"][-2]
+    assert last["step"] == "gear_eccentricity:joint2"
+    assert [last["heldout_rms_um"], *last["ci95"]] == pytest.approx([21, 19, 23])
+    (effect,) = content["effects"]
+    assert (effect["effect"], effect["where"]) == ("gear_eccentricity", "joint2")
+    assert effect["gap_reduction_ci95"] == [0.63, 0.84]
+    first = effect["parameters"][0]
+    low, high = first["ci95"]
+    assert (first["unit"], (low + high) / 2) == ("rad", pytest.approx(1.12e-4))
+    # 97.5 % of a normal distribution lie below 1.96 standard deviations.
+    upper = (high - first["value"]) / first["std"]
+    assert (1 + math.erf(upper / math.sqrt(2))) / 2 == pytest.approx(0.975, abs=1e-6)
+    assert {"effect", "where", "probability", "score"} <= set(content["candidates"][0])
+    assert content["location"]["evidence"]["stages"]["transmission"] == 0.984
+    assert content["noise"]["faulty"][1]["error_um"] == pytest.approx(1300)
+    assert [r["unit"] for r in content["noise"]["repeatability"]] == ["rad"] * 6
+
+
+def test_what_is_not_known_is_null(model):
+    unknown = replace(
+        EXPLAINED,
+        gap=Gap(math.nan, math.inf, 1e-5, 1e-5),
+        budget=(Step("nominal", math.inf, (-math.inf, math.nan)),),
+        location=None,
+        noise=replace(EXPLAINED.noise, pure_error=None),
+    )
+    content = json.loads(json.dumps(publish(unknown, model, "data.csv"), allow_nan=False))
+    assert content["gap"]["nominal_um"] is None and content["gap"]["calibrated_um"] is None
+    assert content["budget"][0] == {"step": "nominal", "heldout_rms_um": None, "ci95": [None] * 2}
+    assert content["location"] is None
+    assert content["noise"]["pure_error_um"] is None
+    assert content["extra_plan"] is None
+
+
+def test_curves_and_extra_poses(model):
+    content = publish(replace(UNKNOWN, extra=EXTRA), model, "data.csv")
+    curve = content["curves"][0]
+    assert len(curve["x"]) == len(curve["y"]) == len(curve["sd"]) == 40
+    assert content["extra_plan"]["pairs"][0]["distance_after"] == 5.6
+    assert content["extra_plan"]["n_poses"] == 2

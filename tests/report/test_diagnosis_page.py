@@ -1,0 +1,174 @@
+"""The diagnosis report: complete, self-contained, harmless."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from support.cells import kr270_cell, kr270_chain
+from support.diagnoses import EXPLAINED, EXTRA, HOSTILE, TWO, VERDICTS
+
+from elastocal.diagnosis.result import FaultyReading, Step
+from elastocal.errors import InputError
+from elastocal.manipulator.model import Model
+from elastocal.report.diagnosis_page import diagnosis_page, write_diagnosis_report
+
+VOID = {"meta", "br", "link", "img", "hr", "input"}
+
+
+class Page(HTMLParser):
+    """Tags, text and table rows; complains where tags do not match."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.rows: list[list[str]] = []
+        self.text = ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.tags.add(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_startendtag(self, tag: str, attrs: Any) -> None:
+        self.tags.add(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+        if {"td", "th"} & set(self.open):
+            self.rows[-1][-1] += data.strip()
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return Model(kr270_chain(), kr270_cell(("base_frame",)))
+
+
+@pytest.fixture(scope="module")
+def pages(model: Model) -> dict[str, str]:
+    told = {"command": f"elastocal diagnose {HOSTILE}", "inputs": {HOSTILE: "0" * 64}, "seed": 7}
+    return {name: diagnosis_page(d, model, HOSTILE, **told) for name, d in VERDICTS.items()}
+
+
+@pytest.mark.parametrize("name", VERDICTS)
+def test_names_from_files_are_text_and_nothing_comes_from_elsewhere(name, pages):
+    text = pages[name]
+    page = Page(text)
+    assert not {"script", "link", "img", "iframe", "object"} & page.tags
+    assert "\x1b" not in text
+    assert "<script>alert(1)</script>" in page.text
+    addresses = set(re.findall(r"""(?:https?:)?//[^\s"'<>)]+""", text))
+    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
+    assert "@import" not in text
+    assert all(target.startswith("#") for target in re.findall(r"url\(([^)]*)\)", text))
+
+
+@pytest.mark.parametrize("name", VERDICTS)
+def test_figures_are_well_formed_and_follow_the_page_colours(name, pages):
+    figures = re.findall(r"<svg.*?</svg>", pages[name], re.DOTALL)
+    assert len(figures) == (4 if VERDICTS[name].curves else 3)
+    for figure in figures:
+        ElementTree.fromstring(figure)
+        assert "aria-label" in figure
+        assert "#0102" not in figure
+    ids = re.findall(r'\bid="([^"]*)"', pages[name])
+    assert len(ids) == len(set(ids))
+
+
+def test_sections_appear_where_there_is_something_to_tell(pages):
+    heads = {
+        "Shape of the unknown dependence": {"unknown"},
+        "Effects found": {"explained", "two", "ambiguous", "planned", "inseparable"},
+        "These data cannot tell apart": {"ambiguous", "planned", "inseparable"},
+        "Extra poses": {"planned", "inseparable"},
+        "d with the extra poses": {"planned", "inseparable"},
+        "The data single out no link": {"nothing", "unlocated"},
+        "Readings left out as faulty": set(VERDICTS),
+        "What could not be tested": set(VERDICTS),
+    }
+    for head, names in heads.items():
+        assert {name for name, text in pages.items() if head in Page(text).text} == names, head
+
+
+def test_every_number_of_the_answer_is_on_the_page(pages):
+    page = Page(pages["explained"])
+    rows = {row[0]: row for row in page.rows if row}
+    assert rows["gear eccentricity at joint 2"][1] == "0.98"  # the last table of the two
+    assert rows["joint2.eccentricity_sin"][1:] == ["0.112", "0.012", "mrad"]
+    assert rows["joint 2 angle"][1:] == ["< 0.001", "0.0040"]
+    assert rows["joint 2"][1] == "0.98"
+    assert rows["88"][1:] == ["29", "M3", "1.30 mm", "71.0"]
+    assert rows["joint compliance"][1:3] == ["84.0 µm", "71.0 µm to 97.0 µm"]
+    for candidate in EXPLAINED.candidates[1:6]:
+        name = f"{candidate.effect.replace('_', ' ')}"
+        assert any(key.startswith(name) for key in rows), name
+    assert "elastocal diagnose" in page.text
+
+
+def test_shade_of_the_chain_is_the_evidence(pages):
+    chain = re.search(r'<svg class="chain".*?</svg>', pages["explained"], re.DOTALL)
+    assert chain
+    shades = [float(v) for v in re.findall(r'fill-opacity="([\d.]+)"', chain[0])]
+    stages = EXPLAINED.location.stages
+    order = ("transmission", "geometry", "load", "compliance", "tool", "tracker")
+    expected = [0.45 * stages.get(stage, 0.0) for stage in order]
+    assert shades == pytest.approx(expected, abs=1e-3)
+    assert chain[0].count("likeliest") == 1
+    unlocated = re.search(r'<svg class="chain".*?</svg>', pages["unlocated"], re.DOTALL)
+    assert unlocated and "fill-opacity" not in unlocated[0]
+
+
+def test_extra_poses_in_people_s_units(pages):
+    rows = [row for row in Page(pages["planned"]).rows if row and row[0] in "123" and len(row) > 9]
+    assert [row[1] for row in rows] == ["X1", "X1", "X2"]
+    q = np.degrees(EXTRA.plan.q)
+    assert [[float(v) for v in row[2:8]] for row in rows] == pytest.approx(q, abs=0.005)
+    assert [row[8] for row in rows] == ["0 0 0", "0 0 -2600", "0 0 -2600"]
+    assert [row[9] for row in rows] == ["+ − + − + −"] * 3
+    assert [row[10] for row in rows] == ["0.0", "10.0", "15.0"]
+
+
+def test_numbers_that_are_not_known_do_not_break_the_page(model):
+    steps = (Step("nominal", float("inf"), (float("nan"),) * 2), Step("a", 0.0, (0.0, 0.0)))
+    gap = replace(EXPLAINED.gap, noise_floor=float("nan"))
+    Page(diagnosis_page(replace(EXPLAINED, budget=steps, gap=gap), model, "data.csv"))
+    bare = replace(EXPLAINED, budget=(), candidates=(), structure=(), untested=(), warnings=())
+    assert "<dt>Warnings" not in diagnosis_page(bare, model, "data.csv")
+
+
+def test_long_lists_are_cut_and_say_so(model):
+    faulty = tuple(FaultyReading(i, "7", "M1", 1e-3, 10.0 + i) for i in range(130))
+    d = replace(TWO, noise=replace(TWO.noise, faulty=faulty))
+    page = Page(diagnosis_page(d, model, "data.csv"))
+    assert "and 30 more" in page.text
+    assert [row[0] for row in page.rows if row and row[0] in ("129", "3")] == ["129"]
+
+
+def test_same_diagnosis_same_page(model):
+    told = (EXPLAINED, model, "data.csv")
+    assert diagnosis_page(*told) == diagnosis_page(*told)
+
+
+def test_writing_is_whole_or_not_at_all(model, tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        write_diagnosis_report(
+            EXPLAINED, model, tmp_path / "r.html", "d.csv", inputs=[tmp_path / "missing.csv"]
+        )
+    with pytest.raises(InputError, match="does not exist"):
+        write_diagnosis_report(EXPLAINED, model, tmp_path / "none" / "r.html", "d.csv")
+    assert list(tmp_path.iterdir()) == []

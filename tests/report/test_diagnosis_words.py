@@ -1,0 +1,228 @@
+"""What a diagnosis says in words: never more than it knows, never a raw name."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.diagnoses import (
+    AMBIGUOUS,
+    CANDIDATES,
+    ECCENTRICITY,
+    EXPLAINED,
+    EXTRA,
+    INSEPARABLE,
+    NOTHING,
+    RIVALS,
+    TWO,
+    UNKNOWN,
+    VERDICTS,
+)
+
+from elastocal.diagnosis.result import EffectAt, NoiseFloor
+from elastocal.report.diagnosis_rows import budget_rows, candidate_rows, untested_rows
+from elastocal.report.diagnosis_verdict import headline, next_steps, sensitivity, verdict_lines
+from elastocal.report.diagnosis_words import (
+    effect_at,
+    name_of,
+    noise_lines,
+    p_value,
+    probability,
+    reduction,
+    settings_text,
+    together,
+)
+
+KINDS = ("revolute",) * 6
+
+
+def spoken(d):
+    return " ".join(text for _, text in verdict_lines(d)) + " ".join(next_steps(d))
+
+
+def test_an_explained_gap_names_effect_probability_and_both_errors():
+    text = spoken(EXPLAINED)
+    assert "Gear eccentricity at joint 2 (probability 0.98) explains the gap." in text
+    assert "from 84.0 µm to 21.0 µm" in text
+    assert "75 % (63 to 84 %)" in text
+
+
+def test_of_two_effects_each_has_its_share():
+    text = spoken(TWO)
+    assert "and encoder jump at joint 1 (probability 0.91) explain the gap" in text
+    assert "gear eccentricity at joint 2 takes away 75 %" in text
+    assert "encoder jump at joint 1 takes away 12 % (5 to 19 %)" in text
+
+
+def test_an_ambiguous_verdict_names_the_whole_set_and_the_way_out():
+    text = spoken(AMBIGUOUS)
+    assert headline(AMBIGUOUS) == (
+        "Either gear eccentricity at joint 2 or link mass error of link 2 makes the gap; these "
+        "data cannot tell which."
+    )
+    assert "explain" not in text
+    assert "Gear eccentricity at joint 2 (probability" not in headline(AMBIGUOUS)
+    assert "--plan" in text
+
+
+def test_an_effect_that_is_certain_beside_an_open_set_is_told_apart_from_it():
+    sure = replace(ECCENTRICITY, effect="encoder_jump", where="joint1", probability=0.99)
+    d = replace(AMBIGUOUS, effects=(*AMBIGUOUS.effects, sure))
+    labels = {label for label, text in verdict_lines(d) if "encoder jump" in text}
+    assert "Besides" in labels and "Likeliest" not in labels
+    assert ("Likeliest", "gear eccentricity at joint 2 (probability 0.58).") in verdict_lines(d)
+
+
+def test_two_open_sets_are_two_questions():
+    pair = (EffectAt("joint_drift", "joint1"), EffectAt("base_drift", "base"))
+    text = headline(replace(AMBIGUOUS, indistinguishable=(*RIVALS, pair)))
+    assert "and either joint drift at joint 1 or base drift make the gap" in text
+
+
+def test_an_unknown_effect_has_a_place_a_driver_and_a_chance_but_no_name():
+    text = spoken(UNKNOWN)
+    assert "joint 2, in the transmission (probability 0.98)" in text
+    assert "joint 2 angle (p = 0.0040)" in text
+    assert "p < 0.001" in text
+    # The curve is 80 µrad · sin(3q) over more than a turn of its argument.
+    assert "Shape" in dict(verdict_lines(UNKNOWN))
+    (moved,) = re.findall(r"joint 2 angle moves joint 2 rotation by ([\d.]+) mrad", text)
+    assert float(moved) == pytest.approx(0.16, rel=0.01)
+    # Tests that the whole family explains by chance are not told as findings.
+    assert "joint 3 torque" not in text and "load (p" not in text
+    assert not any(effect_at(c) in text for c in UNKNOWN.candidates)
+    assert "--plan" in text
+
+
+def test_an_unknown_effect_without_a_place_says_so():
+    assert "do not show where" in headline(VERDICTS["unlocated"])
+
+
+def test_the_smallest_effect_that_shows_has_distance_five():
+    """d of a displacement field of the told size, computed from readings, is 5."""
+    (line, _) = sensitivity(NOTHING)
+    (told,) = re.findall(r"more than about ([\d.]+) µm", line)
+    field = np.random.default_rng(1).normal(size=(NOTHING.n_configurations, 3))
+    field *= float(told) * 1e-6 / math.sqrt((field**2).sum(axis=1).mean())
+    sigma = NOTHING.gap.noise_floor / math.sqrt(3)
+    assert np.linalg.norm(field / sigma) == pytest.approx(5, rel=0.02)
+
+
+def test_nothing_says_what_hides_in_the_noise_and_what_does_not():
+    text = sensitivity(NOTHING)[1]
+    assert "of 10 candidates 6 would have shown" in text
+    for hidden in ("thermal expansion", "link bending", "base compliance"):
+        assert hidden in text
+    assert "encoder jump" not in text
+    assert "0.93" in headline(NOTHING) and "p = 0.41" in spoken(NOTHING)
+
+
+def test_extra_poses_promise_or_say_that_none_helps():
+    promise = " ".join(next_steps(replace(AMBIGUOUS, extra=EXTRA)))
+    assert "2 more poses" in promise and "from 0.69 to > 0.99" in promise and "0.85" in promise
+    assert "--plan" not in promise
+    hopeless = " ".join(next_steps(replace(AMBIGUOUS, extra=INSEPARABLE)))
+    assert "No pose that this cell allows tells apart gear eccentricity at joint 2" in hopeless
+    assert "rises" not in hopeless
+
+
+def test_the_same_advice_is_given_once():
+    advice = [s for s in next_steps(EXPLAINED) if "direction of the last motion" in s]
+    assert len(advice) == 1
+    (row,) = untested_rows(EXPLAINED)
+    assert row[0] == "hysteresis (joint 1, joint 2)"
+
+
+@pytest.mark.parametrize("name", VERDICTS)
+def test_nothing_that_a_terminal_obeys_and_no_raw_names(name):
+    d = VERDICTS[name]
+    text = spoken(d) + " ".join(noise_lines(d.noise, KINDS))
+    assert "\x1b" not in text
+    assert not re.search(r"\b(joint|link)[0-9]", text)
+    assert "gear_" not in text
+
+
+@given(st.floats(0, 1))
+def test_a_probability_is_never_told_as_certain(p):
+    text = probability(p)
+    assert text not in ("0.00", "1.00")
+    number = float(text.strip("<> "))
+    assert abs(number - p) <= 0.0101
+
+
+def test_numbers_that_are_not_known():
+    assert probability(math.nan) == p_value(math.nan) == "–"
+    assert reduction(replace(ECCENTRICITY, gap_reduction_ci95=(math.nan, math.nan))) == "75 %"
+
+
+@pytest.mark.parametrize(
+    ("e", "text"),
+    [
+        (("base_drift", "base"), "base drift"),
+        (("tracker_distortion", "tracker"), "tracker distortion"),
+        (("thermal_expansion", "all"), "thermal expansion of all links"),
+        (("link_bending", "link12"), "link bending of link 12"),
+        (("marker_slip", "marker:M_1 joint2"), "marker slip of marker M_1 joint2"),
+    ],
+)
+def test_names(e, text):
+    assert effect_at(EffectAt(*e)) == text
+    assert name_of(":".join(e)) == name_of(" at ".join(e)) == text
+
+
+def test_names_that_are_no_effects():
+    assert name_of("base_frame") == "base frame"
+    assert name_of("joint2 angle") == "joint 2 angle"
+
+
+def test_settings_have_units():
+    text = settings_text({"jump_time_s": 4325.5, "ripple_order": 100.7, "time_constant_s": 60.0})
+    assert text == "jump time 72.1 min, ripple order 100.7, time constant 60.0 s"
+
+
+def test_lists():
+    assert [together(["a", "b", "c"][:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
+
+
+def test_budget_changes_add_up():
+    """Change of every step, read back from its text, is the difference of the errors."""
+    table = budget_rows(EXPLAINED)
+    assert table[-1][:2] == ("noise alone", "19.0 µm")
+    scale = {"mm": 1e-3, "µm": 1e-6}
+
+    def read(text):
+        number, unit = text.replace("−", "-").split()
+        return float(number) * scale[unit]
+
+    for before, after in pairwise(table[:-1]):
+        assert read(after[3]) == pytest.approx(read(after[1]) - read(before[1]), rel=0.01)
+
+
+def test_candidates_seen_from_five_standard_deviations():
+    table = candidate_rows(EXPLAINED, 10)
+    for row, c in zip(table[:10], CANDIDATES, strict=True):
+        if c.detectable:
+            assert float(row[4]) * c.detectable == pytest.approx(5, rel=0.05)
+        else:
+            assert row[4] == "–"
+    assert [row[0] for row in table[10:]] == [
+        "an effect outside the catalogue",
+        "no further effect",
+    ]
+
+
+def test_noise_without_repeats_statement_or_faults():
+    bare = NoiseFloor(False, 1.0, 2e-5, (0.0,) * 6, 0.0, None)
+    text = " ".join(noise_lines(bare, KINDS))
+    assert "nothing was stated" in text and "none that shows" in text
+    assert "No reading is repeated" in text
+    assert "faulty" not in text and "share" not in text
+    mixed = replace(bare, repeatability=(1e-6,) * 6)
+    text = " ".join(noise_lines(mixed, ("prismatic", *KINDS[1:])))
+    assert "joint 1 1.0 µm, joint 2 1.0 µrad" in text

@@ -1,0 +1,222 @@
+"""Diagnoses made by hand, one per verdict, with names that a terminal or a page must not obey."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from elastocal.diagnosis.result import (
+    Candidate,
+    Curve,
+    Diagnosis,
+    EffectAt,
+    FaultyReading,
+    Finding,
+    FittedParameter,
+    Gap,
+    Location,
+    NoiseFloor,
+    Step,
+    StructureTest,
+    Untested,
+)
+from elastocal.diagnosis.separate_result import ExtraPlan, RivalPair
+from elastocal.measurements import Measurements
+
+HOSTILE = "<script>alert(1)</script>\x1b[31m"
+
+ECCENTRICITY = Finding(
+    effect="gear_eccentricity",
+    where="joint2",
+    probability=0.981,
+    gap_reduction=0.752,
+    gap_reduction_ci90=(0.65, 0.82),
+    gap_reduction_ci95=(0.63, 0.84),
+    gap_reduction_ci90=(0.65, 0.82),
+    parameters=(
+        FittedParameter("joint2.eccentricity_sin", 1.12e-4, "rad", 6e-6),
+        FittedParameter("joint2.eccentricity_cos", -4.1e-5, "rad", 7e-6),
+    ),
+    settings={},
+)
+JUMP = Finding(
+    effect="encoder_jump",
+    where="joint1",
+    probability=0.91,
+    gap_reduction=0.12,
+    gap_reduction_ci90=(0.06, 0.18),
+    gap_reduction_ci95=(0.05, 0.19),
+    gap_reduction_ci90=(0.06, 0.18),
+    parameters=(FittedParameter("joint1.jump", 1.4e-4, "rad", 1.1e-5),),
+    settings={"jump_time_s": 4325.5},
+)
+
+CANDIDATES = (
+    Candidate("gear_eccentricity", "joint2", "transmission", 0.981, 161.4, 21.0, {}),
+    Candidate("link_mass_error", "link2", "load", 0.012, 157.0, 9.4, {}),
+    Candidate("gravity_compensator", "joint2", "load", 0.004, 155.8, 14.0, {}),
+    Candidate("encoder_jump", "joint1", "transmission", 0.002, 12.5, 17.0, {"jump_time_s": 4325.5}),
+    Candidate("gear_ripple", "joint3", "transmission", 0.0004, 3.1, 6.2, {"ripple_order": 100.7}),
+    Candidate("encoder_scale", "joint4", "transmission", 1e-6, -0.4, 4.4, {}),
+    Candidate("marker_slip", f"marker:{HOSTILE}", "tool", 1e-7, -1.2, 11.0, {"slip_time_s": 60.0}),
+    Candidate("thermal_expansion", "all", "geometry", 1e-8, -2.2, 2.1, {"time_constant_s": 1800.0}),
+    Candidate("link_bending", "link6", "compliance", 1e-9, -3.5, 0.2, {}),
+    Candidate("base_compliance", "base", "compliance", 1e-9, -3.9, 0.0, {}),
+)
+
+STRUCTURE = (
+    StructureTest("load", 0.71, 1.0),
+    StructureTest("joint2 angle", 0.0005, 0.004),
+    StructureTest("joint3 torque", 0.03, 0.31),
+)
+
+LOCATION = Location(
+    stage="transmission",
+    where="joint2",
+    probability=0.984,
+    stages={"transmission": 0.984, "load": 0.015, "compliance": 0.001},
+    places={"joint2": 0.985, "link2": 0.012, f"marker:{HOSTILE}": 0.003},
+    drivers={"joint2 angle": 0.0005},
+)
+
+NOISE = NoiseFloor(
+    stated=True,
+    stated_factor=1.12,
+    reading_sigma=18.4e-6,
+    repeatability=(6.1e-6, 5.2e-6, 7.0e-6, 0.0, 9.4e-6, 4.4e-6),
+    shared=0.5,
+    pure_error=17.6e-6,
+    faulty=(
+        FaultyReading(41, HOSTILE, "M1", 0.4e-3, 22.0),
+        FaultyReading(88, "29", "M3", 1.3e-3, 71.0),
+    ),
+)
+
+EXPLAINED = Diagnosis(
+    verdict="explained",
+    gap=Gap(nominal=3.2e-3, calibrated=84e-6, explained=21e-6, noise_floor=19e-6),
+    budget=(
+        Step("nominal", 3.2e-3, (2.9e-3, 3.5e-3)),
+        Step("base_frame", 1.9e-3, (1.7e-3, 2.1e-3)),
+        Step("joint_offset", 410e-6, (360e-6, 450e-6)),
+        Step("joint_compliance", 84e-6, (71e-6, 97e-6)),
+        Step("gear_eccentricity:joint2", 21e-6, (19e-6, 23e-6)),
+        Step("noise_floor", 19e-6, (19e-6, 19e-6)),
+    ),
+    effects=(ECCENTRICITY,),
+    candidates=CANDIDATES,
+    indistinguishable=(),
+    location=LOCATION,
+    noise=NOISE,
+    structure=STRUCTURE,
+    probability_nothing=1e-12,
+    probability_unknown=0.001,
+    p_value=0.0004,
+    untested=(
+        Untested(
+            "hysteresis", "joint1", "the table has no approach direction",
+            "record the direction of the last motion (approach_1 …) and repeat poses from both "
+            "sides",
+        ),
+        Untested(
+            "hysteresis", "joint2", "the table has no approach direction",
+            "record the direction of the last motion (approach_1 …) and repeat poses from both "
+            "sides",
+        ),
+    ),
+    warnings=(f"marker {HOSTILE} was seen in 3 poses only",),
+    n_readings=360,
+    n_configurations=60,
+)  # fmt: skip
+
+TWO = replace(EXPLAINED, effects=(ECCENTRICITY, JUMP))
+
+RIVALS = ((EffectAt("gear_eccentricity", "joint2"), EffectAt("link_mass_error", "link2")),)
+AMBIGUOUS = replace(
+    EXPLAINED,
+    verdict="ambiguous",
+    effects=(replace(ECCENTRICITY, probability=0.58),),
+    candidates=(
+        replace(CANDIDATES[0], probability=0.58),
+        replace(CANDIDATES[1], probability=0.41),
+        *CANDIDATES[2:],
+    ),
+    indistinguishable=RIVALS,
+)
+
+# Where nothing of the catalogue is at work, none of it is likely.
+UNLIKELY = tuple(replace(c, probability=c.probability * 0.02, score=-1.0) for c in CANDIDATES)
+
+NOTHING = replace(
+    EXPLAINED,
+    verdict="nothing_significant",
+    gap=replace(EXPLAINED.gap, calibrated=24e-6, explained=24e-6, noise_floor=23e-6),
+    budget=(*EXPLAINED.budget[:-3], Step("joint_compliance", 24e-6, (21e-6, 27e-6))),
+    effects=(),
+    candidates=UNLIKELY,
+    location=None,
+    structure=(StructureTest("joint2 angle", 0.2, 0.86), StructureTest("load", 0.71, 1.0)),
+    probability_nothing=0.93,
+    probability_unknown=0.02,
+    p_value=0.41,
+)
+
+X = np.linspace(-2.4, 0.6, 40)
+UNKNOWN = replace(
+    EXPLAINED,
+    verdict="unknown_effect",
+    effects=(),
+    candidates=UNLIKELY,
+    budget=(*EXPLAINED.budget[:-2], EXPLAINED.budget[-1]),
+    probability_unknown=0.97,
+    curves=(
+        Curve("joint2 angle", "rad", "joint 2 rotation", "rad", tuple(X),
+              tuple(8e-5 * np.sin(3 * X)), tuple(2e-5 + 1e-5 * X**2)),
+        Curve("time", "s", HOSTILE, "m", (0.0, 3600.0, 7200.0), (0.0, 4e-5, 5e-5),
+              (1e-5, 5e-6, 1e-5)),
+    ),
+)  # fmt: skip
+
+
+def visits(approach: bool = True, time: bool = True) -> Measurements:
+    """Three visits to two poses: X1 unloaded and loaded, X2 loaded."""
+    n = 3
+    return Measurements(
+        source="plan",
+        row=np.arange(n),
+        q=np.linspace(-1.0, 1.0, 6) + np.array([0, 0, 1])[:, None] * 0.1,
+        configuration=np.array([0, 0, 1]),
+        configuration_labels=("X1", "X2"),
+        repeat=np.zeros(n, dtype=np.int64),
+        marker=np.zeros(n, dtype=np.int64),
+        marker_names=("M1",),
+        force=np.array([[0.0, 0, 0], [0, 0, -2600.0], [0, 0, -2600.0]]),
+        approach=np.tile([1.0, -1.0], (n, 3)) if approach else None,
+        time=np.array([0.0, 600.0, 900.5]) if time else None,
+    )
+
+
+EXTRA = ExtraPlan(
+    rivals=("gear_eccentricity:joint2", "link_mass_error:link2"),
+    pairs=(RivalPair("gear_eccentricity:joint2", "link_mass_error:link2", 1.1, 5.6),),
+    plan=visits(),
+    n_poses=2,
+    probability_before=0.69,
+    probability_after=0.997,
+    probability_random=0.85,
+    separable=True,
+    advice=(f"pull sideways as well {HOSTILE}",),
+)
+INSEPARABLE = replace(EXTRA, plan=None, n_poses=0, separable=False, probability_after=0.69)
+
+VERDICTS = {
+    "explained": EXPLAINED,
+    "two": TWO,
+    "ambiguous": AMBIGUOUS,
+    "planned": replace(AMBIGUOUS, extra=EXTRA),
+    "inseparable": replace(AMBIGUOUS, extra=INSEPARABLE),
+    "nothing": NOTHING,
+    "unknown": UNKNOWN,
+    "unlocated": replace(UNKNOWN, location=None, curves=(), structure=()),
+}
