@@ -57,14 +57,11 @@ def _fitted_steps(scene: Scene) -> list[tuple[str, NoisyData]]:
         if k > 0 and not (stage == k).any():
             continue
         free = stage <= k
-        held = scene.data.X[:, :, ~free] @ scene.fitted.moved[~free]
         data = scene.data
         steps.append(
             (
                 name,
-                replace(
-                    data, r=data.r + held, X=data.X[:, :, free], precision=data.precision[free]
-                ),
+                replace(data, X=data.X[:, :, free], precision=data.precision[free]),
             )
         )
     return steps

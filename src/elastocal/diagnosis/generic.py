@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 # Prior sizes of an entry's components at the largest of a smooth dependence.
 MOTION = {"rad": 1e-4, "m": 1e-4, "1": 1e-4}
 BASE_MOTION = 5e-5
+FRAME_WAVES = 5
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,9 @@ def _driven(scene: Scene, drivers: Drivers) -> Iterator[Generic]:
     joints = [f"joint{k + 1}" for k in range(n)]
 
     def block(by: Driver, entry: str, place: str, where: str, stage: Stage) -> Generic:
-        drive = _all(scene, entry, place, by.functions)
+        # Six components each: fewer functions do, since the components share their shape.
+        some = by.functions if entry == "joint_motion" else by.functions[:, :, :FRAME_WAVES]
+        drive = _all(scene, entry, place, some)
         return Generic(by.kind, by.name, where, stage, (entry, (place,)), drive, None, by)
 
     for by in drivers.smooth():

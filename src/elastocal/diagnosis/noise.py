@@ -200,7 +200,7 @@ def fit_noise(data: NoisyData, start: NoiseValues | None = None, steps: int = 60
         low, high = np.maximum(lower, theta - STRIDE), np.minimum(upper, theta + STRIDE)
         found = optimize.minimize(
             cost, theta, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-            options={"maxiter": steps, "ftol": 1e-6, "gtol": 1e-2},
+            options={"maxiter": steps, "ftol": 3e-6, "gtol": 3e-2},
         )  # fmt: skip
         theta = found.x
         inside = (theta > low) & (theta < high) | (theta == lower) | (theta == upper)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from elastocal.diagnosis.generic import Generic
 from elastocal.diagnosis.hypotheses import Hypothesis
@@ -29,6 +30,11 @@ class Prior:
 
     hypotheses: Array
     blocks: Array
+
+    @property
+    def total(self) -> float:
+        """Log prior odds of anything against nothing."""
+        return float(logsumexp(np.concatenate([self.hypotheses, self.blocks])))
 
     @classmethod
     def of(

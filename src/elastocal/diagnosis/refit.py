@@ -14,7 +14,7 @@ from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet
 from elastocal.diagnosis.noise import project
 from elastocal.diagnosis.result import FittedParameter
-from elastocal.diagnosis.scene import Scene, widths
+from elastocal.diagnosis.scene import Scene, away, widths
 
 Array = NDArray[np.float64]
 
@@ -36,13 +36,14 @@ def refit(scene: Scene, chosen: ModelSet) -> dict[tuple[str, str], tuple[FittedP
     at = model.regressor(seen.table, base.x, observations=seen)
     B = at.B.reshape(len(seen.lead), seen.size, -1) * width
     data = scene.data
+    residual = at.residual.reshape(-1, seen.size) + B @ (away(base) / width)
     data = replace(
-        data, r=scene.blocks.pack(at.residual.reshape(-1, seen.size, 1))[:, :, 0],
+        data, r=scene.blocks.pack(residual[:, :, None])[:, :, 0],
         X=scene.blocks.pack(B), precision=np.ones(B.shape[2]),
     )  # fmt: skip
     fit = project(data, chosen.noise)
     step = fit.beta_deviation.T @ np.einsum("cmp,cm->p", fit.H, data.masked(data.r))
-    x = base.x + width * step
+    x = base.x - away(base) + width * step
     std = width * np.linalg.norm(fit.beta_deviation, axis=0)
     out: dict[tuple[str, str], list[FittedParameter]] = {}
     for k, p in enumerate(model.parameters):

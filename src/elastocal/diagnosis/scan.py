@@ -36,7 +36,7 @@ class Scored:
 class Scan:
     """Everything scored under one noise: hypotheses, blocks, and the odds of all together.
 
-    `odds` is the log of Σ prior · evidence over catalogue and blocks, `flipped` (F,) the same for
+    `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior, `flipped` (F,) the same for
     residuals whose configurations had their signs flipped; `by_driver` (drivers,) and its flips
     the largest evidence among the blocks of a driver.
     """
@@ -89,8 +89,8 @@ def scan(
             flips.append(weight + flipped)
             driver_flips.setdefault(g.driver, []).append(flipped)
     return Scan(
-        tuple(scored), tuple(blocks), float(logsumexp(total)),
-        logsumexp(np.array(flips), axis=0) if flips else np.zeros(0),
+        tuple(scored), tuple(blocks), float(logsumexp(total)) - prior.total,
+        logsumexp(np.array(flips), axis=0) - prior.total if flips else np.zeros(0),
         {d: max(v) for d, v in drivers.items()},
         {d: np.max(v, axis=0) for d, v in driver_flips.items()}, at, noise,
     )  # fmt: skip

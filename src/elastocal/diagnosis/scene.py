@@ -42,19 +42,18 @@ LOAD_POINT_TOLERANCE = 2e-3
 
 @dataclass(frozen=True)
 class FittedColumns:
-    """What the columns of the data's X are: `effect` of each, `width` (p,) by which it is scaled,
-    and `moved` (p,), how far the fit is from nominal in that width."""
+    """What the columns of the data's X are: `effect` of each, `width` (p,) by which it is scaled."""
 
     effect: tuple[str, ...]
     width: Array
-    moved: Array
 
 
 @dataclass(frozen=True)
 class Scene:
     """A baseline with the columns of all hypotheses, packed by configuration.
 
-    `data` holds residual, fitted columns (scaled to their prior deviations) and noise shapes.
+    `data` holds the residual at the prior's centre, linearised at the fit, the fitted columns
+    (scaled to their prior deviations) and noise shapes.
     """
 
     base: Baseline
@@ -162,15 +161,15 @@ def scene_of(
     own = np.array([around.names.index(name) for name in model.names], dtype=np.int64)
     at = around.regressor(seen.table, x, own, seen)
     width = widths(base)
-    moved = (base.x - model.nominal) / width
     effects = [p.effect for p in model.parameters]
     B = at.B.reshape(len(seen.lead), seen.size, -1) * width
+    residual = base.residual.reshape(-1, seen.size) + B @ (away(base) / width)
     for h in hook:
         keys = [k for k, p in enumerate(h.parameters) if p.key.startswith("load_point")]
         shift = columns.observed(columns.of(h)[:, :, keys]) * LOAD_POINT_TOLERANCE
         B = np.concatenate([B, shift], axis=2)
         width = np.append(width, np.full(len(keys), LOAD_POINT_TOLERANCE))
-        moved, effects = np.append(moved, np.zeros(len(keys))), effects + [h.name] * len(keys)
+        effects = effects + [h.name] * len(keys)
     used = np.abs(B).max(axis=(0, 1), initial=0.0) > 0
     B = B[:, :, used]
     n_joints = model.chain.n_joints
@@ -182,7 +181,7 @@ def scene_of(
         stated = np.tile(np.diag(np.maximum(each.var(axis=0), 1e-18)), (len(each), 1, 1))
     data = NoisyData(
         blocks=blocks,
-        r=blocks.pack(base.residual.reshape(-1, seen.size, 1))[:, :, 0],
+        r=blocks.pack(residual[:, :, None])[:, :, 0],
         X=blocks.pack(B),
         precision=np.ones(B.shape[2]),
         covariance=blocks.pack_square(stated),
@@ -191,14 +190,21 @@ def scene_of(
         left_out=blocks.absent,
         stated=base.stated is not None,
     )
-    fitted = FittedColumns(
-        tuple(e for e, u in zip(effects, used, strict=True) if u), width[used], moved[used]
-    )
+    fitted = FittedColumns(tuple(e for e, u in zip(effects, used, strict=True) if u), width[used])
     return Scene(base, columns, tuple(hypotheses), blocks, VisitPlaces.of(blocks), data, fitted)
 
 
+def away(base: Baseline) -> Array:
+    """How far (parameters,) the fit is from the centre of the prior: nominal, but for what
+    registration placed, which is where it is.
+
+    An unmodelled effect bends parameters that little else holds; they must be free to return.
+    """
+    return np.where(is_placed(base.model), 0.0, base.x - base.model.nominal)
+
+
 def widths(base: Baseline) -> Array:
-    """Prior standard deviation (parameters,) of each fitted parameter about the fit."""
+    """Prior standard deviation (parameters,) of each fitted parameter."""
     compliant = [p.effect.endswith("compliance") for p in base.model.parameters]
     wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
     return np.where(is_placed(base.model), PLACED, wide)

@@ -21,10 +21,11 @@ Array = NDArray[np.float64]
 FLIPS = 199
 CLOSE = 6  # candidates whose noise is fitted for themselves
 HOPELESS = -6.0  # score below which none is
+FAR_BEHIND = 60.0  # and how far behind the best: noise of its own makes up for less
 # Probability that nothing (more) is there above which nothing is claimed.
 DOUBT, DOUBT_MORE = 0.5, 0.05
 CLOSE_BLOCKS = 3
-MOST_EFFECTS = 4
+MOST_EFFECTS, MOST_BESIDE_UNKNOWN = 4, 2
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,8 @@ class Search:
         p_values: list[float] = []
         while True:
             best, slot = self._best_addition(current, seen)
-            if best is None or len(current.items) >= MOST_EFFECTS:
+            most = MOST_BESIDE_UNKNOWN if current.unknown else MOST_EFFECTS
+            if best is None or len(current.items) >= most:
                 break
             # Score all again under the noise beside the winner: an effect that is still missing
             # looks like noise, and hides others with it.
@@ -198,6 +200,8 @@ class Search:
         known = np.array([item.known for item in slot.items])
         order = np.argsort(-slot.scores, kind="stable")
         order = order[slot.scores[order] > HOPELESS]
+        near = slot.scores[order] > slot.scores[order[:1]].max(initial=-np.inf) - FAR_BEHIND
+        order = order[near]
         hypotheses = order[known[order]][:CLOSE]
         blocks = order[~known[order]][:CLOSE_BLOCKS]
         return np.concatenate([hypotheses, blocks])

@@ -1,0 +1,191 @@
+"""Which further poses would tell the rivals of a diagnosis apart, and how surely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.stats import norm
+
+from elastocal.diagnosis import separate_advice as advice
+from elastocal.diagnosis.baseline import Baseline, fit_baseline
+from elastocal.diagnosis.result import Diagnosis
+from elastocal.diagnosis.separate_contest import Contest
+from elastocal.diagnosis.separate_order import measuring_order
+from elastocal.diagnosis.separate_pool import Pool, draw_pool, pool_of
+from elastocal.diagnosis.separate_result import ExtraPlan, RivalPair
+from elastocal.diagnosis.separate_rivals import RivalSet, Suspects, check_open
+from elastocal.diagnosis.separate_rows import campaign_of, rows_of
+from elastocal.diagnosis.separate_search import ENOUGH, expected, expected_of_random, fewest
+from elastocal.errors import InsufficientDataError, require
+from elastocal.manipulator.model import Model
+from elastocal.measurements import Measurements
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+# A pair that all candidates together would not tell apart with this probability is inseparable.
+HOPE = 0.9
+NUMBERS = 20_000_000  # of the configurations' covariances that are held at once
+GAIN = 0.02  # of probability that a horizontal pull is worth mentioning for
+
+
+def plan_extra(
+    model: Model,
+    table: Measurements,
+    diagnosis: Diagnosis,
+    *,
+    most: int = 10,
+    seed: int = 0,
+    progress: Progress = lambda message: None,
+) -> ExtraPlan:
+    """The fewest extra poses, at most `most`, that tell the rivals of an open verdict apart.
+
+    `diagnosis` of `table` under `model`, its verdict ambiguous or unknown_effect.  The rivals are
+    the sets that it calls indistinguishable, or what the unknown effect may be.  Candidates are
+    feasible poses of the cell in the table's load states, after the campaign; their distances
+    come from the columns of the fitted arm with all fitted parameters free (see
+    `separate_contest`).
+
+    Raises InputError for a verdict that leaves no rivals, or fewer than one pose.
+    """
+    check_open(diagnosis)
+    require(most >= 1, f"extra poses: at least one has to be allowed; found {most}")
+    notes: list[str] = []
+    if model.cell.model.torque == "measured":
+        spec = replace(model.cell.model, torque="computed")
+        model = Model(model.chain, replace(model.cell, model=spec))
+        notes.append("torques of poses not measured yet are computed from load and weights")
+    suspects = Suspects(model, table, diagnosis)
+    progress("extra poses: fitting the model as it is")
+    base = fit_baseline(model, table, seed)
+    progress("extra poses: drawing candidates")
+    try:
+        pool = draw_pool(
+            model, base.x, table, sides=suspects.sides_matter, waits=suspects.waiting_matters,
+            most=_room(base), seed=seed,
+        )  # fmt: skip
+    except InsufficientDataError as error:
+        return _nothing(list(suspects.named_sets()), diagnosis, (str(error),))
+    progress("extra poses: columns of the candidates")
+    drawn = _drawn(base, pool, suspects, seed)
+    sets = [c.rivals for c in drawn]
+    contests, hopeless = _judged(drawn)
+    notes += [
+        advice.inseparable_advice(pair, distance, len(pool)) for pair, distance in hopeless.items()
+    ]
+    notes += advice.other_means(list(hopeless))
+    worthwhile = any(c.open for c in contests)
+    progress("extra poses: choosing")
+    chosen = fewest(contests, most) if worthwhile else []
+    after = expected(contests, chosen)
+    if after < ENOUGH or hopeless:
+        progress("extra poses: what a horizontal pull would add")
+        if after < ENOUGH:
+            reachable = expected(contests, range(len(pool)))
+            notes.append(advice.too_few_advice(len(chosen), after, reachable))
+        pulled = _pulled(base, pool, suspects, seed)
+        notes += _pull_notes(contests, hopeless, pulled, len(chosen), after, _newton(pool))
+    if not worthwhile:
+        return replace(_nothing(sets, diagnosis, tuple(notes)), pairs=_pairs(contests, chosen))
+    rng = np.random.default_rng(seed)
+    return ExtraPlan(
+        rivals=_names(sets),
+        pairs=_pairs(contests, chosen),
+        plan=measuring_order(pool, chosen, table),
+        n_poses=len(chosen),
+        probability_before=expected(contests, ()),
+        probability_after=after,
+        probability_random=expected_of_random(contests, len(chosen), rng),
+        separable=True,
+        advice=(*advice.recording_advice(sets), *notes),
+    )
+
+
+def _room(base: Baseline) -> int:
+    """How many candidates fit into memory beside the data."""
+    C, M = base.blocks.member.shape
+    return max(NUMBERS // (M * base.seen.size) ** 2 - C, 0)
+
+
+def _drawn(base: Baseline, pool: Pool, suspects: Suspects, seed: int) -> list[Contest]:
+    """The contests of the diagnosis, with the candidates of a pool."""
+    campaign = campaign_of(base, pool, suspects.hypotheses, suspects.diagnosis)
+    sets = list(suspects.named_sets())
+    if suspects.unknown:
+        sets.append(suspects.unknown_set(campaign.so_far, campaign.noise))
+    return [Contest.of(s, rows_of(campaign, s), np.random.default_rng(seed)) for s in sets]
+
+
+def _judged(
+    contests: Sequence[Contest],
+) -> tuple[list[Contest], dict[tuple[str, str], float]]:
+    """Each contest in classes that the whole pool could tell apart, and the pairs that it could
+    not, with their distance in all of it."""
+    judged, hopeless = [], {}
+    for c in contests:
+        d = c.distances(c.squared(c.gram(range(len(c.rows.pool)))))
+        near = d < 2 * float(norm.ppf(HOPE))
+        classes = connected_components(near, directed=False)[1].astype(np.int64)
+        judged.append(c.in_classes(classes))
+        names = c.rivals.names
+        for a, b in zip(*np.nonzero(np.triu(near, 1)), strict=True):
+            hopeless[names[a], names[b]] = float(d[a, b])
+    return judged, hopeless
+
+
+def _pairs(contests: Sequence[Contest], chosen: Sequence[int]) -> tuple[RivalPair, ...]:
+    out = []
+    for c in contests:
+        before, after = c.distances(c.before), c.distances(c.squared(c.gram(chosen)))
+        names = c.rivals.names
+        for a, b in zip(*np.triu_indices(len(names), 1), strict=True):
+            out.append(RivalPair(names[a], names[b], float(before[a, b]), float(after[a, b])))
+    return tuple(out)
+
+
+def _nothing(sets: Sequence[RivalSet], diagnosis: Diagnosis, notes: tuple[str, ...]) -> ExtraPlan:
+    """No pose helps: the right one is named as often as the likeliest is right."""
+    likeliest = [float(s.probability.max()) for s in sets]
+    p = float(np.prod(likeliest)) if sets else diagnosis.probability_unknown
+    return ExtraPlan(_names(sets), (), None, 0, p, p, p, False, notes)
+
+
+def _names(sets: Sequence[RivalSet]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for s in sets for name in s.names))
+
+
+def _newton(pool: Pool) -> float:
+    return float(np.linalg.norm(pool.forces, axis=1).max())
+
+
+def _pulled(base: Baseline, pool: Pool, suspects: Suspects, seed: int) -> list[Contest]:
+    """The contests with every candidate also pulled along x and y as hard as its load pulls.
+
+    None without a load, nor for what is unknown: how it takes a pull nobody can say.
+    """
+    if _newton(pool) == 0 or suspects.unknown:
+        return []
+    forces = np.vstack([pool.forces, _newton(pool) * np.eye(3)[:2]])
+    table = base.seen.table
+    wide = pool_of(base.model, base.x, table, pool.q, pool.approach, pool.time, forces)
+    return _drawn(base, wide, suspects, seed)
+
+
+def _pull_notes(
+    contests: Sequence[Contest], hopeless: dict[tuple[str, str], float],
+    pulled: Sequence[Contest], n: int, after: float, newton: float,
+) -> list[str]:  # fmt: skip
+    """Advice to pull sideways, where that helps."""
+    still = _judged(pulled)[1] if pulled else hopeless
+    notes = [advice.pull_separates(pair, newton) for pair in hopeless if pair not in still]
+    if pulled and n:
+        alike = [p.in_classes(c.classes) for p, c in zip(pulled, contests, strict=True)]
+        chosen = fewest(alike, n)
+        reached = expected(alike, chosen)
+        if reached > after + GAIN:
+            notes.append(advice.pull_advice(len(chosen), newton, after, reached))
+    return notes

@@ -1,0 +1,87 @@
+"""What to do besides measuring the extra poses, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from elastocal.diagnosis.separate_rivals import RivalSet
+
+# What a look at something other than the arm's markers would settle, by effect.
+OTHER_MEANS = {
+    "base_drift": "monuments",
+    "frame_jump": "monuments",
+    "tracker_distortion": "scale",
+    "link_mass_error": "torque",
+    "gravity_compensator": "torque",
+    "payload_error": "weigh",
+}
+MEANS = {
+    "monuments": (
+        "measure fixed reflectors (monuments) on the floor and on the robot's foot along with the "
+        "arm: they tell the tracker's motion, the base's and a joint's apart"
+    ),
+    "scale": (
+        "measure a reference length (scale bar) or set the tracker up in a second place: that "
+        "tells its errors from the arm's"
+    ),
+    "torque": (
+        "record the joints' torques or motor currents, which a wrong weight or spring changes "
+        "and a gear error does not"
+    ),
+    "weigh": "weigh the load and measure its hook",
+}
+
+
+def inseparable_advice(pair: tuple[str, str], distance: float, tried: int) -> str:
+    """That no pose separates two rivals."""
+    first, second = pair
+    return (
+        f"no pose separates {first} and {second}: measured in all {tried} poses that were tried "
+        f"they would be {distance:.1f} standard deviations apart"
+    )
+
+
+def other_means(pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """What else tells the rivals of inseparable pairs apart."""
+    effects = [name.partition(":")[0] for pair in pairs for name in pair]
+    wanted = dict.fromkeys(OTHER_MEANS[e] for e in effects if e in OTHER_MEANS)
+    return [MEANS[key] for key in wanted]
+
+
+def too_few_advice(n: int, probability: float, reachable: float) -> str:
+    """That the plan stays below what was aimed at."""
+    return (
+        f"{n} poses reach a probability of {probability:.2f} only; many more would reach "
+        f"{reachable:.2f}: allow more poses (--poses), or repeat each of them"
+    )
+
+
+def pull_advice(n: int, newton: float, without: float, with_pull: float) -> str:
+    """That pulling sideways would help, and how much."""
+    return (
+        f"pull horizontally: {n} poses that are also measured under {newton:.3g} N along x and "
+        f"along y, e.g. by a rope over a pulley, raise the probability from {without:.2f} to "
+        f"{with_pull:.2f}"
+    )
+
+
+def pull_separates(pair: tuple[str, str], newton: float) -> str:
+    """That pulling sideways tells apart what the load alone does not."""
+    first, second = pair
+    return (
+        f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a pulley, "
+        f"would separate {first} and {second}: measure poses under it, too"
+    )
+
+
+def recording_advice(sets: Sequence[RivalSet]) -> list[str]:
+    """What the extra visits must keep to, because rivals depend on it."""
+    out = []
+    if any(s.depends_on("approach") for s in sets):
+        out.append("come to each extra pose with every joint from the side that the plan states")
+    if any(s.depends_on("time") for s in sets):
+        out.append(
+            "leave arm and tracker as they are until the extra poses are measured, and record "
+            "their times on the same clock"
+        )
+    return out
