@@ -19,13 +19,14 @@ WAVES, FEW_WAVES = 8, 3  # functions of a smooth dependence, and of one in a pro
 @dataclass(frozen=True)
 class Driver:
     """Smooth functions (C, v, f) of what a visit was like; `values` (C, v) in `unit` where they
-    are functions of one number."""
+    are functions of one number.  Where `joint` is given, no other joint is moved."""
 
     kind: str
     name: str
     functions: Array
     values: Array | None = None
     unit: str = ""
+    joint: int | None = None
 
 
 @dataclass(frozen=True)
@@ -58,46 +59,80 @@ class Drivers:
         )  # fmt: skip
 
     def smooth(self) -> Iterator[Driver]:
-        """Every driver that is one number, or a product of two, per visit."""
+        """Every driver that is one number per visit, and every product of two."""
+        yield from self._single()
+        yield from self._with_load()
+        yield from self._with_approach()
+        yield from self._at_own_joint()
+        if self.time is not None:
+            time = waves(self.time, self.scene.present, FEW_WAVES)
+            for i in range(self.n):
+                both = _product(self._angle(i, FEW_WAVES), time)
+                yield Driver("time × angle", f"time × joint{i + 1} angle", both)
+
+    @property
+    def n(self) -> int:
+        return self.angle.shape[2]
+
+    def _angle(self, i: int, count: int) -> Array:
+        return waves(self.angle[:, :, i], self.scene.present, count)
+
+    def _loaded_joints(self) -> list[int]:
+        return [i for i in range(self.n) if np.ptp(self.torque[:, :, i][self.scene.present]) > 0]
+
+    def _single(self) -> Iterator[Driver]:
         present = self.scene.present
-        n = self.angle.shape[2]
-        load = self.load
-        angles = [waves(self.angle[:, :, i], present, WAVES) for i in range(n)]
-        for i in range(n):
-            yield Driver("angle", f"joint{i + 1} angle", angles[i], self.angle[:, :, i], "rad")
-        for i in range(n):
-            if np.ptp(self.torque[:, :, i][present]) > 0:
-                tau = self.torque[:, :, i]
-                functions = _odd_and_even(tau, present)
-                yield Driver("torque", f"joint{i + 1} torque", functions, tau, "N m")
+        for i in range(self.n):
+            angle = self.angle[:, :, i]
+            yield Driver("angle", f"joint{i + 1} angle", self._angle(i, WAVES), angle, "rad")
+        for i in self._loaded_joints():
+            tau = self.torque[:, :, i]
+            functions = _odd_and_even(tau, present)
+            yield Driver("torque", f"joint{i + 1} torque", functions, tau, "N m")
         if self.time is not None:
             yield Driver("time", "time", waves(self.time, present, WAVES), self.time, "s")
         if self.temperature is not None:
             warmth = waves(self.temperature, present, FEW_WAVES)
             yield Driver("temperature", "temperature", warmth, self.temperature, "°C")
-        if load is not None:
-            both = np.stack([load, load**2], axis=2) * present[:, :, None]
-            yield Driver("load", "load", both, load, "of the largest load")
-            for i in range(n):
-                few = angles[i][:, :, :FEW_WAVES] * load[:, :, None]
-                yield Driver("load × angle", f"load × joint{i + 1} angle", few)
-            if self.time is not None:
-                time = waves(self.time, present, FEW_WAVES)
-                yield Driver("load × time", "load × time", time * load[:, :, None])
-        if self.approach is not None:
-            for i in range(n):
-                a = self.approach[:, :, i]
-                by = [a] if load is None else [a, a * load]
-                torque = np.abs(self.torque[:, :, i])
-                if torque.max() > 0:
-                    by.append(a * torque / torque.max())
-                yield Driver("approach", f"approach of joint{i + 1}", np.stack(by, axis=2))
+
+    def _with_load(self) -> Iterator[Driver]:
+        load, present = self.load, self.scene.present
+        if load is None:
+            return
+        levels = len(np.unique(load[present].round(6)))
+        powers = [load] if levels < 3 else [load, load**2]
+        both = np.stack(powers, axis=2) * present[:, :, None]
+        yield Driver("load", "load", both, load, "of the largest load")
+        for i in range(self.n):
+            few = self._angle(i, FEW_WAVES) * load[:, :, None]
+            yield Driver("load × angle", f"load × joint{i + 1} angle", few)
         if self.time is not None:
             time = waves(self.time, present, FEW_WAVES)
-            for i in range(n):
-                product = angles[i][:, :, :FEW_WAVES, None] * time[:, :, None, :]
-                functions = product.reshape(*present.shape, -1)
-                yield Driver("time × angle", f"time × joint{i + 1} angle", functions)
+            yield Driver("load × time", "load × time", time * load[:, :, None])
+
+    def _with_approach(self) -> Iterator[Driver]:
+        if self.approach is None:
+            return
+        for i in range(self.n):
+            a = self.approach[:, :, i]
+            by = [a] if self.load is None else [a, a * self.load]
+            torque = np.abs(self.torque[:, :, i])
+            if torque.max() > 0:
+                by.append(a * torque / torque.max())
+            functions = np.stack(by, axis=2)
+            yield Driver("approach", f"approach of joint{i + 1}", functions, joint=i)
+
+    def _at_own_joint(self) -> Iterator[Driver]:
+        """A stiffness that changes with the joint's own angle, or with time."""
+        present = self.scene.present
+        for i in self._loaded_joints():
+            tau = self.torque[:, :, i] / np.abs(self.torque[:, :, i][present]).max()
+            name = f"joint{i + 1} torque"
+            by_angle = self._angle(i, WAVES - FEW_WAVES) * tau[:, :, None]
+            yield Driver("torque × angle", f"{name} × its angle", by_angle, joint=i)
+            if self.time is not None:
+                by_time = waves(self.time, present, FEW_WAVES) * tau[:, :, None]
+                yield Driver("torque × time", f"{name} × time", by_time, joint=i)
 
     def wrenches(self) -> Iterator[tuple[Array, Array]]:
         """The load's force and moment (C, v, 3) at each link's end along its axes, largest 1.
@@ -140,6 +175,11 @@ def waves(x: Array, present: NDArray[np.bool_], count: int) -> Array:
     u = (x - known.min()) / span
     k = np.arange(1, count + 1)
     return np.cos(np.pi * u[:, :, None] * k) / k * present[:, :, None]
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Products of the functions a (C, v, f) and b (C, v, g): (C, v, f·g)."""
+    return np.asarray((a[:, :, :, None] * b[:, :, None, :]).reshape(*a.shape[:2], -1))
 
 
 def monomials(x: Array, degree: int) -> Array:

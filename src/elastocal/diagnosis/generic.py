@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.columns import EntryKey
-from elastocal.diagnosis.drivers import Driver, Drivers, monomials
+from elastocal.diagnosis.drivers import FEW_WAVES, Driver, Drivers, monomials
 from elastocal.diagnosis.scene import Scene
 from elastocal.manipulator.effects.base import Stage
 
@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 MOTION = {"rad": 1e-4, "m": 1e-4, "1": 1e-4}
 BASE_MOTION = 5e-5
 FRAME_WAVES = 5
+HOOK_MOTION = 1e-2
 
 
 @dataclass(frozen=True)
@@ -68,22 +69,35 @@ def _driven(scene: Scene, drivers: Drivers) -> Iterator[Generic]:
         return Generic(by.kind, by.name, where, stage, (entry, (place,)), drive, None, by)
 
     for by in drivers.smooth():
-        kind, name = by.kind, by.name
-        for joint in joints:
-            if kind == "approach" and not name.endswith(joint):
-                continue
-            stage: Stage = "compliance" if kind in ("torque", "load") else "transmission"
-            yield block(by, "joint_motion", joint, joint, stage)
-        if kind in ("angle", "time", "load", "temperature"):
+        under_load = by.kind.startswith(("torque", "load"))
+        for k, joint in enumerate(joints):
+            if by.joint is None or by.joint == k:
+                stage: Stage = "compliance" if under_load else "transmission"
+                yield block(by, "joint_motion", joint, joint, stage)
+        if by.kind in ("angle", "time", "load", "temperature"):
             for k in range(n):
-                stage = "compliance" if kind == "load" else "geometry"
                 link = f"link{k + 1}"
-                yield block(by, "link_frame", link, link, stage)
-        if kind in ("time", "temperature", "load"):
+                yield block(
+                    by, "link_frame", link, link, "compliance" if under_load else "geometry"
+                )
+        if by.kind in ("angle", "time", "load", "temperature", "approach"):
             yield block(by, "base_motion", "base", "base", "tracker")
+        if by.kind in ("time", "temperature", "load"):
             for marker in model.cell.tool.markers:
                 place = f"marker:{marker}"
                 yield block(by, "marker_motion", place, place, "tool")
+        if by.kind in ("angle", "time") and scene.load_point is not None:
+            yield _of_load_point(scene, by)
+
+
+def _of_load_point(scene: Scene, by: Driver) -> Generic:
+    """The hook moves: few functions for each of its directions, under load only."""
+    assert scene.load_point is not None
+    few = by.functions[:, :, :FEW_WAVES]
+    W = np.einsum("cmv,cvf->cmf", scene.places.one_hot, few) * HOOK_MOTION
+    columns = np.einsum("cmd,cmf->cmdf", scene.load_point, W)
+    packed = columns.reshape(*columns.shape[:2], -1)
+    return Generic(f"{by.kind} → load", by.name, "load", "load", None, None, packed)
 
 
 def _all(scene: Scene, entry: str, place: str, W: Array) -> Array:
@@ -105,7 +119,9 @@ def _of_force(scene: Scene, drivers: Drivers) -> Iterator[Generic]:
             drive[:, :, a, 3 * a : 3 * a + 3] = MOTION["m"] * force
             drive[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = MOTION["rad"] * moment
         link = f"link{k + 1}"
-        yield Generic("force", f"force at {link}", link, "compliance", ("link_frame", (link,)),
+        # Beyond the last link there is only the tool and its markers.
+        where = "tool" if k == scene.base.model.chain.n_joints - 1 else link
+        yield Generic("force", f"force at {where}", where, "compliance", ("link_frame", (link,)),
                       drive, None)  # fmt: skip
 
 

@@ -36,9 +36,9 @@ class Scored:
 class Scan:
     """Everything scored under one noise: hypotheses, blocks, and the odds of all together.
 
-    `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior, `flipped` (F,) the same for
-    residuals whose configurations had their signs flipped; `by_driver` (drivers,) and its flips
-    the largest evidence among the blocks of a driver.
+    `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior,
+    `flipped` (F,) the same for residuals whose configurations had their signs flipped;
+    `driver_odds` the largest evidence among the blocks of a driver, and its flips.
     """
 
     scored: tuple[Scored, ...]

@@ -42,7 +42,7 @@ LOAD_POINT_TOLERANCE = 2e-3
 
 @dataclass(frozen=True)
 class FittedColumns:
-    """What the columns of the data's X are: `effect` of each, `width` (p,) by which it is scaled."""
+    """What the columns of the data's X are: `effect` of each, `width` (p,) that scales it."""
 
     effect: tuple[str, ...]
     width: Array
@@ -53,7 +53,8 @@ class Scene:
     """A baseline with the columns of all hypotheses, packed by configuration.
 
     `data` holds the residual at the prior's centre, linearised at the fit, the fitted columns
-    (scaled to their prior deviations) and noise shapes.
+    (scaled to their prior deviations) and noise shapes; `load_point` (C, m, 3) what a shift of the
+    hook does, per m, None without a load.
     """
 
     base: Baseline
@@ -63,6 +64,7 @@ class Scene:
     places: VisitPlaces
     data: NoisyData
     fitted: FittedColumns
+    load_point: Array | None = None
 
     @cached_property
     def _kept(self) -> dict[tuple[str, str, bytes], Array]:
@@ -164,10 +166,12 @@ def scene_of(
     effects = [p.effect for p in model.parameters]
     B = at.B.reshape(len(seen.lead), seen.size, -1) * width
     residual = base.residual.reshape(-1, seen.size) + B @ (away(base) / width)
+    load_point = None
     for h in hook:
         keys = [k for k, p in enumerate(h.parameters) if p.key.startswith("load_point")]
-        shift = columns.observed(columns.of(h)[:, :, keys]) * LOAD_POINT_TOLERANCE
-        B = np.concatenate([B, shift], axis=2)
+        shift = columns.observed(columns.of(h)[:, :, keys])
+        load_point = blocks.pack(shift)
+        B = np.concatenate([B, shift * LOAD_POINT_TOLERANCE], axis=2)
         width = np.append(width, np.full(len(keys), LOAD_POINT_TOLERANCE))
         effects = effects + [h.name] * len(keys)
     used = np.abs(B).max(axis=(0, 1), initial=0.0) > 0
@@ -191,7 +195,9 @@ def scene_of(
         stated=base.stated is not None,
     )
     fitted = FittedColumns(tuple(e for e, u in zip(effects, used, strict=True) if u), width[used])
-    return Scene(base, columns, tuple(hypotheses), blocks, VisitPlaces.of(blocks), data, fitted)
+    return Scene(
+        base, columns, tuple(hypotheses), blocks, VisitPlaces.of(blocks), data, fitted, load_point
+    )
 
 
 def away(base: Baseline) -> Array:

@@ -98,7 +98,7 @@ class Search:
     def run(self) -> Found:
         scene = self.scene
         nothing = current = fit_set(scene, (), self.noise)
-        seen = first = self._scan(current, flips=True)
+        seen = first = alone = self._scan(current, flips=True)
         slots: list[Slot] = []
         p_values: list[float] = []
         while True:
@@ -109,6 +109,8 @@ class Search:
             # Score all again under the noise beside the winner: an effect that is still missing
             # looks like noise, and hides others with it.
             observed = self._scan(current, best.noise)
+            if not current.items:
+                alone = observed
             better, again = self._best_addition(current, observed)
             best, slot = better, slot.best_of(again)
             doubt = DOUBT_MORE if current.items else DOUBT
@@ -130,7 +132,8 @@ class Search:
                 current, slots, seen = self._reexamined(current, slots, seen)
         if not slots:
             slots = [slot]
-        alone = self._scan(nothing, current.noise) if current.items else first
+        if len(current.items) > 1:
+            alone = self._scan(nothing, current.noise)
         return Found(self.scene, current, tuple(slots), tuple(p_values), nothing, first, alone)
 
     def _scan(

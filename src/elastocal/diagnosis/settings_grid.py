@@ -64,12 +64,12 @@ def change_times(time: Array) -> Array:
 def _orders(hypothesis: Hypothesis, visits: Measurements) -> Grid:
     spread = max(float(np.ptp(visits.q[:, index(hypothesis.where)])), 1e-3)
     step = ORDER_STEP / spread
-    values = np.arange(LOWEST_ORDER, HIGHEST_ORDER, step) if step < 100 else np.array([])
+    values = np.arange(LOWEST_ORDER, HIGHEST_ORDER, step)
     (setting,) = hypothesis.settings
     known = [] if setting.default is None else [setting.default]
-    share = KNOWN_SHARE if known and len(values) else float(bool(known))
+    share = KNOWN_SHARE if known else 0.0
     prior = np.concatenate(
-        [np.full(len(known), share), np.full(len(values), (1 - share) / max(len(values), 1))]
+        [np.full(len(known), share), np.full(len(values), (1 - share) / len(values))]
     )
     return Grid(
         np.concatenate([known, values])[:, None], np.log(prior), np.full((len(prior), 1), step)

@@ -16,6 +16,7 @@ from elastocal.diagnosis.search import Found
 Array = NDArray[np.float64]
 
 NAMED = 0.9  # probability from which an effect is named
+UNKNOWN_EFFECT = "unknown_effect"
 SET, LARGEST_SET = 0.95, 3  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
@@ -35,10 +36,15 @@ class Answer:
     @property
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         return tuple(
-            tuple(EffectAt(*item_key(item)) for item, _ in rivals)
+            tuple(EffectAt(*_named(item)) for item, _ in rivals)
             for rivals in self.rivals
-            if len(rivals) > 1 and all(item.known for item, _ in rivals)
+            if len(rivals) > 1
         )
+
+
+def _named(item: Item) -> tuple[str, str]:
+    """(effect, place); a block without a name is an unknown effect at its place."""
+    return item_key(item) if item.known else (UNKNOWN_EFFECT, item.what.where)
 
 
 def judge(found: Found) -> Answer:
@@ -84,8 +90,14 @@ def _of_item(found: Found, k: int, item: Item) -> tuple[float, tuple[tuple[Item,
         p[alike] += spare / len(alike)
     chosen = [own, *alike]
     if p[own] < NAMED:
-        order = [i for i in np.argsort(-p) if slot.items[i].known and i not in chosen]
-        for i in order:
+        # Of the blocks only the likeliest: they all say "something else, about there".
+        blocks = [i for i in range(len(p)) if not slot.items[i].known]
+        rest = {*range(len(p))} - {*chosen, *blocks}
+        if blocks:
+            likeliest = max(blocks, key=lambda i: p[i])
+            p[likeliest] = p[blocks].sum()
+            rest.add(likeliest)
+        for i in sorted(rest, key=lambda i: -p[i]):
             if len(chosen) >= LARGEST_SET or p[chosen].sum() >= SET or p[i] < 0.01:
                 break
             chosen.append(int(i))

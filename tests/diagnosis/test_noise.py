@@ -1,0 +1,130 @@
+"""The noise likelihood against dense Gaussians, and what is fitted against what was drawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from support.diagnosis_data import dense_noise, kept_only, random_data, used_rows
+
+from elastocal.diagnosis.blocks import Blocks
+from elastocal.diagnosis.noise import (
+    NoiseValues,
+    NoisyData,
+    covariance,
+    fit_noise,
+    likelihood,
+    log_prior,
+    project,
+)
+
+NOISE = NoiseValues(1.3, np.array([4e-6, 9e-6, 2e-5]), 0.4)
+SEEDS = range(4)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_covariance_is_built_of_tracker_noise_visits_and_configurations(seed: int) -> None:
+    data = random_data(seed)
+    rows = used_rows(data)
+    V = covariance(data, NOISE)
+    m = V.shape[1]
+    np.testing.assert_allclose(
+        np.array([[V[i // m, i % m, j % m] if i // m == j // m else 0 for j in rows] for i in rows]),
+        dense_noise(data, NOISE), atol=1e-22, rtol=1e-12,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_marginal_likelihood_is_that_of_the_dense_gaussian(seed: int) -> None:
+    data = random_data(seed)
+    rows = used_rows(data)
+    X = data.X.reshape(-1, data.X.shape[2])[rows]
+    S = dense_noise(data, NOISE) + X / data.precision @ X.T
+    expected = stats.multivariate_normal(cov=1e10 * S).logpdf(1e5 * data.r.ravel()[rows])
+    expected += len(rows) * np.log(1e5)
+    assert project(data, NOISE).marginal == pytest.approx(expected, rel=1e-9)
+    prior = log_prior(data.stated, NOISE)[0]
+    assert likelihood(data, NOISE)[0] == pytest.approx(-2 * expected + prior, rel=1e-9)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_slope_is_that_of_finite_differences(seed: int, stated: bool) -> None:
+    data, at, h = random_data(seed, stated=stated), NOISE.logs(), 1e-5
+    slope = likelihood(data, NOISE)[1]
+    for k, step in enumerate(h * np.eye(len(at))):
+        up, down = (likelihood(data, NoiseValues.of_logs(at + s * step))[0] for s in (1, -1))
+        assert slope[k] == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_readings_left_out_count_as_if_they_were_never_made(seed: int) -> None:
+    data = random_data(seed)
+    fewer = kept_only(data)
+    assert fewer.blocks.n < data.blocks.n
+    for one, other in zip(likelihood(data, NOISE), likelihood(fewer, NOISE), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+    rubbish = np.where(data.left_out, 1e3, data.r)
+    assert likelihood(replace(data, r=rubbish), NOISE)[0] == likelihood(data, NOISE)[0]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_projected_residual_is_the_weighted_residual_of_the_fit(seed: int) -> None:
+    """u = P r with the dense P, and u = V⁻¹(r − Xβ̂) with the ridge solution β̂."""
+    data, rows = random_data(seed), used_rows(random_data(seed))
+    at = project(data, NOISE)
+    X, r = data.X.reshape(-1, data.X.shape[2])[rows], data.r.ravel()[rows]
+    inverse = np.linalg.inv(dense_noise(data, NOISE))
+    M = X.T @ inverse @ X + np.diag(data.precision)
+    beta = np.linalg.solve(M, X.T @ inverse @ r)
+    u = inverse @ (r - X @ beta)
+    np.testing.assert_allclose(at.u.ravel()[rows], u, rtol=1e-7, atol=1e-9 * np.abs(u).max())
+    deviation = at.beta_deviation
+    np.testing.assert_allclose(deviation.T @ deviation, np.linalg.inv(M), rtol=1e-7)
+    np.testing.assert_allclose(at.h.sum(axis=0), deviation @ (data.precision * beta), rtol=1e-6)
+
+
+def drawn(truth: NoiseValues, n: int, seed: int) -> NoisyData:
+    """Readings of two or three markers in two visits to each of n configurations."""
+    rng = np.random.default_rng(seed)
+    count = rng.choice([4, 6], n)
+    configuration = np.repeat(np.arange(n), count)
+    visit = 2 * configuration + np.concatenate([np.arange(k) >= k // 2 for k in count])
+    blocks = Blocks.of(configuration, visit, 3)
+    base = random_data(seed, blocks, p=5, joints=len(truth.joint))
+    base = replace(base, left_out=blocks.absent, precision=np.full(5, 1e-6))
+    V = covariance(base, truth)
+    noise = (np.linalg.cholesky(V) @ rng.normal(size=(*V.shape[:2], 1)))[..., 0]
+    return replace(base, r=base.masked(noise + base.X @ rng.normal(size=5)))
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        NoiseValues(1.4, np.array([5e-6, 1.5e-5]), 0.6),
+        NoiseValues(0.7, np.array([1.2e-5, 8e-6]), 0.2),
+    ],
+)
+def test_the_noise_that_made_the_readings_is_found(truth: NoiseValues) -> None:
+    """Within 5 standard deviations of what 400 configurations can tell, and the search's slack."""
+    found = fit_noise(drawn(truth, 400, 3))
+    assert found.factor == pytest.approx(truth.factor, rel=0.05)
+    np.testing.assert_allclose(found.joint, truth.joint, rtol=0.15)
+    assert found.shared == pytest.approx(truth.shared, abs=0.15)
+
+
+def test_the_noise_found_is_the_most_probable_one() -> None:
+    data = drawn(NoiseValues(1.0, np.array([8e-6, 8e-6]), 0.3), 60, 4)
+    best = fit_noise(data)
+    value = likelihood(data, best)[0]
+    for step in 0.2 * np.concatenate([np.eye(4), -np.eye(4)]):
+        assert likelihood(data, NoiseValues.of_logs(best.logs() + step))[0] > value
+
+
+def test_the_start_of_the_search_does_not_matter() -> None:
+    data = drawn(NoiseValues(1.0, np.array([8e-6, 8e-6]), 0.3), 60, 5)
+    far = NoiseValues(2.5, np.array([1e-4, 1e-7]), 1.5)
+    ends = [likelihood(data, fit_noise(data, start))[0] for start in (None, far)]
+    assert ends[0] == pytest.approx(ends[1], abs=0.05)

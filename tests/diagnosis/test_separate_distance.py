@@ -1,0 +1,202 @@
+"""Distances of rivals against dense least squares, and what further visits do to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from support.cells import choices, kr270_cell, kr270_chain, random_poses, table_of
+
+from elastocal.cell import Array, CartesianNoise
+from elastocal.diagnosis.baseline import Baseline, fit_baseline
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import Item
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.result import NoiseFloor
+from elastocal.diagnosis.scene import widths
+from elastocal.diagnosis.separate_contest import DRAWS, Contest
+from elastocal.diagnosis.separate_pool import Pool, joined, pool_of
+from elastocal.diagnosis.separate_rivals import RivalSet
+from elastocal.diagnosis.separate_rows import campaign_of, rows_of
+from elastocal.diagnosis.separate_search import expected, expected_of_random, fewest
+from elastocal.diagnosis.separate_settings import best_imitations
+from elastocal.manipulator.model import Model
+from elastocal.measurements import Measurements
+from elastocal.simulation.simulate import simulate, values_from
+
+FITTED = ("base_frame", "joint_offset", "marker_position")
+RIVALS = (("gear_eccentricity", "joint3"), ("encoder_scale", "joint3"), ("joint_drift", "joint2"))
+TIME_CONSTANT = 1800.0
+SIGMA = 20e-6
+NOISE = NoiseValues(1.3, np.linspace(4e-6, 9e-6, 6), 0.5)
+CHOSEN = (4, 1, 7)
+PROBABILITY = np.array([0.5, 0.3, 0.2])
+
+
+@pytest.fixture(scope="module")
+def base() -> Baseline:
+    """A fit to an unloaded campaign in a narrow range of joint 3."""
+    cell = kr270_cell(FITTED)
+    cell = replace(cell, tracker=replace(cell.tracker, noise=CartesianNoise(np.full(3, SIGMA))))
+    chain = kr270_chain()
+    q = random_poses(chain, 14, 1)
+    q[:, 2] = np.random.default_rng(2).uniform(-0.6, 0.6, 14)
+    table = table_of(q, np.zeros(3))
+    table = replace(table, time=600.0 * table.configuration)
+    spec = replace(
+        cell.model, effects=(*cell.model.effects, *choices(["gear_eccentricity:joint3"]))
+    )
+    truth = Model(chain, replace(cell, model=spec))
+    sizes = {"joint3.eccentricity_sin": 2e-4, "joint3.eccentricity_cos": -1e-4}
+    read = simulate(truth, table, values_from(truth, sizes), 3)
+    return fit_baseline(Model(chain, cell), read)
+
+
+@pytest.fixture(scope="module")
+def pool(base: Baseline) -> Pool:
+    q = random_poses(base.model.chain, 10, 5)
+    late = np.linspace(9000.0, 12000.0, 10)
+    return pool_of(base.model, base.x, base.seen.table, q, None, late, np.zeros((1, 3)))
+
+
+@pytest.fixture(scope="module")
+def contest(base: Baseline, pool: Pool) -> Contest:
+    known = {(h.name, h.where): h for h in possible(base.model, base.seen.table)[0]}
+    settings = [[], [], [TIME_CONSTANT]]
+    items = [Item(known[k], np.array(s), 0.0) for k, s in zip(RIVALS, settings, strict=True)]
+    found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
+    diagnosis = type("Found", (), {"noise": found})
+    whole = campaign_of(base, pool, [known[k] for k in RIVALS], diagnosis)  # type: ignore
+    rivals = RivalSet.of(items, list(PROBABILITY), [])
+    return Contest.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
+
+
+def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Array) -> float:
+    """d² of rival a with parameters `size` from rival b: one dense weighted least-squares problem
+    over all rows, from the B of a model with all rivals active."""
+    model = base.model
+    effects = choices([*FITTED, *(f"{e}:{w}" for e, w in RIVALS)])
+    nominal = replace(
+        model.cell.model.nominal, settings={"joint2": {"time_constant_s": TIME_CONSTANT}}
+    )
+    spec = replace(model.cell.model, effects=effects, nominal=nominal)
+    whole = Model(model.chain, replace(model.cell, model=spec))
+    fitted = dict(zip(model.names, base.x, strict=True))
+    x = np.array([fitted.get(p.name, 0.0) for p in whole.parameters])
+    B = whole.regressor(table, x).B
+    of = {key: [i for i, p in enumerate(whole.parameters) if p.effect == key[0]] for key in RIVALS}
+    X = B[:, [whole.names.index(name) for name in model.names]] * widths(base)
+    widest = np.array([3 * whole.parameters[i].typical for i in of[RIVALS[b]]])
+    Z = np.hstack([X, B[:, of[RIVALS[b]]] * widest])
+    typical = np.array([whole.parameters[i].typical for i in of[RIVALS[a]]])
+    signal = B[:, of[RIVALS[a]]] @ (typical * size)
+    V = NOISE.factor**2 * SIGMA**2 * np.eye(len(B))
+    step = 1e-6
+    for j in range(6):
+        moved = [replace(table, q=table.q + s * step * np.eye(6)[j]) for s in (1, -1)]
+        g = (whole.predict(moved[0], x) - whole.predict(moved[1], x)) / (2 * step)
+        same = np.repeat(table.configuration, 3)
+        shared = (same[:, None] == same[None, :]) * (1 + NOISE.shared**2)
+        V += NOISE.joint[j] ** 2 * np.outer(g, g) * shared
+    L = np.linalg.cholesky(V)
+    white = np.linalg.solve(L, np.column_stack([Z, signal]))
+    tied = np.vstack([white[:, :-1], np.eye(Z.shape[1])])
+    aim = np.concatenate([white[:, -1], np.zeros(Z.shape[1])])
+    left = aim - tied @ np.linalg.lstsq(tied, aim, rcond=None)[0]
+    return float(left @ left)
+
+
+@pytest.mark.parametrize("chosen", [(), CHOSEN])
+@pytest.mark.parametrize(("a", "b"), [(0, 1), (1, 0), (2, 0)])
+def test_distance_is_that_of_dense_least_squares(base, pool, contest, chosen, a, b) -> None:
+    squared = contest.squared(contest.gram(chosen))[a, b]
+    rows = np.flatnonzero(np.isin(pool.table.configuration - 14, chosen))
+    table = joined(base.seen.table, pool.table.take(rows))
+    for k in (0, DRAWS, 2 * DRAWS - 1):
+        expected_square = dense_distance(base, table, a, b, contest.draws[a][k])
+        assert squared[k] == pytest.approx(expected_square, rel=1e-3)
+
+
+def test_adding_each_candidate_is_as_adding_it_by_hand(contest) -> None:
+    each = contest.squared_with_each(contest.gram(CHOSEN))
+    for k in range(10):
+        direct = contest.squared(contest.gram((*CHOSEN, k)))
+        np.testing.assert_allclose(each[k], direct, rtol=1e-6, atol=1e-6)
+
+
+def test_more_visits_never_bring_rivals_nearer(contest) -> None:
+    before = contest.before
+    for n in range(1, 11):
+        after = contest.squared(contest.gram(range(n)))
+        assert (after >= before - 1e-6 * (1 + before)).all()
+        before = after
+
+
+def test_draws_have_the_mean_of_the_ridge_estimate(base, contest) -> None:
+    """Antithetic draws average to the estimate, which is nearer the truth than nothing is."""
+    truth = np.array([2e-4, -1e-4]) / 1e-4
+    estimate = contest.draws[0].mean(axis=0)
+    spread = contest.draws[0].std(axis=0)
+    assert (np.abs(estimate - truth) < 4 * spread).all()
+    opposite = contest.draws[0][:DRAWS] + contest.draws[0][DRAWS:]
+    np.testing.assert_allclose(opposite, np.tile(2 * estimate, (DRAWS, 1)))
+
+
+def test_without_visits_the_likeliest_is_named(contest) -> None:
+    assert expected([contest], ()) == pytest.approx(0.5, abs=1e-4)
+    merged = contest.in_classes(np.array([0, 1, 0]))
+    assert expected([merged], ()) == pytest.approx(0.7, abs=1e-4)
+    assert not contest.in_classes(np.zeros(3, dtype=np.int64)).open and merged.open
+
+
+def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(contest) -> None:
+    """P = Σ p_a P(log odds > 0) with log odds ~ N(±(L + δ²/2), δ²), by drawing them."""
+    p = np.array([0.7, 0.3])
+    two = replace(
+        contest, rivals=replace(contest.rivals, rivals=contest.rivals.rivals[:2], probability=p),
+        draws=contest.draws[:2], before=np.zeros((2, 2, 1)), classes=np.arange(2),
+    )  # fmt: skip
+    delta = 1.7
+    squared = delta**2 * (1 - np.eye(2))[:, :, None]
+    rng = np.random.default_rng(0)
+    L = np.log(p[0] / p[1])
+    drawn = [
+        (sign * L + delta**2 / 2 + delta * rng.normal(size=400_000) > 0).mean() for sign in (1, -1)
+    ]
+    assert two.probability(squared) == pytest.approx(p @ drawn, abs=2e-3)
+    even = replace(two, rivals=replace(two.rivals, probability=np.array([0.5, 0.5])))
+    assert even.probability(squared) == pytest.approx(stats.norm.cdf(delta / 2))
+
+
+def test_the_search_finds_the_best_pair_of_visits(contest) -> None:
+    """Addition and exchange against all pairs."""
+    pairs = [(i, j) for i in range(10) for j in range(i)]
+    errors = {
+        pair: float(contest.error_bound(contest.squared(contest.gram(pair)))) for pair in pairs
+    }
+    chosen = fewest([contest], 2)
+    assert len(chosen) == 2
+    assert errors[max(chosen), min(chosen)] <= min(errors.values()) * (1 + 1e-3)
+
+
+def test_the_plan_beats_random_visits(contest) -> None:
+    chosen = fewest([contest], 2)
+    rng = np.random.default_rng(1)
+    assert expected([contest], chosen) > expected_of_random([contest], len(chosen), rng)
+
+
+def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, contest) -> None:
+    """A drift of 1800 s is imitated by the same drift, whatever constant was found for it."""
+    drift = contest.rivals.rivals[2]
+    quick = replace(drift, settings=np.array([700.0]))
+    found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
+    whole = campaign_of(base, pool, [drift.what], type("Found", (), {"noise": found}))
+    rivals = RivalSet.of([drift, quick], [0.5, 0.5], [])
+    best = best_imitations(whole.so_far, NOISE, rivals)
+    tried = whole.scene.grids[drift.what.name, drift.what.where].values[:, 0]
+    nearest = tried[np.argmin(np.abs(np.log(tried / TIME_CONSTANT)))]
+    assert best[0, 1].settings[0] == pytest.approx(nearest)
+    d = Contest.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
+    assert d.distances(d.before)[0, 1] < 0.5
