@@ -38,10 +38,14 @@ class Shrinkage:
 
 
 def shrinkage(
-    before: ModelSet, after: ModelSet, truths: list[tuple[ModelSet, float]],
+    before: ModelSet, after: ModelSet, truths: list[tuple[ModelSet, float]], between: float,
     rng: np.random.Generator,
 ) -> Shrinkage:  # fmt: skip
-    """Reduction from `before` to `after`, the truth being each of `truths` with its probability."""
+    """Reduction from `before` to `after`, the truth being each of `truths` with its probability.
+
+    `between` (m²): squared error of all readings, on average over configurations, that a change
+    makes in the pause in which it happened: a fresh pose may fall on the wrong side of it.
+    """
     data = before.data
     missed = [s.data.masked(left_out_residual(s.at)) for s in (before, after)]
     weights = np.array([p for _, p in truths])
@@ -52,6 +56,7 @@ def shrinkage(
         noise = draws[which[d]](rng)
         configurations = rng.dirichlet(np.ones(len(noise)))
         squares = [float(configurations @ squared_lengths(data, noise - e)[0]) for e in missed]
+        squares[1] += between * rng.random()
         ratios[d] = 1 - np.sqrt(squares[1] / max(squares[0], 1e-300))
     low95, low90, middle, high90, high95 = np.quantile(ratios, [0.025, 0.05, 0.5, 0.95, 0.975])
     return Shrinkage(float(middle), (float(low90), float(high90)), (float(low95), float(high95)))

@@ -17,13 +17,15 @@ from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.listing import candidates, too_small, warnings
 from elastocal.diagnosis.locate import location, structure_tests
-from elastocal.diagnosis.model_set import ModelSet, fit_set
+from elastocal.diagnosis.model_set import fit_set
+from elastocal.diagnosis.noise import fit_noise
 from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.diagnosis.refit import refit
 from elastocal.diagnosis.result import Diagnosis, Finding
-from elastocal.diagnosis.scene import scene_of
-from elastocal.diagnosis.screen import screen
+from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.diagnosis.screen import faulty_readings
 from elastocal.diagnosis.search import Found, Search
+from elastocal.diagnosis.uncertain_settings import between_visits, other_settings
 from elastocal.diagnosis.verdict import Answer, judge
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.checks import check_table
@@ -60,20 +62,18 @@ def diagnose(
     progress("columns of what could be missing")
     scene = scene_of(base, hypotheses)
     progress("noise floor")
-    complete = scene
-    scene, noise = screen(complete)
+    faulty = faulty_readings(scene, scene.data)
     progress("searching for what is missing")
-    generic = generic_blocks(scene)
-    found = Search(scene, generic, noise, options.false_alarm, options.seed).run()
+    found = _search(scene.without(faulty), options)
     if found.chosen.items:
         # Beside a large effect nothing looks faulty, or the wrong readings do.
-        first = scene.data.X.shape[2]
-        data = found.chosen.data
-        again, noise = screen(complete, data.X[:, :, first:], data.precision[first:])
-        if (again.data.left_out != scene.data.left_out).any():
+        beside = found.chosen.data.without(np.zeros_like(faulty))
+        again = faulty_readings(found.scene, beside)
+        if (again != faulty).any():
             progress("searching again without faulty readings")
-            scene = again
-            found = Search(scene, generic, noise, options.false_alarm, options.seed).run()
+            found = _search(scene.without(again), options)
+            faulty = again
+    scene = scene.without(faulty)
     answer = judge(found)
     progress("confirming")
     rng = np.random.default_rng(options.seed)
@@ -84,10 +84,7 @@ def diagnose(
     p_first = (1 + int((found.first.flipped >= found.first.odds).sum())) / (
         1 + len(found.first.flipped)
     )
-    each, nothing = found.slots[0].probabilities()
-    unknown = sum(
-        float(p) for item, p in zip(found.slots[0].items, each, strict=True) if not item.known
-    )
+    nothing = found.slots[0].probabilities()[1]
     return Diagnosis(
         verdict=answer.verdict,
         gap=gap,
@@ -99,7 +96,7 @@ def diagnose(
         noise=noise_floor(found.scene, chosen.data, chosen.noise),
         structure=tests,
         probability_nothing=nothing,
-        probability_unknown=unknown,
+        probability_unknown=_unknown(found),
         p_value=found.p_values[0] if found.p_values else p_first,
         curves=curves_of(found.scene, chosen),
         untested=(*untested, *too_small(scene, found)),
@@ -107,6 +104,21 @@ def diagnose(
         n_readings=scene.blocks.n,
         n_configurations=len(scene.blocks.member),
     )
+
+
+def _unknown(found: Found) -> float:
+    """Probability that something without a name is at work, in whichever slot it is likeliest."""
+    shares = []
+    for slot in found.slots:
+        each = slot.probabilities()[0]
+        blocks = [p for item, p in zip(slot.items, each, strict=True) if not item.known]
+        shares.append(float(np.sum(blocks)))
+    return max(shares)
+
+
+def _search(scene: Scene, options: DiagnosisOptions) -> Found:
+    noise = fit_noise(scene.data)
+    return Search(scene, generic_blocks(scene), noise, options.false_alarm, options.seed).run()
 
 
 def _check_enough(table: Measurements) -> None:
@@ -151,9 +163,10 @@ def _shrinkage(found: Found, answer: Answer, k: int, rng: np.random.Generator) -
     before = found.nothing if len(chosen.items) == 1 else fit_set(
         scene, chosen.without(k), chosen.noise
     )  # fmt: skip
-    truths: list[tuple[ModelSet, float]] = [(chosen, answer.probability[k])]
-    for item, p in answer.rivals[k][1:]:
-        if p > WORTH_A_DRAW:
+    p = answer.probability[k]
+    truths = [(same, p * share) for same, share in other_settings(scene, chosen, k)]
+    for item, share in answer.rivals[k][1:]:
+        if share > WORTH_A_DRAW:
             items = (*chosen.items[:k], replace(item, log_prior=0.0), *chosen.items[k + 1 :])
-            truths.append((fit_set(scene, items, chosen.noise), p))
-    return shrinkage(before, chosen, truths, rng)
+            truths.append((fit_set(scene, items, chosen.noise), share))
+    return shrinkage(before, chosen, truths, between_visits(scene, chosen, k), rng)

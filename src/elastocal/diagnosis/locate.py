@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.result import Location, StructureTest
 from elastocal.diagnosis.scan import Scan
 from elastocal.diagnosis.search import Found
@@ -33,10 +32,14 @@ def structure_tests(seen: Scan) -> tuple[StructureTest, ...]:
 
 
 def location(found: Found, tests: tuple[StructureTest, ...]) -> Location | None:
-    """Probabilities of stage and place, from all that could stand in the first slot."""
+    """Probabilities of stage and place, from all that could stand in the place of the unknown
+    effect, or of the first one found."""
     if not found.chosen.items:
         return None
-    slot = found.slots[0]
+    items = found.chosen.items
+    unknown = [k for k, item in enumerate(items) if not item.known]
+    own = unknown[0] if unknown else 0
+    slot = found.slots[own]
     each, _ = slot.probabilities()
     total = max(float(each.sum()), 1e-300)
     stages: dict[str, float] = {}
@@ -44,13 +47,10 @@ def location(found: Found, tests: tuple[StructureTest, ...]) -> Location | None:
     for item, p in zip(slot.items, each / total, strict=True):
         stages[item.what.stage] = stages.get(item.what.stage, 0.0) + float(p)
         places[item.what.where] = places.get(item.what.where, 0.0) + float(p)
-    own = found.chosen.items[0].what
-    unknown = [i.what for i in found.chosen.items if not isinstance(i.what, Hypothesis)]
-    if unknown:
-        own = unknown[0]
+    what = items[own].what
     shown = {t.driver: t.p_value for t in tests}
     return Location(
-        own.stage, own.where, places.get(own.where, 0.0), _sorted(stages), _sorted(places), shown
+        what.stage, what.where, places.get(what.where, 0.0), _sorted(stages), _sorted(places), shown
     )
 
 

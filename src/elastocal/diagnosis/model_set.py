@@ -96,7 +96,7 @@ def packed_columns(scene: Scene, item: Item) -> Array:
 
 def fit_set(scene: Scene, items: tuple[Item, ...], start: NoiseValues | None = None) -> ModelSet:
     """Fit the noise beside the items, twice where their best scale is not the typical one."""
-    columns = [scene.data.masked(packed_columns(scene, item)) for item in items]
+    columns = [packed_columns(scene, item) for item in items]
 
     def joined(scales: tuple[float, ...]) -> NoisyData:
         data = scene.data
@@ -166,6 +166,6 @@ def fit_columns(scene: Scene, chosen: ModelSet, scales: tuple[float, ...]) -> No
     """The scene's data with the set's columns at the given scales."""
     data = scene.data
     for item, s in zip(chosen.items, scales, strict=True):
-        C = scene.data.masked(packed_columns(scene, item))
+        C = packed_columns(scene, item)
         data = data.with_columns(C, np.full(C.shape[2], 1 / s**2))
     return data

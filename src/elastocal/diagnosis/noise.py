@@ -45,6 +45,11 @@ class NoiseValues:
     joint: Array
     shared: float
 
+    @classmethod
+    def usual(cls, joints: int) -> NoiseValues:
+        """What one expects before any reading: noise as stated, joints as good as usual."""
+        return cls(1.0, np.full(joints, REPEATABILITY), SHARED)
+
     def logs(self) -> Array:
         return np.log(np.concatenate([[self.factor, self.shared], self.joint]))
 
@@ -186,7 +191,7 @@ def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
 def fit_noise(data: NoisyData, start: NoiseValues | None = None, steps: int = 60) -> NoiseValues:
     """The most probable noise values, by a quasi-Newton search in their logarithms."""
     n = data.G.shape[2]
-    start = start or NoiseValues(1.0, np.full(n, REPEATABILITY), SHARED)
+    start = start or NoiseValues.usual(n)
 
     def cost(theta: Array) -> tuple[float, Array]:
         return likelihood(data, NoiseValues.of_logs(theta))

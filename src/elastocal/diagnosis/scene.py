@@ -83,8 +83,8 @@ class Scene:
         return self.places.example >= 0
 
     def pack(self, rows: Array) -> Array:
-        """Per table row (n_rows, size, k) → packed (C, m, k), zero where left out."""
-        return self.data.masked(self.blocks.pack(self.columns.observed(rows)))
+        """Per table row (n_rows, size, k) → packed (C, m, k)."""
+        return self.blocks.pack(self.columns.observed(rows))
 
     def entry(self, key: EntryKey) -> Array:
         return self.pack(self.columns.entry(key))

@@ -2,59 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, Projection, fit_noise, project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.result import FaultyReading
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-ROUNDS = 8
+ROUNDS = 20
 LEVEL = 0.01  # chance that any of all good readings is taken for faulty
 MOST = 0.1  # share of readings beyond which "faulty" is no accident of measuring
 RUN = 3  # so many neighbours in a row, of one marker, are no accident either
 ACCIDENT = 1e-3  # chance below which suspects stand together by more than accident
 
 
-def screen(
-    scene: Scene, beside: Array | None = None, precision: Array | None = None
-) -> tuple[Scene, NoiseValues]:
-    """The scene without its faulty readings, and the noise of the others.
+def faulty_readings(scene: Scene, data: NoisyData) -> Mask:
+    """The faulty ones (N,) among the readings of `data`, the scene's with what was found beside.
 
     A reading i left out has the error P_ii⁻¹u_i with covariance P_ii⁻¹ (u = P r), so
-    uᵢᵀP_ii⁻¹u_i follows χ² with as many degrees of freedom as it has components; the median of all
-    sets the scale, so that an effect still missing from the model does not make readings
-    faulty.  Runs of one marker's readings are kept: something happened to it; and where suspects
-    prefer one marker, load state or half of the campaign, all are kept, for the same reason.
-    `beside` (C, m, k) are columns of effects already found, `precision` (k,) their priors.
+    uᵢᵀP_ii⁻¹u_i follows χ² with as many degrees of freedom as it has components.  The noise is the
+    usual one and not the fitted one, which faulty readings swell; the median of all sets its
+    scale, so that an effect still missing from the model does not make readings faulty.  Of each
+    visit the worst goes first, for beside it the others look wrong too.  Runs of one marker's
+    readings are kept: something happened to it; and where suspects prefer one marker, load state
+    or half of the campaign, all are kept, for the same reason.
     """
-    whole = scene
-    if beside is not None and precision is not None:
-        scene = replace(scene, data=scene.data.with_columns(beside, precision))
-    before = noise = fit_noise(scene.data)
-    faulty = np.zeros(scene.blocks.n, dtype=bool)
+    blocks = scene.blocks
+    usual = NoiseValues.usual(data.G.shape[2])
+    limit = stats.chi2.isf(LEVEL / blocks.n, blocks.size)
+    middle = stats.chi2.median(blocks.size)
+    faulty = np.zeros(blocks.n, dtype=bool)
     for _ in range(ROUNDS):
-        squared = reading_errors(scene, project(scene.data, noise))
-        scale = np.nanmedian(squared[~faulty]) / stats.chi2.median(scene.blocks.size)
-        limit = stats.chi2.isf(LEVEL / len(squared), scene.blocks.size)
-        now = squared > limit * max(scale, 1e-12)
-        now &= ~in_a_run(scene, now)
-        # The worst first: beside a reading that is off by millimetres others look wrong too.
-        now &= squared > 0.1 * np.nanmax(squared[now], initial=0.0)
-        if not (now & ~faulty).any() or (now | faulty).mean() > MOST:
+        squared = reading_errors(scene, project(data.without(faulty), usual))
+        suspect = squared > limit * np.nanmedian(squared) / middle
+        suspect &= ~in_a_run(scene, suspect)
+        worst = np.zeros(int(blocks.visit.max()) + 1)
+        np.maximum.at(worst, blocks.visit, np.where(suspect, squared, 0.0))
+        now = suspect & (squared == worst[blocks.visit])
+        if not now.any():
             break
         faulty |= now
-        scene = scene.without(faulty)
-        noise = fit_noise(scene.data, noise)
-    if not accidental(scene, faulty):
-        return whole, before
-    return whole.without(faulty), noise
+    if faulty.mean() > MOST or not accidental(scene, faulty):
+        return np.zeros(blocks.n, dtype=bool)
+    return faulty
 
 
 def accidental(scene: Scene, faulty: Mask) -> bool:

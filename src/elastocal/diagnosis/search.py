@@ -88,6 +88,7 @@ class Search:
     level: float
     seed: int
     signs: Array = field(init=False)
+    _visited: set[frozenset[int]] = field(init=False, default_factory=set)
     _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -120,6 +121,8 @@ class Search:
             p = (1 + int((after.flipped >= observed.odds).sum())) / (1 + len(after.flipped))
             if p > self.level:
                 break
+            if self._been_at(best):
+                break
             current, seen = best, after
             slots.append(slot)
             p_values.append(p)
@@ -135,6 +138,13 @@ class Search:
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
         return Found(self.scene, current, tuple(slots), tuple(p_values), nothing, first, alone)
+
+    def _been_at(self, chosen: ModelSet) -> bool:
+        """Whether the search has come round to a set that it had; noted either way."""
+        key = frozenset(id(item.what) for item in chosen.items)
+        known = key in self._visited
+        self._visited.add(key)
+        return known
 
     def _scan(
         self, current: ModelSet, noise: NoiseValues | None = None, flips: bool = False

@@ -16,6 +16,7 @@ from elastocal.diagnosis.noise import NoiseValues, project
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.sums import direct
+from elastocal.diagnosis.verdict import UNKNOWN_EFFECT
 from elastocal.errors import InputError, require
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
@@ -85,6 +86,7 @@ class Suspects:
                 self._probability[key] = c.probability
         self._found = [(f.effect, f.where) for f in diagnosis.effects]
         named = [(e.effect, e.where) for group in diagnosis.indistinguishable for e in group]
+        named = [key for key in named if key[0] != UNKNOWN_EFFECT]
         for effect, where in [*self._found, *named]:
             require(
                 (effect, where) in self._items,
@@ -95,7 +97,9 @@ class Suspects:
     def named_sets(self) -> Iterator[RivalSet]:
         """The sets that the diagnosis calls indistinguishable."""
         for group in self.diagnosis.indistinguishable:
-            keys = [(e.effect, e.where) for e in group]
+            keys = [(e.effect, e.where) for e in group if e.effect != UNKNOWN_EFFECT]
+            if len(keys) < 2:
+                continue
             yield RivalSet.of(
                 [self._items[k] for k in keys],
                 [self._probability[k] for k in keys],
@@ -106,7 +110,7 @@ class Suspects:
     def hypotheses(self) -> list[Hypothesis]:
         """Everything that may take part."""
         keys = [(e.effect, e.where) for group in self.diagnosis.indistinguishable for e in group]
-        keys += self._found
+        keys = [key for key in keys if key[0] != UNKNOWN_EFFECT] + self._found
         if self.unknown:
             keys += self._likeliest()
             # Torques, which may drive what is unknown, come from the compliances' columns.

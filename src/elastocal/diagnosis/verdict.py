@@ -58,6 +58,8 @@ def judge(found: Found) -> Answer:
         rivals.append(others)
     if found.chosen.unknown:
         verdict: Verdict = "unknown_effect"
+        # What is named beside something without a name may be part of its imitation.
+        probability = [min(p, ALIKE_PROBABILITY) for p in probability]
     elif all(len(r) == 1 for r in rivals):
         verdict = "explained"
     else:

@@ -1,0 +1,78 @@
+"""What an effect's searched constants may be instead, and what that does to fresh poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.alike import signal_of
+from elastocal.diagnosis.columns import is_driven
+from elastocal.diagnosis.gram import Grams
+from elastocal.diagnosis.heldout import squared_lengths
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.model_set import ModelSet, fit_columns, fit_set
+from elastocal.diagnosis.noise import project
+from elastocal.diagnosis.scene import Scene
+
+Array = NDArray[np.float64]
+
+MOST = 6  # settings that are kept
+WORTH = 0.02  # probability from which one is
+
+
+def other_settings(scene: Scene, chosen: ModelSet, k: int) -> list[tuple[ModelSet, float]]:
+    """The set with item k at each of its plausible settings, and their probabilities.
+
+    Only the set itself where the item has none.
+    """
+    item = chosen.items[k]
+    what = item.what
+    if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
+        return [(chosen, 1.0)]
+    others = replace(chosen, items=chosen.without(k))
+    data = fit_columns(scene, others, chosen.scales[:k] + chosen.scales[k + 1 :])
+    grid = scene.grids[what.name, what.where]
+    grams = Grams(scene, data, project(data, chosen.noise))
+    own = float(grams.of_hypothesis(what, item.settings[None]).evidence(item.scales)[0])
+    each = grams.of_hypothesis(what).evidence(item.scales)
+    # The chosen one stands for the point of the grid that it was refined from.
+    nearest = int(np.abs(grid.values - item.settings).sum(axis=1).argmin())
+    each[nearest] = own
+    share = np.exp(each - each.max())
+    share /= share.sum()
+    order = [int(i) for i in np.argsort(-share)[:MOST] if share[i] > WORTH or i == nearest]
+    out = []
+    for i in order:
+        if i == nearest:
+            out.append((chosen, float(share[i])))
+            continue
+        moved = replace(item, settings=grid.values[i])
+        items = (*chosen.items[:k], moved, *chosen.items[k + 1 :])
+        out.append((fit_set(scene, items, chosen.noise), float(share[i])))
+    return out
+
+
+def between_visits(scene: Scene, chosen: ModelSet, k: int) -> float:
+    """Largest mean squared error (m², summed over a configuration) of a misplaced change.
+
+    A change between two visits is put into the middle of the pause; fresh readings that fall
+    between that and the true moment, a fraction of up to half the pause over the duration, are
+    off by the whole change.  Zero for effects that do not change once.
+    """
+    what = chosen.items[k].what
+    time = scene.base.seen.table.time
+    changes = isinstance(what, Hypothesis) and any(s.kind == "change_time" for s in what.settings)
+    if not changes or time is None:
+        return 0.0
+    moments = np.unique(time)
+    later = int(np.searchsorted(moments, chosen.items[k].settings[0]))
+    if not 0 < later < len(moments):
+        return 0.0
+    pause = float(moments[later] - moments[later - 1]) / float(np.ptp(moments))
+    signal, _ = signal_of(scene, chosen, k)
+    squares, count = squared_lengths(scene.data, signal)
+    shown = squares > 0
+    per_reading = float(squares[shown].sum() / max(count[shown].sum(), 1))
+    return pause / 2 * per_reading * float(count.mean())
