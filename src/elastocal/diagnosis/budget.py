@@ -35,10 +35,16 @@ def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, t
         scales = tuple(chosen.scales[k] for k in part)
         data = fit_columns(found.scene, replace(chosen, items=items), scales)
         steps.append(_step(items[-1].label.replace(" at ", ":"), data, chosen, rng))
-    floor = noise_rms(chosen.data, chosen.noise)
+    # Where the noise model does not fit, the readings still say what scatter they leave.
+    left = rms_with_interval(chosen.data, left_out_residual(chosen.at), rng)[0]
+    floor = min(noise_rms(chosen.data, chosen.noise), left)
     calibrated = steps[len(steps) - len(known) - 1].heldout_rms
     nominal = steps[0].heldout_rms
     gap = Gap(nominal, calibrated, steps[-1].heldout_rms, floor)
+    unknown = [item.what.where for item in chosen.items if not item.known]
+    if unknown:
+        # What a smooth curve without a name takes away: no explanation, but how much is at stake.
+        steps.append(_step("unknown:" + "+".join(unknown), chosen.data, chosen, rng))
     return gap, (*steps, Step("noise_floor", floor, (floor, floor)))
 
 

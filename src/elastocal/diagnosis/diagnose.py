@@ -23,7 +23,7 @@ from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.diagnosis.refit import refit
 from elastocal.diagnosis.result import Diagnosis, Finding
 from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.screen import faulty_readings
+from elastocal.diagnosis.screen import screen
 from elastocal.diagnosis.search import Found, Search
 from elastocal.diagnosis.uncertain_settings import between_visits, other_settings
 from elastocal.diagnosis.verdict import Answer, judge
@@ -62,17 +62,18 @@ def diagnose(
     progress("columns of what could be missing")
     scene = scene_of(base, hypotheses)
     progress("noise floor")
-    faulty = faulty_readings(scene, scene.data)
+    screened = screen(scene, scene.data)
+    faulty = screened.faulty
     progress("searching for what is missing")
     found = _search(scene.without(faulty), options)
     if found.chosen.items:
         # Beside a large effect nothing looks faulty, or the wrong readings do.
         beside = found.chosen.data.without(np.zeros_like(faulty))
-        again = faulty_readings(found.scene, beside)
-        if (again != faulty).any():
+        screened = screen(found.scene, beside)
+        if (screened.faulty != faulty).any():
             progress("searching again without faulty readings")
-            found = _search(scene.without(again), options)
-            faulty = again
+            faulty = screened.faulty
+            found = _search(scene.without(faulty), options)
     scene = scene.without(faulty)
     answer = judge(found)
     progress("confirming")
@@ -100,7 +101,7 @@ def diagnose(
         p_value=found.p_values[0] if found.p_values else p_first,
         curves=curves_of(found.scene, chosen),
         untested=(*untested, *too_small(scene, found)),
-        warnings=warnings(scene, found),
+        warnings=warnings(scene, found, screened),
         n_readings=scene.blocks.n,
         n_configurations=len(scene.blocks.member),
     )

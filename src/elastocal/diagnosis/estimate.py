@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, ModelSet
+from elastocal.diagnosis.model_set import Item, ModelSet, columns_of
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]
@@ -38,7 +38,4 @@ def item_width(scene: Scene, item: Item) -> int:
     """Number of columns of an item."""
     if isinstance(item.what, Hypothesis):
         return len(item.what.parameters)
-    if item.what.columns is not None:
-        return item.what.columns.shape[2]
-    assert item.what.drive is not None
-    return item.what.drive.shape[3]
+    return columns_of(item.what)

@@ -23,7 +23,11 @@ RECORD = {
         "record approach_1 … (+1 or -1), and visit some poses from both sides",
     ),
     "temperature": ("the table has no temperature column", "record temperature_C"),
-    "load": ("no reading is loaded", "measure some poses with and without a load"),
+    "load": (
+        "no reading is loaded, and the model has no weights",
+        "measure some poses with and without a load, or give the links' masses and set "
+        "[model] link_gravity = true",
+    ),
 }
 ALWAYS = ("payload", "link_gravity")  # loads without parameters
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.result import Candidate, Untested
 from elastocal.diagnosis.scene import Scene
+from elastocal.diagnosis.screen import Screened
 from elastocal.diagnosis.search import Found
 from elastocal.diagnosis.verdict import Answer
 
 DETECTABLE = 1.0  # standard deviations: below, a typical size does not move the data
 STATED_LOW, STATED_HIGH = 0.67, 1.5
 FAULTY_SHARE = 0.02
+SUSPECT_SHARE = 0.05
 
 
 def candidates(scene: Scene, found: Found, answer: Answer) -> tuple[Candidate, ...]:
@@ -57,7 +61,7 @@ def too_small(scene: Scene, found: Found) -> tuple[Untested, ...]:
     return tuple(rows)
 
 
-def warnings(scene: Scene, found: Found) -> tuple[str, ...]:
+def warnings(scene: Scene, found: Found, screened: Screened) -> tuple[str, ...]:
     """What a reader should know before trusting the verdict."""
     out = []
     noise, data = found.chosen.noise, found.chosen.data
@@ -71,6 +75,14 @@ def warnings(scene: Scene, found: Found) -> tuple[str, ...]:
         out.append(
             f"{faulty:.0%} of the readings disagree with all others and were left out; look for "
             "the cause before trusting the rest"
+        )
+    kept = np.flatnonzero(screened.suspects)
+    if len(kept) > SUSPECT_SHARE * len(screened.suspects):
+        lines = scene.base.seen.table.row[scene.base.seen.lead[kept]]
+        out.append(
+            f"{len(kept)} of {len(screened.suspects)} readings (lines {lines.min()} to "
+            f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
+            "other to be accidents; they were kept: look at them with `elastocal identify` first"
         )
     if scene.base.seen.table.time is None:
         out.append("without times neither drifts nor jumps can be seen: record time_s")

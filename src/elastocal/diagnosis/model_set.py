@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from scipy.special import log_ndtr, logsumexp
 
 from elastocal.diagnosis.columns import is_driven
 from elastocal.diagnosis.evidence import SCALES
@@ -113,8 +113,50 @@ def fit_set(scene: Scene, items: tuple[Item, ...], start: NoiseValues | None = N
             break
         scales = best
     assert noise is not None
+    mixed += _within_bounds(scene, items, joined(scales), noise)
     prior = sum(item.log_prior for item in items) - 0.5 * log_prior(scene.data.stated, noise)[0]
     return ModelSet(items, noise, joined(scales), mixed + prior, scales)
+
+
+def _within_bounds(
+    scene: Scene, items: tuple[Item, ...], data: NoisyData, noise: NoiseValues
+) -> float:
+    """Σ log 2Φ(mean/deviation) over parameters that cannot be below their nominal zero.
+
+    A compliance's size prior is one half of the Gaussian; the evidence gains or loses by the
+    posterior's share of that half, each parameter taken by itself.
+    """
+    bounded = [
+        isinstance(item.what, Hypothesis)
+        and any(p.lower == p.nominal for p in item.what.parameters)
+        for item in items
+    ]
+    if not any(bounded):
+        return 0.0
+    at = project(data, noise)
+    root = at.beta_deviation
+    mean = root.T @ np.einsum("cmp,cm->p", at.H, data.masked(data.r))
+    deviation = np.linalg.norm(root, axis=0)
+    total, first = 0.0, scene.data.X.shape[2]
+    for item in items:
+        what = item.what
+        if not isinstance(what, Hypothesis):
+            first += columns_of(what)
+            continue
+        for k, p in enumerate(what.parameters):
+            if p.lower == p.nominal:
+                z = mean[first + k] / deviation[first + k]
+                total += float(np.log(2) + log_ndtr(z))
+        first += len(what.parameters)
+    return total
+
+
+def columns_of(block: Generic) -> int:
+    """Number of columns of a block."""
+    if block.columns is not None:
+        return block.columns.shape[2]
+    assert block.drive is not None
+    return block.drive.shape[3]
 
 
 def _mixed_scales(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -20,8 +22,17 @@ RUN = 3  # so many neighbours in a row, of one marker, are no accident either
 ACCIDENT = 1e-3  # chance below which suspects stand together by more than accident
 
 
-def faulty_readings(scene: Scene, data: NoisyData) -> Mask:
-    """The faulty ones (N,) among the readings of `data`, the scene's with what was found beside.
+@dataclass(frozen=True)
+class Screened:
+    """`faulty` (N,) readings, and `suspects` (N,) that were kept: too many, or too near each other
+    to be accidents of measuring."""
+
+    faulty: Mask
+    suspects: Mask
+
+
+def screen(scene: Scene, data: NoisyData) -> Screened:
+    """The faulty ones among the readings of `data`, the scene's with what was found beside.
 
     A reading i left out has the error P_ii⁻¹u_i with covariance P_ii⁻¹ (u = P r), so
     uᵢᵀP_ii⁻¹u_i follows χ² with as many degrees of freedom as it has components.  The noise is the
@@ -36,9 +47,11 @@ def faulty_readings(scene: Scene, data: NoisyData) -> Mask:
     limit = stats.chi2.isf(LEVEL / blocks.n, blocks.size)
     middle = stats.chi2.median(blocks.size)
     faulty = np.zeros(blocks.n, dtype=bool)
+    beyond = faulty.copy()
     for _ in range(ROUNDS):
         squared = reading_errors(scene, project(data.without(faulty), usual))
         suspect = squared > limit * np.nanmedian(squared) / middle
+        beyond |= suspect
         suspect &= ~in_a_run(scene, suspect)
         worst = np.zeros(int(blocks.visit.max()) + 1)
         np.maximum.at(worst, blocks.visit, np.where(suspect, squared, 0.0))
@@ -47,8 +60,8 @@ def faulty_readings(scene: Scene, data: NoisyData) -> Mask:
             break
         faulty |= now
     if faulty.mean() > MOST or not accidental(scene, faulty):
-        return np.zeros(blocks.n, dtype=bool)
-    return faulty
+        faulty[:] = False
+    return Screened(faulty, beyond & ~faulty)
 
 
 def accidental(scene: Scene, faulty: Mask) -> bool:

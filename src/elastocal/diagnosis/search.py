@@ -25,6 +25,8 @@ FAR_BEHIND = 60.0  # and how far behind the best: noise of its own makes up for 
 # Probability that nothing (more) is there above which nothing is claimed.
 DOUBT, DOUBT_MORE = 0.5, 0.05
 CLOSE_BLOCKS = 3
+CLEARLY = 10.0  # nats by which several named effects must beat fewer without a name
+PART = 0.3
 MOST_EFFECTS, MOST_BESIDE_UNKNOWN = 4, 2
 
 
@@ -78,6 +80,12 @@ def base_score(scene: Scene, current: ModelSet, seen: Scan) -> float:
     return seen.at.marginal + items - 0.5 * log_prior(scene.data.stated, seen.noise)[0]
 
 
+def _rivalled(slot: Slot) -> bool:
+    """Whether some named effect alone does a good part of what a block without a name does."""
+    named = [s for item, s in zip(slot.items, slot.scores, strict=True) if item.known]
+    return max(named, default=-np.inf) > PART * slot.scores.max()
+
+
 @dataclass
 class Search:
     """The search's means: scene, blocks, flips of signs, and the level of a claim."""
@@ -88,6 +96,7 @@ class Search:
     level: float
     seed: int
     signs: Array = field(init=False)
+    _start: Scene = field(init=False)
     _visited: set[frozenset[int]] = field(init=False, default_factory=set)
     _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
 
@@ -97,7 +106,7 @@ class Search:
         self.signs = rng.choice([-1.0, 1.0], (FLIPS, C))
 
     def run(self) -> Found:
-        scene = self.scene
+        self._start = scene = self.scene
         nothing = current = fit_set(scene, (), self.noise)
         seen = first = alone = self._scan(current, flips=True)
         slots: list[Slot] = []
@@ -133,11 +142,27 @@ class Search:
                 seen = self._scan(current)
             if len(current.items) > 1:
                 current, slots, seen = self._reexamined(current, slots, seen)
+        if current.unknown and _rivalled(slots[0]):
+            named = self._named(current)
+            if named is not None:
+                self.scene, current, p_values = named.scene, named.chosen, list(named.p_values)
+                self._fitted.clear()
+                current, slots, seen = self._reexamined(current, list(named.slots), seen)
         if not slots:
             slots = [slot]
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
         return Found(self.scene, current, tuple(slots), tuple(p_values), nothing, first, alone)
+
+    def _named(self, current: ModelSet) -> Found | None:
+        """What effects of the catalogue alone would make of it, where that is clearly better.
+
+        A block without a name fits a little of everything, and may come first where several
+        effects act at once.
+        """
+        alone = Search(self._start, [], self.noise, self.level, self.seed).run()
+        clearly = alone.chosen.score > current.score + CLEARLY
+        return alone if alone.chosen.items and clearly else None
 
     def _been_at(self, chosen: ModelSet) -> bool:
         """Whether the search has come round to a set that it had; noted either way."""
