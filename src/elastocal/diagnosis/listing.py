@@ -24,8 +24,9 @@ def candidates(scene: Scene, found: Found, answer: Answer) -> tuple[Candidate, .
         (h.name, h.where): s.distance
         for h, s in zip(scene.hypotheses, found.alone.scored, strict=True)
     }
-    named = {id(item.what): p for rivals in answer.rivals for item, p in rivals if item.known}
-    for slot in found.slots:
+    for k, slot in enumerate(found.slots):
+        rivals = answer.rivals[k] if k < len(answer.rivals) else ()
+        named = {id(item.what): p for item, p in rivals if item.known}
         each, _ = slot.probabilities()
         for item, p, score in zip(slot.items, each, slot.scores, strict=True):
             what = item.what

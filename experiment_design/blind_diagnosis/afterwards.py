@@ -1,0 +1,106 @@
+"""What the truth says of a diagnosis once it is given: d of each effect, and the true shrinkage.
+
+Uses elastocal's model and columns, at the fit to the campaign's own noisy readings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from draw import World
+from numpy.typing import NDArray
+
+from elastocal.cell_reader import read_cell
+from elastocal.diagnosis.baseline import Baseline, fit_baseline
+from elastocal.diagnosis.gram import Grams, scales_of
+from elastocal.diagnosis.hypotheses import Hypothesis, possible
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, project
+from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.manipulator.model import Model
+from elastocal.measurement_reader import read_measurements
+from elastocal.measurements import Measurements
+
+Array = NDArray[np.float64]
+
+
+def read(model: Model, path: Path) -> Measurements:
+    cell = model.cell
+    return read_measurements(
+        path, joint_kinds=model.chain.kinds, marker_names=tuple(cell.tool.markers)
+    )
+
+
+def plain_fit(visible: Path) -> Baseline:
+    """The cell's own effects fitted to the campaign."""
+    model = Model.from_cell(read_cell(visible / "cell.toml"))
+    return fit_baseline(model, read(model, visible / "data.csv"))
+
+
+def distances(base: Baseline, world: World) -> list[dict[str, Any]]:
+    """Of each true effect: d from nothing and from its nearest rival, in standard deviations.
+
+    d² = min over β, γ of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s², where v is what the effect does to the
+    noise-free readings beside the other effects, V the true noise with repeatability, X the
+    fitted columns and those of the other effects, C the columns of the rival, at the best of its
+    settings, and s the width of its size prior.  `distance` is the smaller of the two.
+    """
+    hypotheses, _ = possible(base.model, base.seen.table)
+    scene = scene_of(base, hypotheses)
+    known = {(h.name, h.where): h for h in hypotheses}
+    noise = NoiseValues(1 / world.noise.stated, world.noise.repeatability, 1e-6)
+    whole = world.noise_free(world.visits)
+    out = []
+    for effect in world.effects:
+        others = tuple(e for e in world.effects if e is not effect)
+        v = whole - replace(world, effects=others).noise_free(world.visits)
+        data = replace(scene.data, r=scene.blocks.pack(v.reshape(-1, 3, 1))[:, :, 0])
+        for e in others:
+            data = _beside(scene, data, known[e.name, e.where], e.settings)
+        at = project(data, noise)
+        grams = Grams(scene, data, at)
+        alone = float((data.r * at.u).sum())
+        taken = {(e.name, e.where) for e in world.effects}
+        left = {key: alone - _explained(grams, h) for key, h in known.items() if key not in taken}
+        rival = min(left, key=left.__getitem__)
+        nothing, nearest = (float(np.sqrt(max(d, 0.0))) for d in (alone, left[rival]))
+        out.append({
+            "effect": effect.name, "where": effect.where, "nothing": nothing,
+            "rival": ":".join(rival), "distance": min(nothing, nearest),
+        })  # fmt: skip
+    return out
+
+
+def _explained(grams: Grams, h: Hypothesis) -> float:
+    found = grams.of_hypothesis(h)
+    s2 = float(scales_of(h).max()) ** 2
+    return float((s2 * found.beta**2 / (1 + s2 * found.lam)).sum(axis=1).max())
+
+
+def _beside(scene: Scene, data: NoisyData, h: Hypothesis, settings: dict[str, float]) -> NoisyData:
+    """The data with the columns of an effect that is there too."""
+    C = scene.packed(h, np.array([settings[s.key] for s in h.settings]))
+    return data.with_columns(C, np.full(C.shape[2], scales_of(h).max() ** -2.0))
+
+
+def true_reduction(base: Baseline, answer: dict[str, Any], extended: Path, fresh: Path) -> float:
+    """1 − e₁/e₀: how far the rms error of fresh noise-free readings falls with what was found.
+
+    e₀ of the cell's own model, e₁ of the `extended` cell's from the values that the diagnosis
+    published, both fitted to the campaign under the stated noise.
+    """
+    model = Model(base.model.chain, read_cell(extended))
+    start = dict(zip(base.model.names, base.x, strict=True))
+    start |= {p["name"]: p["value"] for e in answer["effects"] for p in e["parameters"]}
+    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
+    after = fit_baseline(model, base.seen.table, x0=x0)
+    table = read(base.model, fresh)
+    e0, e1 = (_error(fit.model, fit.x, table) for fit in (base, after))
+    return 1 - e1 / e0
+
+
+def _error(model: Model, x: Array, table: Measurements) -> float:
+    assert table.position is not None
+    return float(np.sqrt(np.mean((model.predict(table, x) - table.position.ravel()) ** 2)))

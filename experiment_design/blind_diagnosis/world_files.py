@@ -1,0 +1,132 @@
+"""A world on disk: what the tool may see in one folder, the truth in another.
+
+visible/  arm.urdf  cell.toml  data.csv
+sealed/   truth.json  fresh.csv (the same columns; 100 other poses, no noise, no scatter)
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+from draw import World
+from numpy.typing import NDArray
+from world import Effect, Visits
+
+Array = NDArray[np.float64]
+FITTED = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")
+
+
+def write_world(world: World, visible: Path, sealed: Path) -> None:
+    """Both folders are made; they must not lie within each other."""
+    visible, sealed = Path(visible).resolve(), Path(sealed).resolve()
+    if visible.is_relative_to(sealed) or sealed.is_relative_to(visible):
+        raise ValueError(f"{sealed} would hold the truth within the tool's reach: {visible}")
+    for folder in (visible, sealed):
+        folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(world.spec.urdf, visible / "arm.urdf")
+    (visible / "cell.toml").write_text(cell_text(world), encoding="utf-8")
+    write_table(world, world.visits, world.readings(), visible / "data.csv")
+    fresh = world.fresh()
+    write_table(world, fresh, world.noise_free(fresh), sealed / "fresh.csv")
+    truth = json.dumps(truth_of(world), indent=2) + "\n"
+    (sealed / "truth.json").write_text(truth, encoding="utf-8")
+
+
+def cell_text(world: World) -> str:
+    """The cell as its owner would write it: nominal data, nothing of the truth."""
+    spec, specimen = world.spec, world.specimen
+    markers = "\n".join(
+        f"{name} = {list(p)}" for name, p in zip(spec.marker_names, spec.markers, strict=True)
+    )
+    return f"""name = "simulated campaign"
+
+[robot]
+urdf = "arm.urdf"
+base = "base_link"
+flange = "flange"
+
+[tool]
+load_point_m = {list(spec.hook)}
+
+[tool.markers_m]
+{markers}
+
+[tracker]
+position_m = [0.0, 0.0, 0.0]
+
+[model]
+observe = "position"
+link_gravity = true
+effects = {json.dumps(FITTED)}
+gear_ripple_orders = {world.orders.tolist()}
+
+[model.nominal]
+base_position_m = {specimen.base_position.tolist()}
+base_rpy_deg = [0.0, 0.0, {specimen.base_yaw_deg}]
+joint_compliance = {specimen.compliance.tolist()}
+"""
+
+
+def write_table(world: World, visits: Visits, readings: Array, path: Path) -> None:
+    """One row per visit and marker; the stated sigmas are the noise's own times its factor."""
+    J = visits.q.shape[1]
+    header = [
+        "configuration", "repeat", "marker", *[f"q{j + 1}_rad" for j in range(J)],
+        "force_x_N", "force_y_N", "force_z_N", "x_m", "y_m", "z_m",
+        "sigma_range_um", "sigma_azimuth_um", "sigma_elevation_um", "time_min",
+        *[f"approach_{j + 1}" for j in range(J)],
+    ]  # fmt: skip
+    sigma = 1e6 * world.noise.stated * world.noise.sigma(readings)
+    lines = [",".join(header)]
+    for i, pose in enumerate(visits.pose):
+        joints = [f"{v:.9f}" for v in visits.q[i]]
+        force = [f"{v + 0.0:.3f}" for v in visits.force[i]]
+        late = [f"{visits.time[i] / 60:.3f}", *[f"{int(a):d}" for a in visits.approach[i]]]
+        for k, name in enumerate(world.spec.marker_names):
+            seen = [f"{v:.9f}" for v in readings[i, k]] + [f"{v:.2f}" for v in sigma[i, k]]
+            lines.append(",".join([str(pose), "0", name, *joints, *force, *seen, *late]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def truth_of(world: World) -> dict[str, object]:
+    """Everything that is withheld, as JSON."""
+    true, noise = world.specimen.true, world.noise
+    return {
+        "world": world.name,
+        "seed": list(world.seed),
+        "arm": world.spec.name,
+        "effects": [_effect(e) for e in world.effects],
+        "plan": {
+            "poses": int(world.visits.pose.max()) + 1,
+            "order": world.plan,
+            "approach_by_motion": world.approach_by_motion,
+        },
+        "noise": {
+            "variant": noise.variant,
+            "level_um": 1e6 * noise.level,
+            "stated_over_true": noise.stated,
+            "repeatability_urad": (1e6 * noise.repeatability).tolist(),
+            "outlier_share": noise.outlier_share,
+        },
+        "arm_values": {
+            "joint_compliance": true.compliance.tolist(),
+            "joint_offset_rad": true.offset.tolist(),
+            "base_position_m": true.base_position.tolist(),
+            "base_rotation": true.base_rotation.tolist(),
+            "markers_m": true.markers.tolist(),
+        },
+    }
+
+
+def _effect(effect: Effect) -> dict[str, object]:
+    location = {"stage": effect.stage, "where": effect.where, "driver": effect.driver}
+    return {
+        "effect": effect.name,
+        "where": effect.where,
+        "in_catalogue": not effect.stage,
+        "values": effect.values,
+        "settings": effect.settings,
+    } | ({"location": location} if effect.stage else {})

@@ -1,0 +1,310 @@
+"""The worlds of the blind check: an arm of its own, at rest, that obeys the stated physics."""
+
+# ruff: noqa: E402  (the study is a script: its folder has to be found first)
+
+import ast
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("mujoco")
+FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diagnosis"
+sys.path.insert(0, str(FOLDER))
+
+from arm_data import ARMS
+from draw import (
+    ALIKE,
+    CATALOGUE,
+    OUTSIDE_EFFECTS,
+    World,
+    catalogue_worlds,
+    draw_world,
+    pair_worlds,
+)
+from instrument import OUTLIER_SIZE, REPEATABILITY, VARIANTS, draw_noise
+from mechanics import ElasticArm, Placement
+from mjcf import GRAVITY, Spring
+from skeleton import Skeleton
+from world_files import write_table, write_world
+
+from elastocal.cell import EffectChoice
+from elastocal.cell_reader import read_cell
+from elastocal.manipulator.model import Model
+from elastocal.measurement_reader import read_measurements
+from elastocal.measurements import Measurements
+
+WORLD_MODULES = {
+    "arm_data", "chance", "draw", "inside", "instrument", "mechanics", "mjcf", "outside", "places",
+    "sizes", "skeleton", "visits", "world", "world_files",
+}  # fmt: skip
+CASES = [
+    pytest.param(name, arm, marks=() if k % len(ARMS) == i else pytest.mark.long)
+    for k, name in enumerate(CATALOGUE)
+    for i, arm in enumerate(ARMS)
+    if name != "gravity_compensator" or arm == "heavy"
+]
+
+
+def signal(world: World) -> np.ndarray:
+    """What the effects move each noise-free reading by, (n, M, 3) m."""
+    return world.noise_free(world.visits) - replace(world, effects=()).noise_free(world.visits)
+
+
+def rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def true_values(world: World) -> dict[str, float]:
+    """The true arm and its effects, as elastocal's parameters name them."""
+    true, nominal = world.specimen.true, world.spec.skeleton
+    turn = Rotation.from_matrix(true.base_rotation).as_rotvec()
+    rows = [("base", ("x", "y", "z", "rx", "ry", "rz"), [*true.base_position, *turn])]
+    for j in range(nominal.n_joints):
+        R = nominal.rotation[j + 1].T
+        shift = R @ (true.skeleton.position[j + 1] - nominal.position[j + 1])
+        turn = Rotation.from_matrix(R @ true.skeleton.rotation[j + 1]).as_rotvec()
+        rows.append((f"link{j + 1}", ("dx", "dy", "dz", "rx", "ry", "rz"), [*shift, *turn]))
+        elastic = [true.offset[j], true.compliance[j]]
+        rows.append((f"joint{j + 1}", ("offset", "compliance"), elastic))
+    for name, point in zip(true.marker_names, true.markers, strict=True):
+        rows.append((f"marker:{name}", ("x", "y", "z"), list(point)))
+    rows += [(e.where, tuple(e.values), list(e.values.values())) for e in world.effects]
+    return {f"{p}.{k}": v for p, keys, vs in rows for k, v in zip(keys, vs, strict=True)}
+
+
+def model_with(
+    effects: list[tuple[str, str, dict[str, float]]], world: World, folder: Path
+) -> tuple[Model, Measurements]:
+    """elastocal's model of the world's cell with effects (name, where, settings) added, and the
+    world's noise-free readings."""
+    seen = folder / "seen"
+    write_world(world, seen, folder / "sealed")
+    write_table(world, world.visits, world.noise_free(world.visits), seen / "data.csv")
+    kinds = ("revolute",) * world.spec.skeleton.n_joints
+    table = read_measurements(seen / "data.csv", joint_kinds=kinds)
+    cell = read_cell(seen / "cell.toml")
+    added = tuple(EffectChoice(name, where) for name, where, _ in effects)
+    nominal = replace(cell.model.nominal, settings={w: s for _, w, s in effects if s})
+    spec = replace(cell.model, effects=cell.model.effects + added, nominal=nominal)
+    return Model.from_cell(replace(cell, model=spec)), table
+
+
+def model_error(world: World, folder: Path) -> np.ndarray:
+    """Noise-free readings minus elastocal's prediction at the true values, (n, M, 3) m."""
+    model, table = model_with([(e.name, e.where, e.settings) for e in world.effects], world, folder)
+    values = true_values(world)
+    assert set(values) == set(model.names)
+    predicted = model.predict(table, np.array([values[name] for name in model.names]))
+    return table.position.reshape(-1, 3, 3) - predicted.reshape(-1, 3, 3)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_the_arm_rests_where_its_energy_is_stationary(arm):
+    """|k ∂V/∂θ| ≤ 1e-9 rad, with V from plain kinematics: weights, springs and the hook's load."""
+    world = draw_world((3,), "clean", arm=arm, poses=8)
+    true, visits = world.specimen.true, world.visits
+    rest, _ = world.physics.rest(visits)
+    deflection = true.compliance * rest.load
+
+    def energy(theta: np.ndarray) -> np.ndarray:
+        R, p = true.skeleton.forward(visits.q + true.offset + theta)
+        com = p[:, :-1] + np.einsum("njab,jb->nja", R[:, :-1], true.skeleton.com)
+        hook = p[:, -1] + R[:, -1] @ true.hook
+        height = (com @ true.base_rotation.T)[..., 2]
+        lifted = np.einsum("ni,ni->n", visits.force, hook @ true.base_rotation.T)
+        sprung = (theta**2 / (2 * true.compliance)).sum(axis=1)
+        return GRAVITY * height @ true.skeleton.mass + sprung - lifted
+
+    step = 1e-4
+    for j in range(len(true.compliance)):
+        d = step * np.eye(len(true.compliance))[j]
+        slope = (energy(deflection + d) - energy(deflection - d)) / (2 * step)
+        assert np.abs(true.compliance[j] * slope).max() < 1e-9
+
+
+@pytest.mark.parametrize("name", [*CATALOGUE, *OUTSIDE_EFFECTS])
+def test_every_world_is_at_rest(name):
+    world = draw_world((4, 1), name, [name], poses=20)
+    assert world.physics.rest(world.visits)[0].residual <= 1e-9
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_plain_world_is_what_elastocal_predicts(arm, tmp_path):
+    assert np.abs(model_error(draw_world((5,), "plain", arm=arm), tmp_path)).max() < 1e-7
+
+
+@pytest.mark.parametrize(("name", "arm"), CASES)
+def test_a_catalogue_effect_is_the_one_that_elastocal_knows(name, arm, tmp_path):
+    """To 2 % of its own signal; 5 % for hysteresis, whose |τ| elastocal rounds off at zero.
+
+    elastocal rounds the step of backlash too: compared only where the load on the joint is above
+    a quarter of its largest.
+    """
+    world = draw_world((6,), name, [name], arm=arm, factor=1.0, poses=40)
+    error, moved = model_error(world, tmp_path), signal(world)
+    if name == "backlash":
+        load = np.abs(world.physics.rest(world.visits)[0].load[:, world.effects[0].index])
+        error, moved = (x[load > 0.25 * load.max()] for x in (error, moved))
+    assert rms(moved) > 1e-6
+    assert rms(error) < (0.05 if name == "hysteresis" else 0.02) * rms(moved)
+
+
+def pendulum(angle: float, play: float) -> float:
+    """Angle from the vertical of a bar, 10 kg at 1 m, on a rigid drive at `angle` with play."""
+    bar = Skeleton(
+        np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.array([[0.0, 1.0, 0.0]]),
+        np.array([-9.0]), np.array([9.0]), np.array([10.0]), np.array([[0.0, 0.0, -1.0]]),
+    )  # fmt: skip
+    arm = ElasticArm(bar, [Spring(1, bar.axis[0], 1e-8)])
+    placement = Placement(np.zeros((1, 3, 3)), np.tile(np.eye(3), (1, 3, 1, 1)))
+    zero = np.zeros((1, 3))
+    rest = arm.rest(np.array([[angle]]), placement, zero, zero, np.zeros_like, {0: play})
+    return float(Rotation.from_matrix(rest.rotation[0]).as_rotvec()[1])
+
+
+def test_play_floats_to_balance_and_rests_on_the_flank_that_the_load_chooses():
+    assert pendulum(0.003, play=0.01) == pytest.approx(0.0, abs=1e-9)
+    assert pendulum(0.2, play=0.01) == pytest.approx(0.2 - 0.005, abs=1e-6)
+    assert pendulum(-0.2, play=0.01) == pytest.approx(-0.2 + 0.005, abs=1e-6)
+    upright = abs(pendulum(np.pi - 0.003, play=0.01))
+    assert upright == pytest.approx(np.pi - 0.003 - 0.005, abs=1e-6)
+
+
+@pytest.mark.parametrize("effect", ALIKE)
+def test_an_effect_said_to_be_alike_is_imitated(effect, tmp_path):
+    """Its signal, off what the plain cell fits, lies in the rival's span to 2 %."""
+    world = draw_world((15,), "alike", [effect], arm="heavy", factor=1.0)
+    name, _, where = ALIKE[effect].partition(":")
+    left = []
+    for rivals in ([], [(name, where, world.effects[0].settings)]):
+        model, table = model_with(rivals, world, tmp_path)
+        B = model.regressor(table).B
+        U, size, _ = np.linalg.svd(B / np.linalg.norm(B, axis=0).clip(1e-12), full_matrices=False)
+        U = U[:, size > 1e-7]
+        moved = signal(world).ravel()
+        left.append(rms(moved - U @ (U.T @ moved)))
+    assert left[1] < 0.02 * left[0]
+
+
+def test_a_change_is_seen_from_its_time_on():
+    world = draw_world((7,), "jump", ["marker_slip"])
+    effect = world.effects[0]
+    moved = np.abs(signal(world)).max(axis=2)
+    slipped = moved[:, int(effect.where[-1]) - 1] > 1e-7
+    assert np.array_equal(slipped, world.visits.time >= effect.settings["slip_time_s"])
+    assert 0 < slipped.sum() < len(slipped)
+    assert moved.sum() == pytest.approx(moved[:, int(effect.where[-1]) - 1].sum())
+
+
+@pytest.mark.parametrize("name", OUTSIDE_EFFECTS)
+def test_an_outside_effect_follows_its_driver_and_nothing_else(name):
+    world = draw_world((8,), name, [name], arm="heavy", factor=2.0)
+    (effect,) = world.effects
+    before, v = signal(world), world.visits
+
+    def follows(**changed: np.ndarray) -> bool:
+        after = signal(replace(world, visits=replace(v, **changed)))
+        return rms(after - before) > 0.05 * rms(before)
+
+    assert rms(before) > 5e-6
+    assert follows(time=v.time[::-1].copy()) == ("time" in effect.driver)
+    assert follows(approach=-v.approach) == ("approach" in effect.driver)
+    assert follows(force=0.5 * v.force) == any(w in effect.driver for w in ("load", "torque"))
+    if effect.where.startswith("marker:"):
+        others = [n for n in world.spec.marker_names if not effect.where.endswith(n)]
+        kept = [world.spec.marker_names.index(n) for n in others]
+        assert np.abs(before[:, kept]).max() == 0.0
+
+
+def test_sizes_lie_in_the_stated_spread():
+    sizes = {"encoder_scale": 1e-4, "backlash": 2e-4, "joint_drift": 1e-4, "encoder_jump": 1e-4}
+    for world in catalogue_worlds(9, per_effect=20, names=list(sizes), poses=3):
+        (effect,) = world.effects
+        (value,) = effect.values.values()
+        factor = abs(value) / (sizes[effect.name] * world.spec.gear)
+        assert 0.6 <= factor <= 1.7
+
+
+@pytest.mark.parametrize("plan", ["interleaved", "blocks"])
+def test_visits_follow_their_plan(plan):
+    drawn = (draw_world((10, k), "plan", arm="medium", poses=12) for k in range(40))
+    world = next(w for w in drawn if w.plan == plan and w.approach_by_motion)
+    v = world.visits
+    loaded = v.force[:, 2] < 0
+    assert np.array_equal(np.sort(v.pose[loaded]), np.arange(12))
+    pairs = np.repeat(np.arange(12), 2) if plan == "interleaved" else np.tile(np.arange(12), 2)
+    assert np.array_equal(v.pose, pairs)
+    step = np.diff(v.q, axis=0)
+    assert np.all(v.approach[1:][step != 0] == np.sign(step[step != 0]))
+    assert np.all(np.diff(v.time) > 0)
+    heights = world.noise_free(v)[..., 2] - world.specimen.true.base_position[2]
+    assert heights.min() > 0.05
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_noise_is_of_the_kind_and_size_stated(variant):
+    rng = np.random.default_rng(11)
+    noise = draw_noise(variant, 6, 4.0, rng, level=5e-5)
+    points = 4.0 * np.array([0.6, 0.64, 0.48]) + np.zeros((4000, 3, 3))
+    error = noise.add(points, rng) - points
+    size = np.linalg.norm(error, axis=-1)
+    kept = error[size < OUTLIER_SIZE[0]] if variant == "outliers" else error
+    assert rms(kept) == pytest.approx(5e-5, rel=0.1)
+    assert rms(noise.sigma(points)) == pytest.approx(5e-5)
+    far = np.mean(np.abs(error) > 4.5 * noise.sigma(points).max())
+    assert (far > 1e-3) == (variant in ("outliers", "heavy_tails"))
+    pose = np.repeat(np.arange(2000), 2)
+    jitter = noise.jitter(pose, rng)
+    together = np.corrcoef(jitter[0::2, 0], jitter[1::2, 0])[0, 1]
+    assert together == pytest.approx(1.0 if variant == "shared_scatter" else 0.0, abs=0.1)
+    even = np.allclose(jitter.std(axis=0), REPEATABILITY, rtol=0.1)
+    assert even == (variant != "joint_pattern")
+
+
+def test_the_tool_sees_nothing_of_the_truth(tmp_path):
+    """Cell and arm are those of the same world without effects; no file names an effect."""
+    for world in [*pair_worlds(12, 3), draw_world((12,), "outside", ["floor_wave"])]:
+        seen, sealed = tmp_path / "seen" / world.name, tmp_path / "sealed" / world.name
+        write_world(world, seen, sealed)
+        write_world(replace(world, effects=()), tmp_path / "clean", tmp_path / "none")
+        assert {p.name for p in seen.iterdir()} == {"arm.urdf", "cell.toml", "data.csv"}
+        for name in ("arm.urdf", "cell.toml"):
+            assert (seen / name).read_bytes() == (tmp_path / "clean" / name).read_bytes()
+        text = "".join(p.read_text() for p in seen.iterdir())
+        truth = json.loads((sealed / "truth.json").read_text())
+        assert len(truth["effects"]) == len(world.effects)
+        for effect in truth["effects"]:
+            assert effect["effect"] not in text
+        assert world.name not in text
+
+
+def test_truth_within_the_tools_reach_is_refused(tmp_path):
+    world = draw_world((13,), "clean", poses=3)
+    with pytest.raises(ValueError, match="within the tool's reach"):
+        write_world(world, tmp_path, tmp_path / "sealed")
+
+
+def test_worlds_are_reproducible_and_fresh_poses_are_fresh(tmp_path):
+    first, again, other = (draw_world((14, k), "w", ["joint_drift"]) for k in (0, 0, 1))
+    for k, world in enumerate((first, again, other)):
+        write_world(world, tmp_path / f"seen{k}", tmp_path / f"sealed{k}")
+    data = [(tmp_path / f"seen{k}" / "data.csv").read_bytes() for k in range(3)]
+    assert data[0] == data[1] != data[2]
+    fresh = first.fresh()
+    assert len(np.unique(fresh.pose)) == 100
+    gaps = np.abs(fresh.q[:, None] - first.visits.q[None]).max(axis=2)
+    assert gaps.min() > 1e-3
+    assert fresh.time[-1] == pytest.approx(first.visits.time[-1])
+
+
+def test_the_world_shares_no_code_with_elastocal():
+    for name in WORLD_MODULES:
+        for node in ast.walk(ast.parse((FOLDER / f"{name}.py").read_text())):
+            used = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            used += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not any(module.startswith("elastocal") for module in used), name

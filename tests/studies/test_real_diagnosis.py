@@ -1,0 +1,83 @@
+"""Diagnosis of real measurements, where ELASTOCAL_DATASETS names their folder."""
+
+import importlib.util
+import json
+import os
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from elastocal.cli import app
+
+FOLDER = Path(__file__).parents[2] / "experiment_design" / "real_arms"
+
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(
+        not os.environ.get("ELASTOCAL_DATASETS"),
+        reason="ELASTOCAL_DATASETS is unset; experiment_design/real_arms/README.md says what it is",
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Cells of the study beside the tables that its own prepare.py makes."""
+    spec = importlib.util.spec_from_file_location("prepare", FOLDER / "prepare.py")
+    prepare = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(prepare)
+    work = tmp_path_factory.mktemp("real_diagnosis")
+    prepare.prepare(work / "data")
+    for cell in FOLDER.glob("*.toml"):
+        (work / cell.name).write_text(cell.read_text(encoding="utf-8"), encoding="utf-8")
+    return work
+
+
+def diagnosed(folder, cell, data):
+    arguments = ["diagnose", str(folder / cell), str(folder / "data" / data), "-q", "--json"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    "cell, calibrated", [("iiwa7_rigid.toml", 1650), ("iiwa7_rigid_scale.toml", 990)]
+)
+def test_iiwa_without_springs_is_found_to_bend_at_joint_2(folder, cell, calibrated):
+    """What identification shows (README): 1.6 to 0.4 mm with one compliance near 1e-4."""
+    found = diagnosed(folder, cell, "iiwa7.csv")
+    first = found["effects"][0]
+    assert (first["effect"], first["where"]) == ("joint_compliance", "joint2")
+    assert first["probability"] > 0.85
+    (compliance,) = first["parameters"]
+    assert 5e-5 < compliance["value"] < 1.5e-4
+    assert found["gap"]["calibrated_um"] == pytest.approx(calibrated, rel=0.1)
+    assert found["gap"]["explained_um"] < 500
+    assert first["gap_reduction_ci95"][0] > 0.5
+
+
+def test_iiwa_readings_that_the_compliance_explains_are_not_faulty(folder):
+    """Left out for their deflection, they must come back once the compliance is found."""
+    found = diagnosed(folder, "iiwa7_rigid_scale.toml", "iiwa7.csv")
+    assert all(reading["error_um"] < 4500 for reading in found["noise"]["faulty"])
+
+
+def test_ur5_gets_no_single_cause(folder):
+    """Residuals of geometry alone, which several gears share: no lone effect may be claimed."""
+    found = diagnosed(folder, "ur5.toml", "ur5_grid.csv")
+    assert found["gap"]["calibrated_um"] == pytest.approx(113, rel=0.1)
+    assert found["gap"]["noise_floor_um"] < 0.85 * found["gap"]["calibrated_um"]
+    assert found["verdict"] == "unknown_effect" or len(found["effects"]) > 1
+    shown = {test["driver"] for test in found["structure"] if test["p_family"] < 0.01}
+    assert {"joint1 angle", "joint2 angle"} <= shown
+    reasons = {row["effect"] for row in found["untested"]}
+    assert {"joint_compliance", "hysteresis", "joint_drift"} <= reasons
+
+
+def test_wam_is_not_explained_away(folder):
+    """A cable drive: whatever is named, millimetres remain and the verdict says so."""
+    found = diagnosed(folder, "wam.toml", "wam_grid.csv")
+    assert found["verdict"] in ("unknown_effect", "ambiguous")
+    assert found["gap"]["explained_um"] > 2000
+    assert not any(effect["probability"] > 0.9 for effect in found["effects"])

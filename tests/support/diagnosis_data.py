@@ -1,0 +1,257 @@
+"""What the diagnosis engine is tested on: random blocks, and campaigns on arms with faults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from support.cells import ANCHOR, COMPLIANCE, DOWN, LOAD_POINT, MARKERS, choices, kr270_chain
+from support.cells import random_poses, table_of
+from support.robots import KR270
+
+from elastocal.cell import CartesianNoise, Cell, ModelSpec, Nominal, Robot, Tool, Tracker
+from elastocal.diagnosis.blocks import Blocks
+from elastocal.diagnosis.diagnose import diagnose
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.diagnosis.result import Diagnosis
+from elastocal.manipulator.chain import Chain, Joint
+from elastocal.manipulator.model import Model
+from elastocal.measurements import Measurements
+from elastocal.simulation.simulate import draw_errors, simulate, values_from
+
+Array = np.ndarray
+FITTED = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
+SIGMA, REPEATABILITY = 1e-5, 3e-6
+VISIT_TIME = 30.0  # s
+JUMP_TIME = 900.0
+
+
+@dataclass(frozen=True)
+class Fault:
+    """An effect of the true arm: parameters by key, and its settings."""
+
+    effect: str
+    where: str
+    values: Mapping[str, float]
+    settings: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.effect, self.where
+
+
+FAULTS = {
+    f"{f.effect}:{f.where}": f
+    for f in (
+        Fault("encoder_scale", "joint3", {"encoder_scale": 2e-4}),
+        Fault(
+            "gear_eccentricity",
+            "joint2",
+            {"eccentricity_sin": 1e-4, "eccentricity_cos": -1.2e-4},
+        ),
+        Fault(
+            "gear_eccentricity",
+            "joint4",
+            {"eccentricity_sin": 1.5e-4, "eccentricity_cos": -1e-4},
+        ),
+        Fault(
+            "gear_ripple",
+            "joint5",
+            {"ripple_sin": 1e-4, "ripple_cos": 5e-5},
+            {"ripple_order": 81.3},
+        ),
+        Fault("hysteresis", "joint3", {"hysteresis": 1e-4}),
+        Fault("encoder_jump", "joint4", {"jump": 2e-4}, {"jump_time_s": JUMP_TIME}),
+        Fault(
+            "marker_slip",
+            "marker:M2",
+            {"slip_x": 1.5e-4, "slip_y": -1e-4, "slip_z": 8e-5},
+            {"slip_time_s": JUMP_TIME},
+        ),
+        Fault("payload_error", "load", {"payload_scale": 0.05}),
+        Fault(
+            "off_axis_compliance",
+            "joint3",
+            {"off_axis_compliance_x": 1.5e-7, "off_axis_compliance_y": 1e-7},
+        ),
+        Fault(
+            "tracker_distortion",
+            "tracker",
+            {"azimuth_sin": 5e-5, "azimuth_cos": -4e-5, "elevation_sin": 5e-5},
+        ),
+        # The anchor stands 120° about the joint from where the example has it.
+        Fault(
+            "gravity_compensator",
+            "joint2",
+            {
+                "compensator_stiffness": 8e4,
+                "compensator_anchor_x": -0.447,
+                "compensator_anchor_y": 0.534,
+            },
+        ),
+        Fault(
+            "thermal_expansion",
+            "link2",
+            {"expansion": 2e-4},
+            {"time_constant_s": 1200.0},
+        ),
+    )
+}
+
+
+def cell(
+    effects: Sequence[str] = FITTED, observe: Any = "position", sigma: float = SIGMA, **model: Any
+) -> Cell:
+    """A KR 270-2 with its stated tracker noise."""
+    model.setdefault("nominal", Nominal(joint_compliance=COMPLIANCE))
+    model.setdefault("link_gravity", True)
+    tracker = Tracker(
+        position=np.array([3.5, -2.0, 0.6]), noise=CartesianNoise(np.full(3, sigma)), anchor=ANCHOR,
+        rotation_sigma=5e-5, distance_sigma=sigma,
+    )  # fmt: skip
+    spec = ModelSpec(observe=observe, effects=choices(effects), **model)
+    tool = Tool(LOAD_POINT, dict(MARKERS))
+    return Cell("arm", None, Robot(urdf=KR270), tool, tracker, spec)
+
+
+def measured(
+    chain: Chain, plain: Cell, faults: Sequence[Fault], table: Measurements, seed: int
+) -> Measurements:
+    """The table as read on the arm with the faults: equilibria at scattered joint angles.
+
+    What the cell fits deviates at random from nominal.
+    """
+    nominal, settings = plain.model.nominal, {f.where: dict(f.settings) for f in faults if f.settings}
+    effects = (*plain.model.effects, *choices([f"{f.effect}:{f.where}" for f in faults]))
+    spec = replace(plain.model, effects=effects, nominal=replace(nominal, settings=settings))
+    truth = Model(chain, replace(plain, model=spec))
+    errors = draw_errors(Model(chain, plain), 1.0, np.random.default_rng((seed, 4)))
+    values = errors | {f"{f.where}.{key}": v for f in faults for key, v in f.values.items()}
+    rng = np.random.default_rng((seed, 2))
+    key = np.column_stack([table.configuration, table.repeat, table.force])
+    visit = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+    shake = REPEATABILITY * rng.normal(size=(visit.max() + 1, chain.n_joints))
+    shaken = replace(table, q=table.q + shake[visit])
+    return replace(simulate(truth, shaken, values_from(truth, values), rng), q=table.q)
+
+
+def plan(chain: Chain, n: int, seed: int, force: Array = DOWN) -> Measurements:
+    """`n` random poses, unloaded and loaded, with times and random sides of approach."""
+    table = table_of(random_poses(chain, n, seed), force, both=True)
+    visit = np.arange(len(table)) // len(MARKERS)
+    sides = np.random.default_rng((seed, 3)).choice([-1.0, 1.0], (visit[-1] + 1, chain.n_joints))
+    return replace(table, time=VISIT_TIME * visit, approach=sides[visit])
+
+
+@lru_cache
+def campaign(
+    *names: str, n: int = 40, seed: int = 1, observe: str = "position", sigma: float = SIGMA
+) -> tuple[Model, Measurements]:
+    """Model without, and readings with, the faults of these names."""
+    chain, plain = kr270_chain(), cell(observe=observe, sigma=sigma)
+    faults = [FAULTS[name] for name in names]
+    return Model(chain, plain), measured(chain, plain, faults, plan(chain, n, seed), seed)
+
+
+@lru_cache
+def diagnosed(
+    *names: str, without: tuple[str, ...] = (), n: int = 40, seed: int = 1
+) -> Diagnosis:
+    return diagnose(*campaign(*names, n=n, seed=seed), DiagnosisOptions(without=without))
+
+
+def zigzag(n_joints: int) -> Chain:
+    """An arm of 0.35 m links whose axes turn by turns about z, y, y, x."""
+    axes = np.array([[0.0, 0, 1], [0, 1, 0], [0, 1, 0], [1, 0, 0]])
+    joints = []
+    for k in range(n_joints):
+        placement = np.eye(4)
+        placement[:3, 3] = [0.25, 0.05, 0.25] if k else [0, 0, 0.4]
+        joints.append(Joint(f"j{k + 1}", "revolute", placement, axes[k % 4], -2.2, 2.2))
+    flange = np.eye(4)
+    flange[:3, 3] = [0.2, 0.0, 0.1]
+    return Chain("zigzag", tuple(joints), flange)
+
+
+def random_blocks(seed: int, sizes: Sequence[int] = (4, 2, 6, 4, 1), size: int = 3) -> Blocks:
+    """Blocks of unequal length, two or three observations to a visit, rows in no order."""
+    rng = np.random.default_rng(seed)
+    configuration = np.repeat(np.arange(len(sizes)), sizes)
+    local = np.concatenate([np.arange(s) // rng.integers(2, 4) for s in sizes])
+    visit = 10 * configuration + local
+    order = rng.permutation(len(configuration))
+    return Blocks.of(configuration[order], visit[order], size)
+
+
+def random_data(
+    seed: int, blocks: Blocks | None = None, p: int = 4, joints: int = 3, stated: bool = True
+) -> NoisyData:
+    """Everything random, of order one in its own units, some readings left out."""
+    rng = np.random.default_rng((seed, 7))
+    blocks = blocks or random_blocks(seed)
+    n, size = blocks.n, blocks.size
+    root = rng.normal(size=(n, size, size))
+    covariance = 1e-10 * (root @ root.transpose(0, 2, 1) + size * np.eye(size))
+    data = NoisyData(
+        blocks=blocks,
+        r=blocks.pack(2e-5 * rng.normal(size=(n, size, 1)))[:, :, 0],
+        X=blocks.pack(1e-5 * rng.normal(size=(n, size, p))),
+        precision=rng.uniform(0.2, 3.0, p),
+        covariance=blocks.pack_square(covariance),
+        G=blocks.pack(rng.normal(size=(n, size, joints))),
+        same_visit=blocks.same_visit,
+        left_out=blocks.absent,
+        stated=stated,
+    )
+    return data.without(rng.random(n) < 0.15)
+
+
+def used_rows(data: NoisyData) -> Array:
+    """Places in the flattened blocks (C·m) of the rows that count."""
+    return np.flatnonzero(~data.left_out.ravel())
+
+
+def dense_noise(data: NoisyData, noise: NoiseValues) -> Array:
+    """V of the rows that count, entry by entry from the observations' labels."""
+    blocks, size = data.blocks, data.blocks.size
+    observation = np.repeat(blocks.member, size, axis=1).ravel()
+    m = data.r.shape[1]
+    rows = used_rows(data)
+    G = data.G.reshape(-1, data.G.shape[2])
+    V = np.zeros((len(rows), len(rows)))
+    for a, i in enumerate(rows):
+        for b, j in enumerate(rows):
+            if i // m != j // m:
+                continue
+            one, other = observation[i], observation[j]
+            joint = float((noise.joint**2 * G[i] * G[j]).sum())
+            V[a, b] = joint * noise.shared**2
+            if blocks.visit[one] == blocks.visit[other]:
+                V[a, b] += joint
+            if one == other:
+                V[a, b] += noise.factor**2 * data.covariance[i // m, i % m, j % m]
+    return V
+
+
+def kept_only(data: NoisyData) -> NoisyData:
+    """The data rebuilt from the observations that count alone."""
+    old = data.blocks
+    out = old.unpack(data.left_out[..., None].astype(float))[:, 0, 0] > 0
+    configuration = np.empty(old.n + 1, dtype=int)
+    configuration[old.member] = np.arange(len(old.member))[:, None]
+    blocks = Blocks.of(configuration[:-1][~out], old.visit[~out], old.size)
+    return NoisyData(
+        blocks=blocks,
+        r=blocks.pack(old.unpack(data.r[..., None])[~out])[:, :, 0],
+        X=blocks.pack(old.unpack(data.X)[~out]),
+        precision=data.precision,
+        covariance=blocks.pack_square(old.unpack_square(data.covariance)[~out]),
+        G=blocks.pack(old.unpack(data.G)[~out]),
+        same_visit=blocks.same_visit,
+        left_out=blocks.absent,
+        stated=data.stated,
+    )
