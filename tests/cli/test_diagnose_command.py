@@ -39,7 +39,7 @@ class Engine:
             raise self.answer
         return self.answer
 
-    def plan_extra(self, model, table, diagnosis, **asked):
+    def plan_extra(self, model, table, diagnosis, progress, **asked):
         self.planned.append(asked)
         return self.extra
 

@@ -33,7 +33,6 @@ ECCENTRICITY = Finding(
     gap_reduction=0.752,
     gap_reduction_ci90=(0.65, 0.82),
     gap_reduction_ci95=(0.63, 0.84),
-    gap_reduction_ci90=(0.65, 0.82),
     parameters=(
         FittedParameter("joint2.eccentricity_sin", 1.12e-4, "rad", 6e-6),
         FittedParameter("joint2.eccentricity_cos", -4.1e-5, "rad", 7e-6),
@@ -47,7 +46,6 @@ JUMP = Finding(
     gap_reduction=0.12,
     gap_reduction_ci90=(0.06, 0.18),
     gap_reduction_ci95=(0.05, 0.19),
-    gap_reduction_ci90=(0.06, 0.18),
     parameters=(FittedParameter("joint1.jump", 1.4e-4, "rad", 1.1e-5),),
     settings={"jump_time_s": 4325.5},
 )

@@ -8,8 +8,17 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from support.cells import ANCHOR, COMPLIANCE, DOWN, LOAD_POINT, MARKERS, choices, kr270_chain
-from support.cells import random_poses, table_of
+from support.cells import (
+    ANCHOR,
+    COMPLIANCE,
+    DOWN,
+    LOAD_POINT,
+    MARKERS,
+    choices,
+    kr270_chain,
+    random_poses,
+    table_of,
+)
 from support.robots import KR270
 
 from elastocal.cell import CartesianNoise, Cell, ModelSpec, Nominal, Robot, Tool, Tracker
@@ -125,7 +134,10 @@ def measured(
 
     What the cell fits deviates at random from nominal.
     """
-    nominal, settings = plain.model.nominal, {f.where: dict(f.settings) for f in faults if f.settings}
+    nominal, settings = (
+        plain.model.nominal,
+        {f.where: dict(f.settings) for f in faults if f.settings},
+    )
     effects = (*plain.model.effects, *choices([f"{f.effect}:{f.where}" for f in faults]))
     spec = replace(plain.model, effects=effects, nominal=replace(nominal, settings=settings))
     truth = Model(chain, replace(plain, model=spec))
@@ -158,9 +170,7 @@ def campaign(
 
 
 @lru_cache
-def diagnosed(
-    *names: str, without: tuple[str, ...] = (), n: int = 40, seed: int = 1
-) -> Diagnosis:
+def diagnosed(*names: str, without: tuple[str, ...] = (), n: int = 40, seed: int = 1) -> Diagnosis:
     return diagnose(*campaign(*names, n=n, seed=seed), DiagnosisOptions(without=without))
 
 

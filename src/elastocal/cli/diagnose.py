@@ -20,7 +20,7 @@ from elastocal.cli.app import (
     reporting_errors,
 )
 from elastocal.cli.diagnosis_files import Outputs, write_diagnosis
-from elastocal.cli.identify import _load
+from elastocal.cli.identify import load_inputs
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import require
 
@@ -85,7 +85,7 @@ def diagnose(
     check_outputs(*outputs.wanted)
     with progress_line(quiet) as progress:
         progress("reading")
-        model, (table,) = _load(cell, [data])
+        model, (table,) = load_inputs(cell, [data])
         read = [cell, data, *(path for path in files_of(model.cell) if path is not None)]
         check_apart(outputs.wanted, read)
         found = run(model, table, options, progress)
@@ -112,4 +112,6 @@ def _with_extra_poses(
     from elastocal.diagnosis.separate import plan_extra
 
     progress("looking for poses that tell the rivals apart")
-    return replace(found, extra=plan_extra(model, table, found, most=most, seed=seed))
+    return replace(
+        found, extra=plan_extra(model, table, found, most=most, seed=seed, progress=progress)
+    )

@@ -129,7 +129,7 @@ def identify(
     check_outputs(output, report, residuals)
     with progress_line(quiet) as progress:
         progress("reading")
-        model, tables = _load(cell, [data] if test is None else [data, test])
+        model, tables = load_inputs(cell, [data] if test is None else [data, test])
         if known is not None:
             constraints, prior = known.of(model)
             chosen = replace(chosen, constraints=constraints, prior=prior)
@@ -147,7 +147,7 @@ def identify(
             typer.echo(f"wrote {path}")
 
 
-def _load(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]:
+def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]:
     """Model and tables; every file is checked before anything is computed."""
     from elastocal.cell_reader import read_cell
     from elastocal.manipulator.choice import load_chain

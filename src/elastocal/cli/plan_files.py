@@ -55,7 +55,7 @@ def check_apart(written: list[Path], read: list[Path]) -> None:
     for path in written:
         require(
             path.resolve() not in inputs,
-            f"{path} is read for this plan and would be written over; name another output",
+            f"{path} is read and would be written over; name another output",
         )
         require(
             path.resolve() not in seen, f"{path}: two outputs of the same name; name another one"

@@ -22,7 +22,7 @@ from elastocal.report.diagnosis_words import (
     probability,
     together,
 )
-from elastocal.report.html import _environment, _resource, digests
+from elastocal.report.html import digests, resource, software
 from elastocal.report.units import significant
 from elastocal.report.verdict import counted
 from elastocal.report.words import printable
@@ -79,7 +79,7 @@ def diagnosis_page(
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    template = environment.from_string(_resource("diagnosis.html.j2"))
+    template = environment.from_string(resource("diagnosis.html.j2"))
     return template.render(
         **_contents(diagnosis, model),
         data=printable(data),
@@ -98,9 +98,9 @@ def _contents(d: Diagnosis, model: Model) -> dict[str, Any]:
     alike = [together([effect_at(e) for e in rivals]) for rivals in d.indistinguishable]
     return {
         "title": printable(" – ".join(name for name in names if name)),
-        "css": Markup(_resource("style.css") + _resource("diagnosis.css")),
+        "css": Markup(resource("style.css") + resource("diagnosis.css")),
         "version": __version__,
-        "environment": _environment(),
+        "environment": software(),
         "headline": headline(d),
         "verdict": lines,
         "steps": next_steps(d),

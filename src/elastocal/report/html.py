@@ -75,7 +75,7 @@ def report_page(
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    template = environment.from_string(_resource("identification.html.j2"))
+    template = environment.from_string(resource("identification.html.j2"))
     return template.render(
         **_contents(result, truth),
         command=None if command is None else printable(command),
@@ -113,9 +113,9 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
     names = dict.fromkeys([result.model.chain.name, result.model.cell.name])
     return {
         "title": printable(" – ".join(name for name in names if name)),
-        "css": Markup(_resource("style.css")),
+        "css": Markup(resource("style.css")),
         "version": __version__,
-        "environment": _environment(),
+        "environment": software(),
         "compared": truth is not None,
         "lopsided": any_lopsided((*result.estimates, *result.combinations)),
         "verdict": verdict,
@@ -221,10 +221,10 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def _environment() -> str:
+def software() -> str:
     versions = [f"{name} {metadata.version(name)}" for name in LIBRARIES]
     return ", ".join([f"Python {platform.python_version()}", *versions])
 
 
-def _resource(name: str) -> str:
+def resource(name: str) -> str:
     return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")
