@@ -1,6 +1,6 @@
 """Writes the campaign of the README's example: one world, its truth beside it for once.
 
-    python experiment_design/blind_diagnosis/example.py
+python experiment_design/blind_diagnosis/example.py
 """
 
 from __future__ import annotations

@@ -106,8 +106,8 @@ def finding_lines(found: dict[str, Any]) -> list[str]:
         values += [f"{key} = {value:.4g}" for key, value in effect["settings"].items()]
         lines.append(
             f"- **{effect['effect']} at {effect['where']}**, probability "
-            f"{chance(effect['probability'])}: takes away {effect['gap_reduction']:.0%} "
-            f"({low:.0%} to {high:.0%}) of the noise-free error of fresh poses; "
+            f"{chance(effect['probability'])}: takes away {100 * effect['gap_reduction']:.0f} % "
+            f"({100 * low:.0f} to {100 * high:.0f} %) of the noise-free error of fresh poses; "
             f"{', '.join(values)}"
         )
     for rivals in found["indistinguishable"]:

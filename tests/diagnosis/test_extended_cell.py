@@ -36,7 +36,7 @@ LAYOUTS = (
     '[robot]\nurdf = "arm.urdf"\n',
     'robot = { dh = "dh.csv", masses = "./links.csv" }\nmodel.effects = []\n'
     "model.nominal.base_position_m = [0, 0, 1]\n",
-    '[model.nominal.settings.joint1]\njump_time_s = 3\nripple_order = 101.0\n'
+    "[model.nominal.settings.joint1]\njump_time_s = 3\nripple_order = 101.0\n"
     '[robot]\nurdf = "../cell/arm.urdf"\n'
     '[model]\neffects = ["base_frame", "gear_eccentricity:joint2"]  # one is there already\n',
     'model = { nominal = { settings = { "marker:M1" = { slip_time_s = 1.0 } } } }\n'

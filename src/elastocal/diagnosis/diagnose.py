@@ -65,7 +65,8 @@ def diagnose(
     screened = screen(scene, scene.data)
     faulty = screened.faulty
     progress("searching for what is missing")
-    found = _search(scene.without(faulty), options)
+    search = _search(scene.without(faulty), options)
+    found = search.run()
     if found.chosen.items:
         # Beside a large effect nothing looks faulty, or the wrong readings do.
         beside = found.chosen.data.without(np.zeros_like(faulty))
@@ -73,7 +74,9 @@ def diagnose(
         if (screened.faulty != faulty).any():
             progress("searching again without faulty readings")
             faulty = screened.faulty
-            found = _search(scene.without(faulty), options)
+            search = _search(scene.without(faulty), options)
+            found = search.run()
+    found = search.settled(found)
     scene = scene.without(faulty)
     answer = judge(found)
     progress("confirming")
@@ -117,9 +120,9 @@ def _unknown(found: Found) -> float:
     return max(shares)
 
 
-def _search(scene: Scene, options: DiagnosisOptions) -> Found:
+def _search(scene: Scene, options: DiagnosisOptions) -> Search:
     noise = fit_noise(scene.data)
-    return Search(scene, generic_blocks(scene), noise, options.false_alarm, options.seed).run()
+    return Search(scene, generic_blocks(scene), noise, options.false_alarm, options.seed)
 
 
 def _check_enough(table: Measurements) -> None:

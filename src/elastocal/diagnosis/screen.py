@@ -56,9 +56,15 @@ def screen(scene: Scene, data: NoisyData) -> Screened:
         worst = np.zeros(int(blocks.visit.max()) + 1)
         np.maximum.at(worst, blocks.visit, np.where(suspect, squared, 0.0))
         now = suspect & (squared == worst[blocks.visit])
-        if not now.any():
+        if not now.any() or faulty.mean() > MOST:
             break
         faulty |= now
+    for k in np.flatnonzero(faulty):
+        # A good reading may have looked wrong beside a faulty one that was still there.
+        others = faulty.copy()
+        others[k] = False
+        squared = reading_errors(scene, project(data.without(others), usual))
+        faulty[k] = squared[k] > limit * np.nanmedian(squared) / middle
     if faulty.mean() > MOST or not accidental(scene, faulty):
         faulty[:] = False
     return Screened(faulty, beyond & ~faulty)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,27 +142,29 @@ class Search:
                 seen = self._scan(current)
             if len(current.items) > 1:
                 current, slots, seen = self._reexamined(current, slots, seen)
-        if current.unknown and _rivalled(slots[0]):
-            named = self._named(current)
-            if named is not None:
-                self.scene, current, p_values = named.scene, named.chosen, list(named.p_values)
-                self._fitted.clear()
-                current, slots, seen = self._reexamined(current, list(named.slots), seen)
         if not slots:
             slots = [slot]
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
         return Found(self.scene, current, tuple(slots), tuple(p_values), nothing, first, alone)
 
-    def _named(self, current: ModelSet) -> Found | None:
+    def settled(self, found: Found) -> Found:
         """What effects of the catalogue alone would make of it, where that is clearly better.
 
         A block without a name fits a little of everything, and may come first where several
         effects act at once.
         """
-        alone = Search(self._start, [], self.noise, self.level, self.seed).run()
-        clearly = alone.chosen.score > current.score + CLEARLY
-        return alone if alone.chosen.items and clearly else None
+        if not found.chosen.unknown or not _rivalled(found.slots[0]):
+            return found
+        named = Search(self._start, [], self.noise, self.level, self.seed).run()
+        if not named.chosen.items or named.chosen.score < found.chosen.score + CLEARLY:
+            return found
+        self.scene = named.scene
+        self._fitted.clear()
+        chosen, slots, _ = self._reexamined(named.chosen, list(named.slots), found.alone)
+        return replace(
+            found, scene=self.scene, chosen=chosen, slots=tuple(slots), p_values=named.p_values
+        )
 
     def _been_at(self, chosen: ModelSet) -> bool:
         """Whether the search has come round to a set that it had; noted either way."""

@@ -53,6 +53,12 @@ def _ambiguous(d: Diagnosis) -> str:
 
 def _unknown(d: Diagnosis) -> str:
     text = "Something that is not in the catalogue makes the gap"
+    if d.effects:
+        each = [f"{effect_at(f)} (probability {probability(f.probability)})" for f in d.effects]
+        named = together(each)
+        verb = "make" if len(each) > 1 else "makes"
+        text = f"{capital(named)} {verb} part of the gap; beside it, something not in the catalogue"
+        return f"{text} acts {location_text(d.location)}." if d.location else f"{text} acts."
     if d.location is None:
         return f"{text}; the data do not show where it sits."
     return f"{text}: it sits {location_text(d.location)}."

@@ -1,0 +1,74 @@
+"""How far a rival is from a found effect, against dense matrices."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from support.diagnosis_data import campaign, dense_noise, used_rows
+
+from elastocal.diagnosis.alike import distances, signal_of
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import Item, ModelSet, fit_set, packed_columns
+from elastocal.diagnosis.scene import Scene, scene_of
+
+RIVALS = ("gear_eccentricity", "encoder_scale", "link_mass_error")
+
+
+@lru_cache
+def found() -> tuple[Scene, ModelSet, np.ndarray]:
+    """Eccentricity of joint 2 in a set of two, and S of the data without it."""
+    model, table = campaign("gear_eccentricity:joint2", n=16)
+    hypotheses = [h for h in possible(model, table)[0] if h.name in RIVALS]
+    scene = scene_of(fit_baseline(model, table), hypotheses)
+    chosen = {(h.name, h.where): h for h in scene.hypotheses}
+    keys = [("encoder_scale", "joint5"), ("gear_eccentricity", "joint2")]
+    grids = scene.grids
+    items = tuple(Item(chosen[k], grids[k].values[0], 0.0) for k in keys)
+    both = fit_set(scene, items)
+    rows = used_rows(scene.data)
+    X = scene.data.X.reshape(-1, scene.data.X.shape[2])[rows]
+    other = packed_columns(scene, items[0]).reshape(-1, 1)[rows] * both.scales[0]
+    S = dense_noise(scene.data, both.noise) + X / scene.data.precision @ X.T + other @ other.T
+    return scene, both, S
+
+
+def dense(scene: Scene, packed: np.ndarray) -> np.ndarray:
+    return packed.reshape(-1, packed.shape[2])[used_rows(scene.data)]
+
+
+def test_the_signal_is_what_the_item_does_at_its_estimate() -> None:
+    """The posterior mean of the item's columns given everything else, from dense matrices."""
+    scene, both, S = found()
+    C = dense(scene, packed_columns(scene, both.items[1])) * both.scales[1]
+    r = dense(scene, scene.data.r[..., None])[:, 0]
+    mean = C @ (C.T @ np.linalg.solve(S + C @ C.T, r))
+    v = dense(scene, signal_of(scene, both, 1)[0][..., None])[:, 0]
+    np.testing.assert_allclose(v, mean, atol=2e-3 * np.abs(mean).max())
+
+
+def test_distances_are_what_no_rival_and_no_fitted_parameter_explains() -> None:
+    """d² = vᵀ(S + s²CCᵀ)⁻¹v: everything that may follow integrated out at its prior."""
+    scene, both, S = found()
+    v = dense(scene, signal_of(scene, both, 1)[0][..., None])[:, 0]
+    nothing, each = distances(scene, both, 1)
+    assert nothing == pytest.approx(np.sqrt(v @ np.linalg.solve(S, v)), rel=1e-3)
+    assert both.items[1].what not in [h for h in scene.hypotheses if (h.name, h.where) in each]
+    for h in scene.hypotheses:
+        if h is both.items[1].what or h.name == "link_mass_error":
+            continue
+        item = Item(h, scene.grids[h.name, h.where].values[0], 0.0)
+        C = 3.0 * dense(scene, packed_columns(scene, item))
+        expected = np.sqrt(v @ np.linalg.solve(S + C @ C.T, v))
+        assert each[h.name, h.where] == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_weight_on_the_second_link_is_near_and_other_joints_are_far() -> None:
+    scene, both, _ = found()
+    nothing, each = distances(scene, both, 1)
+    assert max(each.values()) <= nothing * (1 + 1e-9)
+    assert min(each, key=lambda key: each[key]) == ("link_mass_error", "link2")
+    assert each["link_mass_error", "link2"] < 2.0 < each["gear_eccentricity", "joint3"]
+    assert each["gear_eccentricity", "joint5"] > 0.9 * nothing

@@ -1,0 +1,123 @@
+"""The closed form of the evidence against dense Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import logsumexp
+from support.diagnosis_data import dense_noise, random_data, used_rows
+
+from elastocal.diagnosis.evidence import SCALES, evidence_of
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, project
+from elastocal.diagnosis.sums import direct
+
+NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), 0.5)
+SEEDS = range(4)
+
+
+def group(data: NoisyData, seed: int, k: int = 3) -> np.ndarray:
+    rng = np.random.default_rng((seed, 11))
+    return data.masked(1e-5 * rng.normal(size=(*data.r.shape, k)))
+
+
+def dense_evidence(data: NoisyData, C: np.ndarray, s: float) -> float:
+    """log N(r; 0, S + s²CCᵀ) − log N(r; 0, S) with everything else integrated out in S."""
+    rows = used_rows(data)
+    X, C = (a.reshape(-1, a.shape[2])[rows] * 1e5 for a in (data.X, C))
+    r = data.r.ravel()[rows] * 1e5
+    S = 1e10 * dense_noise(data, NOISE) + X / data.precision @ X.T
+    with_group, without = (
+        stats.multivariate_normal(cov=V).logpdf(r) for V in (S + s**2 * C @ C.T, S)
+    )
+    return float(with_group - without)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_evidence_is_the_ratio_of_dense_densities(seed: int) -> None:
+    data = random_data(seed)
+    C = group(data, seed)
+    found = direct(C, project(data, NOISE))
+    each = [dense_evidence(data, C, s) for s in SCALES]
+    for s, expected in zip(SCALES, each, strict=True):
+        assert found.evidence(np.array([s]))[0] == pytest.approx(expected, rel=1e-7, abs=1e-7)
+    mixed = logsumexp(each) - np.log(len(SCALES))
+    assert found.evidence()[0] == pytest.approx(mixed, rel=1e-7, abs=1e-7)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_columns_of_zeros_and_turned_columns_count_the_same(seed: int) -> None:
+    """The prior is isotropic: the evidence of a group is that of any rotation of it."""
+    data = random_data(seed)
+    C, at = group(data, seed), project(data, NOISE)
+    plain = direct(C, at).evidence()
+    padded = np.concatenate([np.zeros((*data.r.shape, 2)), C], axis=2)
+    np.testing.assert_allclose(direct(padded, at).evidence(), plain, rtol=1e-9)
+    turn = stats.ortho_group(3, seed=seed).rvs()
+    np.testing.assert_allclose(direct(C @ turn, at).evidence(), plain, rtol=1e-8)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_the_fitted_columns_can_do_has_no_evidence(seed: int) -> None:
+    """Under a flat prior P removes their span; rounding must not bring it back."""
+    data = random_data(seed)
+    data = replace(data, precision=np.full(data.X.shape[2], 1e-11))
+    at, C = project(data, NOISE), group(data, seed, 1)
+    mix = np.random.default_rng(seed).normal(size=(data.X.shape[2], 2))
+    both = direct(np.concatenate([C, data.masked(data.X @ mix)], axis=2), at)
+    assert (both.lam[0] == 0).sum() == 2 and (both.beta[0][both.lam[0] == 0] == 0).all()
+    np.testing.assert_allclose(both.evidence(), direct(C, at).evidence(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_flipped_configurations_are_flipped_residuals_projected_anew(seed: int) -> None:
+    """b = CᵀP(De) with the fit's residual e and D the configurations' signs, P dense."""
+    data = random_data(seed)
+    C, at = group(data, seed), project(data, NOISE)
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], (6, len(data.r)))
+    found = direct(C, at).flipped(signs)[:, 0]
+    rows = used_rows(data)
+    X, c = (a.reshape(-1, a.shape[2])[rows] for a in (data.X, C))
+    inverse = np.linalg.inv(dense_noise(data, NOISE))
+    M = X.T @ inverse @ X + np.diag(data.precision)
+    P = inverse - inverse @ X @ np.linalg.solve(M, X.T @ inverse)
+    e = np.linalg.inv(inverse) @ P @ data.r.ravel()[rows]
+    lam, U = np.linalg.eigh(c.T @ P @ c)
+    each = np.repeat(signs, data.r.shape[1], axis=1)[:, rows]
+    expected = [evidence_of(lam, U.T @ c.T @ P @ (d * e), SCALES) for d in each]
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_flips_at_all_leave_the_evidence_as_it_is(seed: int) -> None:
+    """Up to the fitted parameters' prior, which pulls the residual a little: none here."""
+    data = random_data(seed)
+    data = replace(data, precision=np.full(data.X.shape[2], 1e-11))
+    found = direct(group(data, seed), project(data, NOISE))
+    np.testing.assert_allclose(found.parts.sum(axis=0), found.beta, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        found.flipped(np.ones((1, len(data.r))))[0], found.evidence(), rtol=1e-6
+    )
+
+
+def test_the_distance_is_the_signal_of_the_typical_size_off_the_fitted_columns() -> None:
+    """d² = tr CᵀPC: the expected squared signal, in standard deviations, of γ ~ N(0, I)."""
+    data = random_data(1)
+    C, at = group(data, 1), project(data, NOISE)
+    gamma = np.random.default_rng(0).normal(size=(20000, 3))
+    P = at.inverse - at.H @ at.H.transpose(0, 2, 1)
+    A = sum(c.T @ p @ c for c, p in zip(C, P, strict=True))
+    H, flat = at.H.reshape(-1, at.H.shape[2]), C.reshape(-1, 3)
+    own = sum(h.T @ c for h, c in zip(at.H, C, strict=True))
+    np.testing.assert_allclose(own, H.T @ flat, rtol=1e-9)
+    A = sum(c.T @ v @ c for c, v in zip(C, at.inverse, strict=True)) - own.T @ own
+    simulated = np.mean(np.einsum("gi,ij,gj->g", gamma, A, gamma))
+    assert direct(C, at).distance[0] ** 2 == pytest.approx(simulated, rel=0.05)
+
+
+def test_strong_evidence_does_not_overflow() -> None:
+    lam, beta = np.array([[1e6]]), np.array([[1e6]])
+    assert np.isfinite(evidence_of(lam, beta, SCALES)).all()
+    assert evidence_of(lam, beta, SCALES)[0] == pytest.approx(5e5, rel=1e-3)

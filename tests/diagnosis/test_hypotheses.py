@@ -1,0 +1,95 @@
+"""What is tried, what cannot be, and what to record so that it can."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import kr270_chain
+from support.diagnosis_data import campaign, cell
+
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.errors import InputError
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.model import Model
+
+MODEL, TABLE = campaign()
+ISSUE = {
+    "encoder_scale", "gear_eccentricity", "gear_second_harmonic", "gear_ripple", "wrist_coupling",
+    "backlash", "hysteresis", "joint_hardening", "off_axis_compliance", "link_bending",
+    "base_compliance", "gravity_compensator", "payload_error", "link_mass_error",
+    "thermal_expansion", "base_drift", "joint_drift", "encoder_jump", "frame_jump", "marker_slip",
+    "tracker_distortion",
+}  # fmt: skip
+
+
+def test_the_whole_catalogue_is_tried_where_everything_is_recorded() -> None:
+    tried, untested = possible(MODEL, TABLE)
+    assert {h.name for h in tried} >= ISSUE
+    assert untested == []
+    assert len({(h.name, h.where) for h in tried}) == len(tried)
+    for joint in range(1, 7):
+        assert ("gear_eccentricity", f"joint{joint}") in {(h.name, h.where) for h in tried}
+
+
+def test_what_the_model_has_is_not_a_hypothesis_and_what_it_lacks_is() -> None:
+    tried = {h.name for h in possible(MODEL, TABLE)[0]}
+    assert not tried & {c.name for c in MODEL.cell.model.effects}
+    assert "link_geometry" in tried
+    spare = Model(kr270_chain(), cell(("base_frame", "joint_compliance:joint2")))
+    places = {(h.name, h.where) for h in possible(spare, TABLE)[0]}
+    assert ("joint_compliance", "joint3") in places and ("joint_offset", "joint1") in places
+    assert ("joint_compliance", "joint2") not in places
+
+
+LACKING = {
+    "time": ("joint_drift", "base_drift", "encoder_jump", "frame_jump", "marker_slip"),
+    "approach": ("hysteresis",),
+}
+
+
+@pytest.mark.parametrize("column", LACKING)
+@pytest.mark.parametrize("how", ["absent", "constant"])
+def test_what_the_table_does_not_say_is_untested_with_advice(column: str, how: str) -> None:
+    """A column that never changes says as little as none."""
+    values = None if how == "absent" else np.ones_like(getattr(TABLE, column))
+    tried, untested = possible(MODEL, replace(TABLE, **{column: values}))
+    names = {u.effect for u in untested}
+    assert names >= set(LACKING[column]) and not names & {h.name for h in tried}
+    assert all(column in u.reason or "side" in u.reason for u in untested)
+    assert all("record" in u.advice and column in u.advice for u in untested)
+    complete = {(h.name, h.where) for h in possible(MODEL, TABLE)[0]}
+    parts = {(h.name, h.where) for h in tried} | {(u.effect, u.where) for u in untested}
+    assert parts == complete
+
+
+def test_without_a_load_the_loads_error_is_untested() -> None:
+    unloaded = replace(TABLE, force=np.zeros_like(TABLE.force))
+    tried, untested = possible(MODEL, unloaded)
+    assert "payload_error" in {u.effect for u in untested} - {h.name for h in tried}
+    assert any("load" in u.advice for u in untested)
+
+
+@pytest.mark.parametrize("name", sorted(ISSUE))
+def test_an_effect_can_be_taken_out_of_the_catalogue(name: str) -> None:
+    whole = {(h.name, h.where) for h in possible(MODEL, TABLE)[0]}
+    rest = {(h.name, h.where) for h in possible(MODEL, TABLE, (name,))[0]}
+    assert rest == {key for key in whole if key[0] != name} < whole
+
+
+def test_instruments_that_were_not_used_are_not_suspected() -> None:
+    names = {h.name for h in possible(MODEL, TABLE)[0]}
+    assert not names & {"marker_orientation", "distance_sensor"}
+    for observe, name in (("pose", "marker_orientation"), ("distance", "distance_sensor")):
+        other = Model(kr270_chain(), cell(observe=observe))
+        assert name in {h.name for h in possible(other, TABLE)[0]}
+
+
+def test_a_misspelt_effect_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(InputError, match="gear_eccentricity"):
+        DiagnosisOptions(without=("gear_excentricity",))
+    with pytest.raises(InputError, match="false-alarm"):
+        DiagnosisOptions(false_alarm=0.0)
+    assert DiagnosisOptions(without=tuple(CATALOGUE)).without == tuple(CATALOGUE)

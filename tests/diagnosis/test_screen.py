@@ -1,0 +1,114 @@
+"""Faulty readings are found, and only those; what an arm does is not taken for a fault."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from support.diagnosis_data import SIGMA, campaign, diagnosed
+
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.noise import NoiseValues, fit_noise, project
+from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.diagnosis.screen import describe_faulty, reading_errors, screen
+from elastocal.measurements import Measurements
+
+POSES = 60  # × 2 loads × 3 markers
+
+
+def scene_with(table: Measurements) -> Scene:
+    return scene_of(fit_baseline(campaign(n=POSES)[0], table), [])
+
+
+@lru_cache
+def clean() -> Scene:
+    return scene_with(campaign(n=POSES)[1])
+
+
+def screened(scene: Scene) -> tuple[np.ndarray, Scene, NoiseValues]:
+    """Rows of the faulty readings, the scene without them, and the noise of the others."""
+    faulty = screen(scene, scene.data).faulty
+    kept = scene.without(faulty)
+    return np.flatnonzero(faulty), kept, fit_noise(kept.data)
+
+
+def spoiled(rows: np.ndarray, size: float, seed: int) -> Measurements:
+    table = campaign(n=POSES)[1]
+    error = np.random.default_rng(seed).normal(size=(len(rows), 3))
+    position = table.position.copy()
+    position[rows] += size * error / np.linalg.norm(error, axis=1, keepdims=True)
+    return replace(table, position=position)
+
+
+def test_good_readings_are_kept() -> None:
+    faulty, _, noise = screened(clean())
+    assert len(faulty) == 0 and not screen(clean(), clean().data).suspects.any()
+    assert noise.factor == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_one_reading_in_a_hundred_that_is_a_millimetre_off_is_found_and_no_other(
+    seed: int,
+) -> None:
+    rows = np.sort(np.random.default_rng(seed).choice(6 * POSES, 4, replace=False))
+    table = spoiled(rows, 1e-3, seed)
+    faulty, scene, noise = screened(scene_with(table))
+    np.testing.assert_array_equal(faulty, rows)
+    assert noise.factor == pytest.approx(1.0, abs=0.15)
+    told = describe_faulty(scene, scene.data, noise)
+    assert [f.line for f in told] == list(table.row[rows])
+    for f, k in zip(told, rows, strict=True):
+        assert f.error == pytest.approx(1e-3, rel=0.1)
+        assert f.sigmas == pytest.approx(f.error / SIGMA / noise.factor, rel=0.01)
+        assert f.configuration == table.configuration_labels[table.configuration[k]]
+        assert f.marker == table.marker_names[table.marker[k]]
+
+
+def test_heavy_tails_are_not_faults() -> None:
+    """t with 4 degrees of freedom, of the stated size: all but a handful stay."""
+    table = campaign(n=POSES)[1]
+    shake = np.random.default_rng(3).standard_t(4, size=table.position.shape) / np.sqrt(2)
+    faulty, _, _ = screened(scene_with(replace(table, position=table.position + SIGMA * shake)))
+    assert len(faulty) <= 0.02 * 6 * POSES
+
+
+def test_a_slipped_marker_is_not_a_row_of_faults() -> None:
+    table = campaign(n=POSES)[1]
+    late = (table.marker == 1) & (table.time > 0.9 * table.time.max())
+    position = table.position + 1e-3 * late[:, None]
+    scene = scene_with(replace(table, position=position))
+    found = screen(scene, scene.data)
+    assert late.sum() > 8
+    assert not (found.faulty & late).any()
+
+
+def test_the_error_of_a_reading_is_against_the_fit_to_all_others() -> None:
+    """uᵢᵀP_ii⁻¹u_i falls by as much as the residuals' squares do when reading i is left out."""
+    scene = clean()
+    _, _, noise = screened(scene)
+    at = project(scene.data, noise)
+    found = reading_errors(scene, at)
+
+    def squares(at_data) -> float:
+        p = project(at_data, noise)
+        return float((p.u * at_data.masked(at_data.r)).sum())
+
+    for i in (0, 17, 200):
+        mask = np.arange(scene.blocks.n) == i
+        fall = squares(scene.data) - squares(scene.data.without(mask))
+        assert found[i] == pytest.approx(fall, rel=1e-4, abs=1e-4)
+
+
+def test_errors_of_good_readings_follow_chi_squared() -> None:
+    found = reading_errors(clean(), project(clean().data, screened(clean())[2]))
+    assert found.mean() == pytest.approx(3.0, rel=0.15)
+
+
+@pytest.mark.parametrize("name", ["thermal_expansion:link2", "off_axis_compliance:joint3"])
+def test_readings_that_looked_faulty_before_their_effect_was_found_are_taken_back(
+    name: str,
+) -> None:
+    """All readings are Gaussian, whatever the arm does: none is faulty once that is known."""
+    assert diagnosed(name).noise.faulty == ()

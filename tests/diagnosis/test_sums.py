@@ -1,0 +1,68 @@
+"""Sums over an entry's columns against the columns formed one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.diagnosis_data import random_blocks, random_data
+
+from elastocal.diagnosis import sums
+from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.sums import EntrySums, VisitPlaces, direct
+
+NOISE = NoiseValues(1.1, np.array([4e-6, 9e-6, 1e-5]), 0.5)
+SEEDS = range(4)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_every_observation_stands_in_the_place_of_its_visit(seed: int) -> None:
+    blocks = random_blocks(seed)
+    places = VisitPlaces.of(blocks)
+    assert (places.example >= 0).sum() == len(np.unique(blocks.visit))
+    for c, member in enumerate(blocks.member):
+        for a, i in enumerate(member):
+            hot = places.one_hot[c, 3 * a]
+            if i == blocks.n:
+                assert (hot == 0).all()
+            else:
+                assert hot.sum() == 1
+                assert blocks.visit[places.example[c, hot.argmax()]] == blocks.visit[i]
+
+
+def test_a_visit_gathers_what_its_observations_share_and_nothing_where_there_is_none() -> None:
+    blocks = random_blocks(2)
+    places = VisitPlaces.of(blocks)
+    gathered = places.gather(1.0 + blocks.visit)
+    assert (gathered[places.example < 0] == 0).all()
+    at = places.one_hot @ gathered[..., None]
+    packed = blocks.pack(np.repeat(1.0 + blocks.visit[:, None, None], 3, axis=1))
+    np.testing.assert_array_equal(at, packed)
+
+
+@pytest.mark.parametrize(("d", "k"), [(1, 1), (1, 2), (3, 2), (6, 4)])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_driven_groups_are_groups_of_the_columns_they_stand_for(
+    seed: int, d: int, k: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = random_data(seed)
+    places, at = VisitPlaces.of(data.blocks), project(data, NOISE)
+    rng = np.random.default_rng((seed, 5))
+    E = data.masked(1e-5 * rng.normal(size=(*data.r.shape, d)))
+    C, v = places.example.shape
+    D = rng.normal(size=(5, C, v, d, k))
+    D[3] = 0.0
+    entry = EntrySums.of(E, places, at)
+    found = entry.driven(D)
+    signs = rng.choice([-1.0, 1.0], (4, C))
+    for g in range(5):
+        columns = np.einsum("cmd,cmv,cvdk->cmk", E, places.one_hot, D[g])
+        expected = direct(columns, at)
+        np.testing.assert_allclose(
+            found.lam[g], expected.lam[0], rtol=1e-8, atol=1e-9 * found.lam[g].max()
+        )
+        np.testing.assert_allclose(found.evidence()[g], expected.evidence()[0], atol=1e-8)
+        np.testing.assert_allclose(
+            found.flipped(signs)[:, g], expected.flipped(signs)[:, 0], atol=1e-8
+        )
+    monkeypatch.setattr(sums, "PIECE", 1)
+    np.testing.assert_allclose(entry.driven(D).evidence(), found.evidence(), atol=1e-9)
