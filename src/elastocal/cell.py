@@ -98,6 +98,7 @@ class ModelSpec:
     compliance_levels: dict[str, tuple[float, ...]] = field(default_factory=dict)
     gear_ripple_orders: tuple[float, ...] = ()
     thermal_driver: Literal["time", "temperature"] = "time"
+    play_side: Literal["load", "load_and_approach"] = "load"
     nominal: Nominal = field(default_factory=Nominal)
 
 

@@ -172,6 +172,7 @@ def _model(path: Path, table: ModelTable, known_effects: tuple[str, ...] | None)
         compliance_levels=levels,
         gear_ripple_orders=tuple(table.gear_ripple_orders or ()),
         thermal_driver=table.thermal_driver or "time",
+        play_side=table.play_side or "load",
         nominal=_nominal(table.nominal or NominalTable()),
     )
 

@@ -83,6 +83,7 @@ class ModelTable(Table):
     )
     gear_ripple_orders: list[Positive] | None = key("a list of positive numbers")
     thermal_driver: Literal["time", "temperature"] | None = key('"time" or "temperature"')
+    play_side: Literal["load", "load_and_approach"] | None = key('"load" or "load_and_approach"')
     nominal: NominalTable | None = key("a table")
 
 

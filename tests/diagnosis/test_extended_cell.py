@@ -129,7 +129,9 @@ def test_the_model_gains_the_parameters_of_the_effects_and_no_others(tmp_path):
     source = tmp_path / "cell.toml"
     source.write_text('[robot]\nurdf = "arm.urdf"\n[model]\neffects = ["base_frame"]\n')
     (tmp_path / "out").mkdir()
-    cell = write_extended_cell(source, tmp_path / "out" / "cell.toml", (ECCENTRICITY, JUMP))
+    keys = {"play_side": "load_and_approach"}
+    cell = write_extended_cell(source, tmp_path / "out" / "cell.toml", (ECCENTRICITY, JUMP), keys)
+    assert cell.model.play_side == "load_and_approach"
     names = set(Model.from_cell(cell).names)
     before = set(Model.from_cell(read_cell(source)).names)
     assert names - before == {p.name for f in (ECCENTRICITY, JUMP) for p in f.parameters}

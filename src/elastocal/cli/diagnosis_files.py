@@ -64,7 +64,7 @@ def write_diagnosis(
     if outputs.cell is not None:
         from elastocal.diagnosis.extended_cell import write_extended_cell
 
-        write_extended_cell(cell, outputs.cell, diagnosis.effects)
+        write_extended_cell(cell, outputs.cell, diagnosis.effects, diagnosis.model_keys)
         added = ", ".join(f"{f.effect}:{f.where}" for f in diagnosis.effects)
         told.append(f"wrote {outputs.cell} with {added or 'no further effect'}")
     return told

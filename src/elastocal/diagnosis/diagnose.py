@@ -20,6 +20,7 @@ from elastocal.diagnosis.locate import location, structure_tests
 from elastocal.diagnosis.model_set import fit_set
 from elastocal.diagnosis.noise import fit_noise
 from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.diagnosis.recorded_drivers import model_keys, with_recorded_drivers
 from elastocal.diagnosis.refit import refit
 from elastocal.diagnosis.result import Diagnosis, Finding
 from elastocal.diagnosis.scene import Scene, scene_of
@@ -56,6 +57,7 @@ def diagnose(
     options = options or DiagnosisOptions()
     check_table(model, table)
     _check_enough(table)
+    model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")
     base = fit_baseline(model, table, options.seed)
     hypotheses, untested = possible(model, table, options.without)
@@ -107,6 +109,7 @@ def diagnose(
         warnings=warnings(scene, found, screened),
         n_readings=scene.blocks.n,
         n_configurations=len(scene.blocks.member),
+        model_keys=model_keys(model, findings),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,19 @@ PATHS = (
 )
 
 
-def write_extended_cell(source: str | Path, target: str | Path, found: Sequence[Finding]) -> Cell:
+def write_extended_cell(
+    source: str | Path,
+    target: str | Path,
+    found: Sequence[Finding],
+    model_keys: Mapping[str, str] | None = None,
+) -> Cell:
     """Write the cell file `source` to `target` with the effects `found` switched on; read it back.
 
     Each effect joins `[model] effects` as "effect:where", its searched constants join
     `[model.nominal.settings]`.  Relative paths are rewritten so that they lead from `target`'s
     folder to the same files; a cell without a name keeps the one that its old file gave it.
-    Comments are not carried over.  Without effects the model is the one that was read.
+    `model_keys` join [model] as they are.  Comments are not carried over.  Without effects the
+    model is the one that was read.
 
     Raises InputError where `source` is no valid cell file or `target` cannot be written.
     """
@@ -43,6 +49,7 @@ def write_extended_cell(source: str | Path, target: str | Path, found: Sequence[
     _redirect(data, source.parent, target.parent)
     if found:
         _switch_on(data.setdefault("model", {}), found)
+        data["model"] |= dict(model_keys or {})
     atomic_write_text(target, tomli_w.dumps(data))
     return read_cell(target)
 

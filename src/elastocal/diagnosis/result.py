@@ -193,3 +193,5 @@ class Diagnosis:
     n_readings: int = 0
     n_configurations: int = 0
     extra: ExtraPlan | None = field(default=None)
+    # Keys of [model] that the effects found rest on, beyond their own names.
+    model_keys: dict[str, str] = field(default_factory=dict)

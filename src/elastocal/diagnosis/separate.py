@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from elastocal.diagnosis import separate_advice as advice
 from elastocal.diagnosis.baseline import Baseline, fit_baseline
+from elastocal.diagnosis.recorded_drivers import with_recorded_drivers
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.diagnosis.separate_contest import Contest
 from elastocal.diagnosis.separate_order import measuring_order
@@ -61,6 +62,7 @@ def plan_extra(
         notes.append("torques of poses not measured yet are computed from load and weights")
     suspects = Suspects(model, table, diagnosis)
     progress("extra poses: fitting the model as it is")
+    model = with_recorded_drivers(model, table)
     base = fit_baseline(model, table, seed)
     progress("extra poses: drawing candidates")
     try:
