@@ -10,6 +10,7 @@ import pytest
 from support.diagnosis_data import campaign
 
 from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.found import Found, Slot
 from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.model_set import Item, fit_set, packed_columns
@@ -17,7 +18,7 @@ from elastocal.diagnosis.noise import NoiseValues, covariance, project
 from elastocal.diagnosis.prior import Prior
 from elastocal.diagnosis.scan import scan
 from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.search import Found, Search, Slot, base_score
+from elastocal.diagnosis.search import Search, base_score
 from elastocal.diagnosis.sums import direct
 
 TRIED = ("gear_eccentricity", "encoder_scale", "encoder_jump", "marker_slip", "hysteresis")

@@ -23,8 +23,7 @@ def signal_of(scene: Scene, chosen: ModelSet, k: int) -> tuple[Array, NoisyData]
         scene, replace(chosen, items=chosen.without(k)), scales[:k] + scales[k + 1 :]
     )
     at = chosen.at
-    data = chosen.data
-    mean = at.beta_deviation.T @ np.einsum("cmp,cm->p", at.H, data.masked(data.r))
+    mean = at.beta
     columns = [packed_columns(scene, item) for item in chosen.items]
     widths = [C.shape[2] for C in columns]
     stop = len(mean) - sum(widths[k + 1 :])

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.heldout import left_out_residual, noise_rms, rms_with_interval
 from elastocal.diagnosis.model_set import ModelSet, fit_columns
 from elastocal.diagnosis.noise import NoisyData, project
 from elastocal.diagnosis.result import Gap, Step
 from elastocal.diagnosis.scene import Scene
-from elastocal.diagnosis.search import Found
 from elastocal.identification.solve import PLACED_EFFECTS
 from elastocal.manipulator.effects import CATALOGUE
 

@@ -69,8 +69,7 @@ class _Draws:
         at, data = chosen.at, chosen.data
         self.X, self.r = data.masked(data.X), data.masked(data.r)
         self.factor = at.factor
-        z = np.einsum("cmp,cm->p", at.H, self.r)
-        self.mean = linalg.solve_triangular(self.factor, z, lower=True, trans="T")
+        self.mean = at.beta
 
     def __call__(self, rng: np.random.Generator) -> Array:
         spread = linalg.solve_triangular(

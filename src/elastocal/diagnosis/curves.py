@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.estimate import item_width, posterior_mean
+from elastocal.diagnosis.estimate import item_width
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet
 from elastocal.diagnosis.result import Curve
@@ -21,7 +21,7 @@ AXES = {1: ("",), 3: (" x", " y", " z"), 6: (" x", " y", " z", " rx", " ry", " r
 def curves_of(scene: Scene, chosen: ModelSet) -> tuple[Curve, ...]:
     """Curves of the unknown blocks that depend on one number, the largest components first."""
     at = chosen.at
-    mean = posterior_mean(chosen)
+    mean = at.beta
     out: list[Curve] = []
     first = scene.data.X.shape[2]
     for item in chosen.items:

@@ -13,6 +13,7 @@ from elastocal.diagnosis.confirm import Shrinkage, shrinkage
 from elastocal.diagnosis.curves import curves_of
 from elastocal.diagnosis.extend import settings_of
 from elastocal.diagnosis.floor import noise_floor
+from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.listing import candidates, too_small, warnings
@@ -25,7 +26,7 @@ from elastocal.diagnosis.refit import refit
 from elastocal.diagnosis.result import Diagnosis, Finding
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.screen import screen
-from elastocal.diagnosis.search import Found, Search
+from elastocal.diagnosis.search import Search
 from elastocal.diagnosis.uncertain_settings import between_visits, other_settings
 from elastocal.diagnosis.verdict import Answer, judge
 from elastocal.errors import InsufficientDataError

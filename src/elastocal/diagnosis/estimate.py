@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, columns_of
 from elastocal.diagnosis.scene import Scene
 
-Array = NDArray[np.float64]
-
-
-def posterior_mean(chosen: ModelSet) -> Array:
-    """Mean (p,) of the coefficients of the set's data: fitted columns first, then the items'."""
-    at, data = chosen.at, chosen.data
-    return np.asarray(at.beta_deviation.T @ np.einsum("cmp,cm->p", at.H, data.masked(data.r)))
-
 
 def linear_estimates(scene: Scene, chosen: ModelSet) -> dict[str, float]:
     """Linear estimates of the known items' parameters by name."""
-    mean = posterior_mean(chosen)
+    mean = chosen.at.beta
     first = scene.data.X.shape[2]
     out: dict[str, float] = {}
     for item in chosen.items:

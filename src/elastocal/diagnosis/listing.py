@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.result import Candidate, Untested
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.screen import Screened
-from elastocal.diagnosis.search import Found
 from elastocal.diagnosis.verdict import Answer
 
 DETECTABLE = 1.0  # standard deviations: below, a typical size does not move the data

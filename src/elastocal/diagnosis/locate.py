@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.result import Location, StructureTest
 from elastocal.diagnosis.scan import Scan
-from elastocal.diagnosis.search import Found
 
 
 def structure_tests(seen: Scan) -> tuple[StructureTest, ...]:

@@ -134,9 +134,7 @@ def _within_bounds(
     if not any(bounded):
         return 0.0
     at = project(data, noise)
-    root = at.beta_deviation
-    mean = root.T @ np.einsum("cmp,cm->p", at.H, data.masked(data.r))
-    deviation = np.linalg.norm(root, axis=0)
+    deviation = np.linalg.norm(at.beta_deviation, axis=0)
     total, first = 0.0, scene.data.X.shape[2]
     for item in items:
         what = item.what
@@ -145,7 +143,7 @@ def _within_bounds(
             continue
         for k, p in enumerate(what.parameters):
             if p.lower == p.nominal:
-                z = mean[first + k] / deviation[first + k]
+                z = at.beta[first + k] / deviation[first + k]
                 total += float(np.log(2) + log_ndtr(z))
         first += len(what.parameters)
     return total

@@ -115,13 +115,14 @@ class Projection:
     """The data under one noise: V⁻¹ (C, m, m), H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
 
     P = V⁻¹ − HHᵀ; `u` = P r = V⁻¹e (C, m) with the fit's residual e = r − Xβ̂; `h` (C, p) each
-    block's Hᵀe.  `marginal` is the log marginal likelihood ℓ.
+    block's Hᵀe, `beta` (p,) the posterior mean β̂.  `marginal` is the log marginal likelihood ℓ.
     """
 
     inverse: Array
     H: Array
     u: Array
     h: Array
+    beta: Array
     marginal: float
     factor: Array
 
@@ -151,7 +152,7 @@ def project(data: NoisyData, noise: NoiseValues) -> Projection:
     minus_two = log_det + squares + data.n_rows * float(np.log(2 * np.pi))
     beta = linalg.solve_triangular(factor, z, lower=True, trans="T")
     h = (H.transpose(0, 2, 1) @ (r - X @ beta)[..., None])[..., 0]
-    return Projection(inverse, H, Vr - H @ z, h, -0.5 * minus_two, factor)
+    return Projection(inverse, H, Vr - H @ z, h, beta, -0.5 * minus_two, factor)
 
 
 def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:

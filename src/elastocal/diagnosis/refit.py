@@ -42,8 +42,7 @@ def refit(scene: Scene, chosen: ModelSet) -> dict[tuple[str, str], tuple[FittedP
         X=scene.blocks.pack(B), precision=np.ones(B.shape[2]),
     )  # fmt: skip
     fit = project(data, chosen.noise)
-    step = fit.beta_deviation.T @ np.einsum("cmp,cm->p", fit.H, data.masked(data.r))
-    x = base.x - away(base) + width * step
+    x = base.x - away(base) + width * fit.beta
     std = width * np.linalg.norm(fit.beta_deviation, axis=0)
     out: dict[tuple[str, str], list[FittedParameter]] = {}
     for k, p in enumerate(model.parameters):

@@ -126,8 +126,7 @@ def describe_faulty(scene: Scene, data: NoisyData, noise: NoiseValues) -> tuple[
     if not out.any():
         return ()
     at = project(data, noise)
-    beta = at.beta_deviation.T @ np.einsum("cmp,cm->p", at.H, data.masked(data.r))
-    e = blocks.unpack((data.r - data.X @ beta)[..., None])[:, :, 0]
+    e = blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
     sigma = np.sqrt(np.einsum("nii->ni", blocks.unpack_square(data.covariance)) * noise.factor**2)
     table, lead = scene.base.seen.table, scene.base.seen.lead
     return tuple(

@@ -43,7 +43,7 @@ def best_imitations(
         C = data.masked(packed_columns(scene, item))
         both = data.with_columns(C, np.ones(C.shape[2]))
         at = project(both, noise)
-        fitted = at.beta_deviation.T @ np.einsum("cmp,cm->p", at.H, both.masked(both.r))
+        fitted = at.beta
         signal = C @ fitted[data.X.shape[2] :]
         at = project(replace(data, r=signal), noise)
         for b, h in others.items():

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.alike import distances, item_key
+from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item
 from elastocal.diagnosis.result import EffectAt, Verdict
-from elastocal.diagnosis.search import Found
 
 Array = NDArray[np.float64]
 
