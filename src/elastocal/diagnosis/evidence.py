@@ -33,6 +33,16 @@ class Spectrum:
     beta: Array
     parts: Array
 
+    @classmethod
+    def joined(cls, pieces: list[Spectrum]) -> Spectrum:
+        """The groups of several spectra as one."""
+        if len(pieces) == 1:
+            return pieces[0]
+        return cls(
+            np.concatenate([s.lam for s in pieces]), np.concatenate([s.beta for s in pieces]),
+            np.concatenate([s.parts for s in pieces], axis=1),
+        )  # fmt: skip
+
     @property
     def distance(self) -> Array:
         """d (V,): what the group's typical size moves the data, √tr A, in standard deviations."""

@@ -17,6 +17,8 @@ from elastocal.diagnosis.sums import EntrySums, direct
 
 Array = NDArray[np.float64]
 
+HELD = 2_000_000  # settings times visits whose drives are held at a time
+
 
 @dataclass
 class Grams:
@@ -39,8 +41,11 @@ class Grams:
             return direct(self.data.masked(self.scene.packed(h, np.zeros(0))), self.at)
         if settings is None:
             settings = self.scene.grids[h.name, h.where].values
-        key = entry_key(h, self.scene.base.model)
-        return self.entry(key).driven(self.scene.drive(h, settings))
+        sums = self.entry(entry_key(h, self.scene.base.model))
+        # A large table's drives at thousands of settings do not fit into memory at once.
+        each = max(1, HELD // self.scene.present.size)
+        pieces = [settings[i : i + each] for i in range(0, len(settings), each)]
+        return Spectrum.joined([sums.driven(self.scene.drive(h, piece)) for piece in pieces])
 
     def of_block(self, g: Generic) -> Spectrum:
         if g.columns is not None:

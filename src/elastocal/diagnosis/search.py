@@ -21,7 +21,9 @@ Array = NDArray[np.float64]
 FLIPS = 199
 CLOSE = 6  # candidates whose noise is fitted for themselves
 HOPELESS = -6.0  # score below which none is
-FAR_BEHIND = 60.0  # and how far behind the best: noise of its own makes up for less
+# How far behind the best one is not worth a noise of its own: under noise that an effect still
+# missing has swollen, and under the noise of a set that is complete but for the item in question.
+FAR_BEHIND, BEHIND_COMPLETE = 60.0, 20.0
 # Probability that nothing (more) is there above which nothing is claimed.
 DOUBT, DOUBT_MORE = 0.5, 0.05
 CLOSE_BLOCKS = 3
@@ -148,12 +150,14 @@ class Search:
             return Prior.of(self.scene.hypotheses, self.generic)
         return Prior.of(self.scene.hypotheses, self.generic, something)
 
-    def _best_addition(self, current: ModelSet, seen: Scan) -> tuple[ModelSet | None, Slot]:
+    def _best_addition(
+        self, current: ModelSet, seen: Scan, behind: float = FAR_BEHIND
+    ) -> tuple[ModelSet | None, Slot]:
         """The best set with one item more (None: none is better), and the slot it fills."""
         options = self._options(current, seen)
         slot = Slot(tuple(item for item, _ in options), np.array([s for _, s in options]))
         base = current.score
-        close = self._close(slot)
+        close = self._close(slot, behind)
         best: ModelSet | None = None
         scores = slot.scores.copy()
         for k in close:
@@ -192,11 +196,11 @@ class Search:
             self._fitted[key] = refine(self.scene, fitted, len(items) - 1)
         return self._fitted[key]
 
-    def _close(self, slot: Slot) -> NDArray[np.int64]:
+    def _close(self, slot: Slot, behind: float) -> NDArray[np.int64]:
         known = np.array([item.known for item in slot.items])
         order = np.argsort(-slot.scores, kind="stable")
         order = order[slot.scores[order] > HOPELESS]
-        near = slot.scores[order] > slot.scores[order[:1]].max(initial=-np.inf) - FAR_BEHIND
+        near = slot.scores[order] > slot.scores[order[:1]].max(initial=-np.inf) - behind
         order = order[near]
         hypotheses = order[known[order]][:CLOSE]
         blocks = order[~known[order]][:CLOSE_BLOCKS]
@@ -212,7 +216,7 @@ class Search:
             while k < len(current.items):
                 others = fit_set(self.scene, current.without(k), current.noise)
                 beside = self._scan(others, current.noise)
-                best, slot = self._best_addition(others, beside)
+                best, slot = self._best_addition(others, beside, BEHIND_COMPLETE)
                 slots[k] = slot
                 if best is None:  # no longer needed
                     current, changed = others, True

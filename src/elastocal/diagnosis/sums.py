@@ -90,11 +90,7 @@ class EntrySums:
         """Spectrum of the groups with drives D (V, C, v, d, k)."""
         V, C, v, d, k = D.shape
         each = max(1, PIECE // (C * v * d * k * max(k, v * d)))
-        pieces = [self._driven(D[i : i + each]) for i in range(0, V, each)]
-        return Spectrum(
-            np.concatenate([s.lam for s in pieces]), np.concatenate([s.beta for s in pieces]),
-            np.concatenate([s.parts for s in pieces], axis=1),
-        )  # fmt: skip
+        return Spectrum.joined([self._driven(D[i : i + each]) for i in range(0, V, each)])
 
     def _driven(self, D: Array) -> Spectrum:
         V, C, v, d, k = D.shape
