@@ -9,7 +9,8 @@ data:
 
 What is drawn as the truth is at times a rival or nothing, as probable as each is, which
 charges the interval for the selection.  The remaining fraction is the ratio of the rms errors,
-with configurations weighted at random (Bayesian bootstrap, Rubin 1981) for the choice of poses.
+with configurations weighted at random (Bayesian bootstrap, Rubin 1981) for the choice of poses,
+and a set of FRESH poses drawn by these weights.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from scipy import linalg
 
 from elastocal.diagnosis.heldout import left_out_residual, squared_lengths
 from elastocal.diagnosis.model_set import ModelSet
+from elastocal.diagnosis.noise import project
 
 Array = NDArray[np.float64]
 
 DRAWS = 400
+FRESH = 100  # poses of the fresh set that the intervals are for
 
 
 @dataclass(frozen=True)
@@ -47,19 +50,29 @@ def shrinkage(
     makes in the pause in which it happened: a fresh pose may fall on the wrong side of it.
     """
     data = before.data
-    missed = [s.data.masked(left_out_residual(s.at)) for s in (before, after)]
+    missed = [_missed(s) for s in (before, after)]
     weights = np.array([p for _, p in truths])
     which = rng.choice(len(truths), DRAWS, p=weights / weights.sum())
     ratios = np.empty(DRAWS)
     draws = {k: _Draws(truths[k][0]) for k in np.unique(which)}
     for d in range(DRAWS):
         noise = draws[which[d]](rng)
-        configurations = rng.dirichlet(np.ones(len(noise)))
+        configurations = rng.multinomial(FRESH, rng.dirichlet(np.ones(len(noise)))) / FRESH
         squares = [float(configurations @ squared_lengths(data, noise - e)[0]) for e in missed]
         squares[1] += between * rng.random()
         ratios[d] = 1 - np.sqrt(squares[1] / max(squares[0], 1e-300))
     low95, low90, middle, high90, high95 = np.quantile(ratios, [0.025, 0.05, 0.5, 0.95, 0.975])
     return Shrinkage(float(middle), (float(low90), float(high90)), (float(low95), float(high95)))
+
+
+def _missed(chosen: ModelSet) -> Array:
+    """Left-out residuals (C, m) of a fit weighted by the instrument's noise alone.
+
+    That is what a calibration does that knows nothing of the joints' scatter; and the scatter
+    fitted beside a missing effect is the effect, which weights by it would spare.
+    """
+    at = project(chosen.data, chosen.noise.of_instrument())
+    return chosen.data.masked(left_out_residual(at))
 
 
 class _Draws:

@@ -15,6 +15,7 @@ data do not show near its usual size.  ∂(−2ℓ)/∂θ = tr(P V_θ) − rᵀP
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,10 @@ class NoiseValues:
     def usual(cls, joints: int) -> NoiseValues:
         """What one expects before any reading: noise as stated, joints as good as usual."""
         return cls(1.0, np.full(joints, REPEATABILITY), SHARED)
+
+    def of_instrument(self) -> NoiseValues:
+        """The instrument's part alone: joints that repeat exactly."""
+        return NoiseValues(self.factor, np.full(len(self.joint), SMALLEST), SHARED)
 
     def logs(self) -> Array:
         return np.log(np.concatenate([[self.factor, self.shared], self.joint]))
@@ -114,22 +119,39 @@ def covariance(data: NoisyData, noise: NoiseValues) -> Array:
 class Projection:
     """The data under one noise: V⁻¹ (C, m, m), H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
 
-    P = V⁻¹ − HHᵀ; `u` = P r = V⁻¹e (C, m) with the fit's residual e = r − Xβ̂; `h` (C, p) each
-    block's Hᵀe, `beta` (p,) the posterior mean β̂.  `marginal` is the log marginal likelihood ℓ.
+    P = V⁻¹ − HHᵀ; `u` = P r (C, m); `beta` (p,) the posterior mean β̂; `marginal` the log marginal
+    likelihood ℓ.
     """
 
     inverse: Array
     H: Array
     u: Array
-    h: Array
     beta: Array
     marginal: float
     factor: Array
+
+    @cached_property
+    def spread(self) -> tuple[Array, Array]:
+        """V⁻¹e and Hᵀe, (C, m) and (C, p), of residuals e that scatter as the noise does.
+
+        The fit's own residuals are too small, its leverage less than V: u_c has the covariance
+        P_cc, so e_c = V_c^½ P_cc^−½ u_c has V_c (Bell and McCaffrey 2002).
+        """
+        P = self.inverse - self.H @ self.H.transpose(0, 2, 1)
+        e = _power(self.inverse, -0.5) @ (_power(P, -0.5) @ self.u[..., None])
+        return (self.inverse @ e)[..., 0], (self.H.transpose(0, 2, 1) @ e)[..., 0]
 
     @property
     def beta_deviation(self) -> Array:
         """L⁻¹ (p, p): the posterior covariance of β is L⁻ᵀL⁻¹."""
         return linalg.solve_triangular(self.factor, np.eye(len(self.factor)), lower=True)
+
+
+def _power(blocks: Array, exponent: float) -> Array:
+    """Symmetric powers of positive definite matrices (C, m, m)."""
+    values, vectors = np.linalg.eigh(blocks)
+    values = np.maximum(values, ROUNDING * values[:, -1:]) ** exponent
+    return np.asarray((vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1))
 
 
 def project(data: NoisyData, noise: NoiseValues) -> Projection:
@@ -151,8 +173,7 @@ def project(data: NoisyData, noise: NoiseValues) -> Projection:
     squares = float(r.ravel() @ Vr.ravel() - z @ z)
     minus_two = log_det + squares + data.n_rows * float(np.log(2 * np.pi))
     beta = linalg.solve_triangular(factor, z, lower=True, trans="T")
-    h = (H.transpose(0, 2, 1) @ (r - X @ beta)[..., None])[..., 0]
-    return Projection(inverse, H, Vr - H @ z, h, beta, -0.5 * minus_two, factor)
+    return Projection(inverse, H, Vr - H @ z, beta, -0.5 * minus_two, factor)
 
 
 def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:

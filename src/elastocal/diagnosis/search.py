@@ -24,8 +24,10 @@ HOPELESS = -6.0  # score below which none is
 # How far behind the best one is not worth a noise of its own: under noise that an effect still
 # missing has swollen, and under the noise of a set that is complete but for the item in question.
 FAR_BEHIND, BEHIND_COMPLETE = 60.0, 20.0
-# Probability that nothing (more) is there above which nothing is claimed.
-DOUBT, DOUBT_MORE = 0.5, 0.05
+# Probability that nothing (more) is there above which nothing is claimed.  For a first effect the
+# flips keep the false alarms at their level; many weak candidates together may make it probable
+# that there is something, though none of them is probable by itself.
+DOUBT, DOUBT_MORE = 0.7, 0.05
 CLOSE_BLOCKS = 3
 CLEARLY = 10.0  # nats by which several named effects must beat fewer without a name
 PART = 0.3
@@ -153,7 +155,10 @@ class Search:
     def _best_addition(
         self, current: ModelSet, seen: Scan, behind: float = FAR_BEHIND
     ) -> tuple[ModelSet | None, Slot]:
-        """The best set with one item more (None: none is better), and the slot it fills."""
+        """The best set with one item more (None: none is worth it), and the slot it fills.
+
+        Beside other items it has to be better than the set without it.
+        """
         options = self._options(current, seen)
         slot = Slot(tuple(item for item, _ in options), np.array([s for _, s in options]))
         base = current.score
@@ -169,7 +174,7 @@ class Search:
             scores[k] = fitted.score - base
             if best is None or fitted.score > best.score:
                 best = fitted
-        if best is not None and best.score <= base:
+        if best is not None and current.items and best.score <= base:
             best = None
         return best, Slot(slot.items, scores)
 

@@ -64,12 +64,13 @@ class VisitPlaces:
 class EntrySums:
     """Of one entry under one noise: `local` (C, v, d, v, d), `H` (p, C, v, d), `b` (C, v, d).
 
-    `h` (C, p) is the projection's.
+    `flip` (C, v, d) and `h` (C, p) are of residuals whose signs may be flipped.
     """
 
     local: Array
     H: Array
     b: Array
+    flip: Array
     h: Array
 
     @classmethod
@@ -81,9 +82,10 @@ class EntrySums:
         local = wide.transpose(0, 2, 1) @ (at.inverse @ wide)
         H = at.H.transpose(0, 2, 1) @ wide  # (C, p, v·d)
         b = np.einsum("cmk,cm->ck", wide, at.u)
+        flip = np.einsum("cmk,cm->ck", wide, at.spread[0])
         return cls(
             local.reshape(C, v, d, v, d), H.transpose(1, 0, 2).reshape(-1, C, v, d),
-            b.reshape(C, v, d), at.h,
+            b.reshape(C, v, d), flip.reshape(C, v, d), at.spread[1],
         )  # fmt: skip
 
     def driven(self, D: Array) -> Spectrum:
@@ -100,8 +102,9 @@ class EntrySums:
         A = flat.reshape(V, -1, k).transpose(0, 2, 1) @ moved.reshape(V, -1, k)
         Z = self.H.reshape(len(self.H), -1) @ flat.reshape(V, -1, k)
         A = A - Z.transpose(0, 2, 1) @ Z
-        parts = np.einsum("gcik,ci->cgk", flat, self.b.reshape(C, -1))
-        return spectrum(A, parts.sum(axis=0), parts - np.tensordot(self.h, Z, (1, 1)))
+        b = np.einsum("gcik,ci->gk", flat, self.b.reshape(C, -1))
+        parts = np.einsum("gcik,ci->cgk", flat, self.flip.reshape(C, -1))
+        return spectrum(A, b, parts - np.tensordot(self.h, Z, (1, 1)))
 
 
 def _times(local: Array, flat: Array) -> Array:
@@ -121,5 +124,7 @@ def direct(C: Array, at: Projection) -> Spectrum:
     k = C.shape[2]
     A = C.reshape(-1, k).T @ (at.inverse @ C).reshape(-1, k)
     Z = at.H.reshape(-1, at.H.shape[2]).T @ C.reshape(-1, k)
-    parts = np.einsum("cmk,cm->ck", C, at.u)
-    return spectrum((A - Z.T @ Z)[None], parts.sum(axis=0)[None], (parts - at.h @ Z)[:, None, :])
+    u, h = at.spread
+    b = np.einsum("cmk,cm->k", C, at.u)
+    parts = np.einsum("cmk,cm->ck", C, u) - h @ Z
+    return spectrum((A - Z.T @ Z)[None], b[None], parts[:, None, :])

@@ -70,7 +70,9 @@ def judge(found: Found) -> Answer:
 def _of_item(found: Found, k: int, item: Item) -> tuple[float, tuple[tuple[Item, float], ...]]:
     """Probability of item k, and it with those that it may be instead."""
     slot = found.slots[k]
-    each, _ = slot.probabilities()
+    each, nothing = slot.probabilities()
+    # That there is something has been decided; now it is only what.
+    each = each / (1 - nothing)
     own = next(i for i, other in enumerate(slot.items) if other.same_as(item))
     if not item.known:
         return float(each[own]), ((item, float(each[own])),)
