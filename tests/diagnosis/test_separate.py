@@ -128,7 +128,7 @@ def test_rivals_that_stay_alike_are_planned_for_as_one(narrow) -> None:
 
 def test_the_side_of_approach_is_chosen_where_rivals_depend_on_it() -> None:
     """Approached from one side only, hysteresis is an offset of the joint times its load."""
-    pair = {("hysteresis", "joint3"): 0.5, ("backlash", "joint3"): 0.5}
+    pair = {("hysteresis", "joint3"): 0.5, ("joint_hardening", "joint3"): 0.5}
     model, table = campaign({}, 2.0)
     true = {"joint3.hysteresis": 1e-4}
     sides = np.random.default_rng(5).choice([-1.0, 1.0], (30, 6))

@@ -58,6 +58,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "noise": _noise(d.noise, model.chain.kinds),
         "untested": [vars(u) for u in d.untested],
         "extra_plan": None if d.extra is None else _extra(d.extra),
+        "model_keys": d.model_keys,
         "warnings": list(d.warnings),
         "n_readings": d.n_readings,
         "n_configurations": d.n_configurations,
