@@ -15,6 +15,8 @@ from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]
 
+PLAUSIBLE = 5.0
+
 
 def signal_of(scene: Scene, chosen: ModelSet, k: int) -> tuple[Array, NoisyData]:
     """What item k does to the readings (C, m) at its estimate, and the data without the item."""
@@ -34,8 +36,8 @@ def distances(scene: Scene, chosen: ModelSet, k: int) -> tuple[float, dict[tuple
     """d of item k from nothing, and from each other hypothesis that the data could mean instead.
 
     d² = min over β, γ of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's
-    columns C at its best settings and the widest s of the size prior: in standard deviations,
-    and infinite sizes do not count.
+    columns C at its best settings and s = PLAUSIBLE times the widest of the size prior: in
+    standard deviations.  A rival larger than usual is less probable, but it is no less alike.
     """
     v, data = signal_of(scene, chosen, k)
     at = project(replace(data, r=v), chosen.noise)
@@ -46,7 +48,7 @@ def distances(scene: Scene, chosen: ModelSet, k: int) -> tuple[float, dict[tuple
         if h is chosen.items[k].what:
             continue
         found = grams.of_hypothesis(h)
-        s = float(scales_of(h).max())
+        s = PLAUSIBLE * float(scales_of(h).max())
         explained = (s**2 * found.beta**2 / (1 + s**2 * found.lam)).sum(axis=1).max()
         out[h.name, h.where] = float(np.sqrt(max(whole - float(explained), 0.0)))
     return float(np.sqrt(max(whole, 0.0))), out
