@@ -25,8 +25,7 @@ def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, t
     `scene` is about the fit without further effects.
     """
     nothing, chosen = found.nothing, found.chosen
-    # The nominal arm, base and markers placed: as it is, for weights that know of the joints'
-    # scatter would place it elsewhere.
+    # The nominal arm, base and markers placed, as the baseline left it.
     placed = scene.blocks.pack(scene.base.nominal.reshape(-1, scene.blocks.size, 1))[:, :, 0]
     steps = [Step("base_frame", *rms_with_interval(scene.data, placed, rng))]
     steps += [_step(name, data, nothing, rng) for name, data in _fitted_steps(scene)]
@@ -51,7 +50,9 @@ def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, t
 
 
 def _step(name: str, data: NoisyData, fitted: ModelSet, rng: np.random.Generator) -> Step:
-    residual = left_out_residual(project(data, fitted.noise))
+    # Weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
+    # effect is that effect, and weights by it would spare it.
+    residual = left_out_residual(project(data, fitted.noise.of_instrument()))
     rms, interval = rms_with_interval(data, residual, rng)
     return Step(name, rms, interval)
 
