@@ -85,6 +85,8 @@ def _of_item(found: Found, k: int, item: Item) -> tuple[float, tuple[tuple[Item,
         and id(other.what) not in taken
         and near[item_key(other)] < ALIKE
     ]
+    # More than so many are no answer; the others stand among the candidates.
+    alike = sorted(alike, key=lambda i: -each[i])[: LARGEST_SET - 1]
     p = each.copy()
     if alike and p[own] > ALIKE_PROBABILITY:
         # Their columns are the same in these poses; what separates the scores is only how many
