@@ -73,7 +73,7 @@ def test_what_the_fitted_columns_can_do_has_no_evidence(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_flipped_configurations_are_flipped_residuals_projected_anew(seed: int) -> None:
-    """b = CᵀP(De) with residuals e as large as the noise and D the configurations' signs, P dense."""
+    """b = CᵀP(De), P dense: residuals e as large as the noise, D the configurations' signs."""
     data = random_data(seed)
     C, at = group(data, seed), project(data, NOISE)
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], (6, len(data.r)))
