@@ -74,9 +74,7 @@ def distances(base: Baseline, world: World) -> list[dict[str, Any]]:
 
 
 def _explained(grams: Grams, h: Hypothesis) -> float:
-    found = grams.of_hypothesis(h)
-    s2 = float(scales_of(h).max()) ** 2
-    return float((s2 * found.beta**2 / (1 + s2 * found.lam)).sum(axis=1).max())
+    return float(grams.of_hypothesis(h).explained(float(scales_of(h).max())).max())
 
 
 def _beside(scene: Scene, data: NoisyData, h: Hypothesis, settings: dict[str, float]) -> NoisyData:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, ModelSet, fit_columns, packed_columns
-from elastocal.diagnosis.noise import NoisyData, project
+from elastocal.diagnosis.model_set import Item, ModelSet, beside, packed_columns
+from elastocal.diagnosis.noise import project
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]
@@ -18,18 +18,10 @@ Array = NDArray[np.float64]
 PLAUSIBLE = 5.0
 
 
-def signal_of(scene: Scene, chosen: ModelSet, k: int) -> tuple[Array, NoisyData]:
-    """What item k does to the readings (C, m) at its estimate, and the data without the item."""
-    scales = chosen.scales
-    base = fit_columns(
-        scene, replace(chosen, items=chosen.without(k)), scales[:k] + scales[k + 1 :]
-    )
-    at = chosen.at
-    mean = at.beta
-    columns = [packed_columns(scene, item) for item in chosen.items]
-    widths = [C.shape[2] for C in columns]
-    stop = len(mean) - sum(widths[k + 1 :])
-    return scene.data.masked(columns[k] @ mean[stop - widths[k] : stop]), base
+def signal_of(scene: Scene, chosen: ModelSet, k: int) -> Array:
+    """What item k does to the readings (C, m) at its estimate."""
+    columns = packed_columns(scene, chosen.items[k])
+    return scene.data.masked(columns @ chosen.at.beta[chosen.spans[k]])
 
 
 def distances(scene: Scene, chosen: ModelSet, k: int) -> tuple[float, dict[tuple[str, str], float]]:
@@ -39,7 +31,7 @@ def distances(scene: Scene, chosen: ModelSet, k: int) -> tuple[float, dict[tuple
     columns C at its best settings and s = PLAUSIBLE times the widest of the size prior: in
     standard deviations.  A rival larger than usual is less probable, but it is no less alike.
     """
-    v, data = signal_of(scene, chosen, k)
+    v, data = signal_of(scene, chosen, k), beside(scene, chosen, k)
     at = project(replace(data, r=v), chosen.noise)
     grams = Grams(scene, data, at)
     whole = float((v * at.u).sum())
@@ -49,8 +41,8 @@ def distances(scene: Scene, chosen: ModelSet, k: int) -> tuple[float, dict[tuple
             continue
         found = grams.of_hypothesis(h)
         s = PLAUSIBLE * float(scales_of(h).max())
-        explained = (s**2 * found.beta**2 / (1 + s**2 * found.lam)).sum(axis=1).max()
-        out[h.name, h.where] = float(np.sqrt(max(whole - float(explained), 0.0)))
+        explained = float(found.explained(s).max())
+        out[h.name, h.where] = float(np.sqrt(max(whole - explained, 0.0)))
     return float(np.sqrt(max(whole, 0.0))), out
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.heldout import left_out_residual, noise_rms, rms_with_interval
-from elastocal.diagnosis.model_set import ModelSet, fit_columns
+from elastocal.diagnosis.model_set import ModelSet, with_items
 from elastocal.diagnosis.noise import NoisyData, project
 from elastocal.diagnosis.result import Gap, Step
 from elastocal.diagnosis.scene import Scene
@@ -34,7 +34,7 @@ def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, t
         part = known[: n + 1]
         items = tuple(chosen.items[k] for k in part)
         scales = tuple(chosen.scales[k] for k in part)
-        data = fit_columns(found.scene, replace(chosen, items=items), scales)
+        data = with_items(found.scene, items, scales)
         steps.append(_step(items[-1].label.replace(" at ", ":"), data, chosen, rng))
     # Where the noise model does not fit, the readings still say what scatter they leave.
     left = rms_with_interval(chosen.data, left_out_residual(chosen.at), rng)[0]

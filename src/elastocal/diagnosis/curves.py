@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.estimate import item_width
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet
 from elastocal.diagnosis.result import Curve
@@ -21,19 +20,15 @@ AXES = {1: ("",), 3: (" x", " y", " z"), 6: (" x", " y", " z", " rx", " ry", " r
 def curves_of(scene: Scene, chosen: ModelSet) -> tuple[Curve, ...]:
     """Curves of the unknown blocks that depend on one number, the largest components first."""
     at = chosen.at
-    mean = at.beta
     out: list[Curve] = []
-    first = scene.data.X.shape[2]
-    for item in chosen.items:
-        span = slice(first, first + item_width(scene, item))
-        first = span.stop
+    for item, span in zip(chosen.items, chosen.spans, strict=True):
         block = item.what
         if isinstance(block, Hypothesis) or block.source is None or block.source.values is None:
             continue
         assert block.drive is not None and block.entry is not None
         there = scene.present
         x = block.source.values[there]
-        motion = block.drive[there] @ mean[span]  # (visits, d)
+        motion = block.drive[there] @ at.beta[span]  # (visits, d)
         half = block.drive[there] @ at.beta_deviation.T[span]
         deviation = np.linalg.norm(half, axis=2)
         _, order = np.unique(x, return_index=True)

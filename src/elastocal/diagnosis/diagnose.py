@@ -11,6 +11,7 @@ from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.budget import budget
 from elastocal.diagnosis.confirm import Shrinkage, shrinkage
 from elastocal.diagnosis.curves import curves_of
+from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.extend import settings_of
 from elastocal.diagnosis.floor import noise_floor
 from elastocal.diagnosis.found import Found
@@ -25,7 +26,7 @@ from elastocal.diagnosis.recorded_drivers import model_keys, with_recorded_drive
 from elastocal.diagnosis.refit import refit
 from elastocal.diagnosis.result import Diagnosis, Finding
 from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.screen import screen
+from elastocal.diagnosis.screen import Screened, screen
 from elastocal.diagnosis.search import Search
 from elastocal.diagnosis.uncertain_settings import between_visits, other_settings
 from elastocal.diagnosis.verdict import Answer, judge
@@ -64,23 +65,7 @@ def diagnose(
     hypotheses, untested = possible(model, table, options.without)
     progress("columns of what could be missing")
     scene = scene_of(base, hypotheses)
-    progress("noise floor")
-    screened = screen(scene, scene.data)
-    faulty = screened.faulty
-    progress("searching for what is missing")
-    search = _search(scene.without(faulty), options)
-    found = search.run()
-    if found.chosen.items:
-        # Beside a large effect nothing looks faulty, or the wrong readings do.
-        beside = found.chosen.data.without(np.zeros_like(faulty))
-        screened = screen(found.scene, beside)
-        if (screened.faulty != faulty).any():
-            progress("searching again without faulty readings")
-            faulty = screened.faulty
-            search = _search(scene.without(faulty), options)
-            found = search.run()
-    found = search.settled(found)
-    scene = scene.without(faulty)
+    scene, found, screened = _searched(scene, options, progress)
     answer = judge(found)
     progress("confirming")
     rng = np.random.default_rng(options.seed)
@@ -88,10 +73,8 @@ def diagnose(
     findings = _findings(found, answer, rng)
     tests = structure_tests(found.first)
     chosen = found.chosen
-    p_first = (1 + int((found.first.flipped >= found.first.odds).sum())) / (
-        1 + len(found.first.flipped)
-    )
     nothing = found.slots[0].probabilities()[1]
+    p_first = exceedance(found.first.flipped, found.first.odds)
     return Diagnosis(
         verdict=answer.verdict,
         gap=gap,
@@ -122,6 +105,26 @@ def _unknown(found: Found) -> float:
         blocks = [p for item, p in zip(slot.items, each, strict=True) if not item.known]
         shares.append(float(np.sum(blocks)))
     return max(shares)
+
+
+def _searched(
+    scene: Scene, options: DiagnosisOptions, progress: Progress
+) -> tuple[Scene, Found, Screened]:
+    """What is missing, and the scene without the faulty readings, which are sought twice: beside a
+    large effect nothing looks faulty, or the wrong readings do."""
+    progress("noise floor")
+    screened = screen(scene, scene.data)
+    progress("searching for what is missing")
+    search = _search(scene.without(screened.faulty), options)
+    found = search.run()
+    if found.chosen.items:
+        before = screened.faulty
+        screened = screen(found.scene, found.chosen.data.without(np.zeros_like(before)))
+        if (screened.faulty != before).any():
+            progress("searching again without faulty readings")
+            search = _search(scene.without(screened.faulty), options)
+            found = search.run()
+    return scene.without(screened.faulty), search.settled(found), screened
 
 
 def _search(scene: Scene, options: DiagnosisOptions) -> Search:

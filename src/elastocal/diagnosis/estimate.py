@@ -1,30 +1,33 @@
-"""Linear estimates of a set: posterior means of what its columns stand for."""
+"""Estimates of a set: what its columns stand for, and the fit of the model with them in it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
+from elastocal.diagnosis.baseline import Baseline, fit_baseline
+from elastocal.diagnosis.extend import extended
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, ModelSet, columns_of
+from elastocal.diagnosis.model_set import Item, ModelSet
 from elastocal.diagnosis.scene import Scene
 
 
 def linear_estimates(scene: Scene, chosen: ModelSet) -> dict[str, float]:
-    """Linear estimates of the known items' parameters by name."""
-    mean = chosen.at.beta
-    first = scene.data.X.shape[2]
+    """Posterior means of the known items' parameters by name."""
     out: dict[str, float] = {}
-    for item in chosen.items:
-        count = item_width(scene, item)
+    for item, span in zip(chosen.items, chosen.spans, strict=True):
         if isinstance(item.what, Hypothesis):
-            size = scene.sizes[item.what.name, item.what.where]
-            values = mean[first : first + count] * size
+            values = chosen.at.beta[span] * scene.sizes[item.what.name, item.what.where]
             for p, v in zip(item.what.parameters, values, strict=True):
                 out[f"{item.what.where}.{p.key}"] = float(v) + p.nominal
-        first += count
     return out
 
 
-def item_width(scene: Scene, item: Item) -> int:
-    """Number of columns of an item."""
-    if isinstance(item.what, Hypothesis):
-        return len(item.what.parameters)
-    return columns_of(item.what)
+def fit_extended(scene: Scene, chosen: ModelSet, items: Sequence[Item]) -> Baseline:
+    """The nonlinear fit of the model with `items` of the set in it, from the linear estimate."""
+    base = scene.base
+    model = extended(base.model, items)
+    start = dict(zip(base.model.names, base.x, strict=True)) | linear_estimates(scene, chosen)
+    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
+    return fit_baseline(model, base.seen.table, x0=x0)

@@ -48,6 +48,11 @@ class Spectrum:
         """d (V,): what the group's typical size moves the data, √tr A, in standard deviations."""
         return np.sqrt(self.lam.sum(axis=1))
 
+    def explained(self, scale: float) -> Array:
+        """What each group takes off eᵀPe, its coefficients γ charged with |γ|²/scale² (V,)."""
+        squared = scale**2
+        return np.asarray((squared * self.beta**2 / (1 + squared * self.lam)).sum(axis=1))
+
     def evidence(self, scales: Array = SCALES) -> Array:
         """Log evidence (V,) over the model without the group."""
         return evidence_of(self.lam, self.beta, scales)
@@ -57,6 +62,11 @@ class Spectrum:
         C, V, K = self.parts.shape
         beta = (signs @ self.parts.reshape(C, -1)).reshape(-1, V, K)
         return evidence_of(self.lam, beta, scales)
+
+
+def exceedance(flipped: Array, observed: float) -> float:
+    """p-value of `observed` among what the flips (F,) yield, itself counted as one of them."""
+    return (1 + int((flipped >= observed).sum())) / (1 + len(flipped))
 
 
 def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:

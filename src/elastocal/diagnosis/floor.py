@@ -24,7 +24,7 @@ def noise_floor(scene: Scene, data: NoisyData, noise: NoiseValues) -> NoiseFloor
 def pure_error(scene: Scene) -> float | None:
     """Scatter in m per axis among repeats of the same pose, load and marker; None without any."""
     seen, table = scene.base.seen, scene.base.seen.table
-    out = scene.blocks.unpack(scene.data.left_out[..., None].astype(float))[:, 0, 0] > 0
+    out = scene.data.faulty
     rows = seen.lead[~out]
     force = np.round(table.force[rows], 6)
     key = np.column_stack([table.configuration[rows], table.marker[rows], force])

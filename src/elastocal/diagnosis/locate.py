@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.result import Location, StructureTest
 from elastocal.diagnosis.scan import Scan
@@ -18,12 +19,11 @@ def structure_tests(seen: Scan) -> tuple[StructureTest, ...]:
     if not seen.driver_flips:
         return ()
     largest = np.max(list(seen.driver_flips.values()), axis=0)
-    n = len(largest) + 1
     tests = [
         StructureTest(
             driver,
-            (1 + int((seen.driver_flips[driver] >= odds).sum())) / n,
-            (1 + int((largest >= odds).sum())) / n,
+            exceedance(seen.driver_flips[driver], odds),
+            exceedance(largest, odds),
         )
         for driver, odds in seen.driver_odds.items()
     ]

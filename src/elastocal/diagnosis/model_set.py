@@ -51,6 +51,16 @@ class Item:
     def scales(self) -> Array:
         return scales_of(self.what) if isinstance(self.what, Hypothesis) else SCALES
 
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        if isinstance(self.what, Hypothesis):
+            return len(self.what.parameters)
+        if self.what.columns is not None:
+            return self.what.columns.shape[2]
+        assert self.what.drive is not None
+        return self.what.drive.shape[3]
+
     def same_as(self, other: Item) -> bool:
         return self.what is other.what
 
@@ -77,8 +87,21 @@ class ModelSet:
     def unknown(self) -> bool:
         return any(not item.known for item in self.items)
 
+    @property
+    def spans(self) -> tuple[slice, ...]:
+        """Where each item's coefficients stand among those of the data, last of all."""
+        return spans_of(self.items, self.data.X.shape[2])
+
     def without(self, k: int) -> tuple[Item, ...]:
         return self.items[:k] + self.items[k + 1 :]
+
+
+def spans_of(items: tuple[Item, ...], total: int) -> tuple[slice, ...]:
+    """Where the coefficients of `items` stand, the last of `total`."""
+    ends = total - sum(item.width for item in items) + np.cumsum([i.width for i in items])
+    return tuple(
+        slice(int(end) - item.width, int(end)) for item, end in zip(items, ends, strict=True)
+    )
 
 
 def packed_columns(scene: Scene, item: Item) -> Array:
@@ -99,10 +122,7 @@ def fit_set(scene: Scene, items: tuple[Item, ...], start: NoiseValues | None = N
     columns = [packed_columns(scene, item) for item in items]
 
     def joined(scales: tuple[float, ...]) -> NoisyData:
-        data = scene.data
-        for C, s in zip(columns, scales, strict=True):
-            data = data.with_columns(C, np.full(C.shape[2], 1 / s**2))
-        return data
+        return _joined(scene.data, columns, scales)
 
     scales = tuple(1.0 for _ in items)
     noise = start
@@ -113,14 +133,12 @@ def fit_set(scene: Scene, items: tuple[Item, ...], start: NoiseValues | None = N
             break
         scales = best
     assert noise is not None
-    mixed += _within_bounds(scene, items, joined(scales), noise)
+    mixed += _within_bounds(items, joined(scales), noise)
     prior = sum(item.log_prior for item in items) - 0.5 * log_prior(scene.data.stated, noise)[0]
     return ModelSet(items, noise, joined(scales), mixed + prior, scales)
 
 
-def _within_bounds(
-    scene: Scene, items: tuple[Item, ...], data: NoisyData, noise: NoiseValues
-) -> float:
+def _within_bounds(items: tuple[Item, ...], data: NoisyData, noise: NoiseValues) -> float:
     """Σ log 2Φ(mean/deviation) over parameters that cannot be below their nominal zero.
 
     A compliance's size prior is one half of the Gaussian; the evidence gains or loses by the
@@ -134,27 +152,13 @@ def _within_bounds(
     if not any(bounded):
         return 0.0
     at = project(data, noise)
-    deviation = np.linalg.norm(at.beta_deviation, axis=0)
-    total, first = 0.0, scene.data.X.shape[2]
-    for item in items:
-        what = item.what
-        if not isinstance(what, Hypothesis):
-            first += columns_of(what)
-            continue
-        for k, p in enumerate(what.parameters):
-            if p.lower == p.nominal:
-                z = at.beta[first + k] / deviation[first + k]
-                total += float(np.log(2) + log_ndtr(z))
-        first += len(what.parameters)
+    z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
+    total = 0.0
+    for item, span in zip(items, spans_of(items, len(z)), strict=True):
+        if isinstance(item.what, Hypothesis):
+            for p, share in zip(item.what.parameters, log_ndtr(z[span]), strict=True):
+                total += float(np.log(2) + share) if p.lower == p.nominal else 0.0
     return total
-
-
-def columns_of(block: Generic) -> int:
-    """Number of columns of a block."""
-    if block.columns is not None:
-        return block.columns.shape[2]
-    assert block.drive is not None
-    return block.drive.shape[3]
 
 
 def _mixed_scales(
@@ -188,8 +192,7 @@ def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
     (setting,) = what.settings
     if setting.kind == "change_time":
         return chosen
-    others = replace(chosen, items=chosen.without(k))
-    data = fit_columns(scene, others, chosen.scales[:k] + chosen.scales[k + 1 :])
+    data = beside(scene, chosen, k)
     grams = Grams(scene, data, project(data, chosen.noise))
     grid = scene.grids[what.name, what.where]
     near = int(np.abs(grid.values[:, 0] - item.settings[0]).argmin())
@@ -202,10 +205,17 @@ def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
     return fit_set(scene, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), chosen.noise)
 
 
-def fit_columns(scene: Scene, chosen: ModelSet, scales: tuple[float, ...]) -> NoisyData:
-    """The scene's data with the set's columns at the given scales."""
-    data = scene.data
-    for item, s in zip(chosen.items, scales, strict=True):
-        C = packed_columns(scene, item)
+def with_items(scene: Scene, items: tuple[Item, ...], scales: tuple[float, ...]) -> NoisyData:
+    """The scene's data with the items' columns at the given scales."""
+    return _joined(scene.data, [packed_columns(scene, item) for item in items], scales)
+
+
+def beside(scene: Scene, chosen: ModelSet, k: int) -> NoisyData:
+    """The set's data without item k."""
+    return with_items(scene, chosen.without(k), chosen.scales[:k] + chosen.scales[k + 1 :])
+
+
+def _joined(data: NoisyData, columns: list[Array], scales: tuple[float, ...]) -> NoisyData:
+    for C, s in zip(columns, scales, strict=True):
         data = data.with_columns(C, np.full(C.shape[2], 1 / s**2))
     return data

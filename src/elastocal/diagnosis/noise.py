@@ -95,6 +95,11 @@ class NoisyData:
         return replace(self, left_out=np.repeat(padded, self.blocks.size, axis=1))
 
     @property
+    def faulty(self) -> Mask:
+        """Observations (N,) that are left out."""
+        return self.blocks.unpack(self.left_out[..., None].astype(float))[:, 0, 0] > 0
+
+    @property
     def n_rows(self) -> int:
         return int((~self.left_out).sum())
 

@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.estimate import linear_estimates
-from elastocal.diagnosis.extend import extended
+from elastocal.diagnosis.estimate import fit_extended
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet
 from elastocal.diagnosis.noise import project
@@ -26,12 +24,8 @@ def refit(scene: Scene, chosen: ModelSet) -> dict[tuple[str, str], tuple[FittedP
     covariance of the noise at its end.
     """
     known = [item for item in chosen.items if item.known]
-    model = extended(scene.base.model, known)
-    start = dict(zip(scene.base.model.names, scene.base.x, strict=True)) | linear_estimates(
-        scene, chosen
-    )
-    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
-    base = fit_baseline(model, scene.base.seen.table, x0=x0)
+    base = fit_extended(scene, chosen, known)
+    model = base.model
     seen, width = base.seen, widths(base)
     at = model.regressor(seen.table, base.x, observations=seen)
     B = at.B.reshape(len(seen.lead), seen.size, -1) * width

@@ -122,7 +122,7 @@ def in_a_run(scene: Scene, suspect: Mask) -> Mask:
 def describe_faulty(scene: Scene, data: NoisyData, noise: NoiseValues) -> tuple[FaultyReading, ...]:
     """The readings left out, with their error against the fit to the others."""
     blocks, size = scene.blocks, scene.blocks.size
-    out = blocks.unpack(data.left_out[..., None].astype(float))[:, 0, 0] > 0
+    out = data.faulty
     if not out.any():
         return ()
     at = project(data, noise)

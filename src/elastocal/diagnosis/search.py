@@ -7,12 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.found import Found, Slot
 from elastocal.diagnosis.generic import Generic
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_set, refine
 from elastocal.diagnosis.noise import NoiseValues, log_prior
-from elastocal.diagnosis.prior import ANOTHER, Prior
-from elastocal.diagnosis.relinearise import is_far, relinearised, restarted
+from elastocal.diagnosis.prior import ANOTHER, SOMETHING, Prior
+from elastocal.diagnosis.relinearise import is_far, relinearised
 from elastocal.diagnosis.scan import Scan, scan
 from elastocal.diagnosis.scene import Scene
 
@@ -87,7 +88,7 @@ class Search:
             if best is None or slot.probabilities()[1] > doubt:
                 break
             after = self._scan(best, flips=True)
-            p = (1 + int((after.flipped >= observed.odds).sum())) / (1 + len(after.flipped))
+            p = exceedance(after.flipped, observed.odds)
             if p > self.level:
                 break
             if self._been_at(best):
@@ -98,7 +99,7 @@ class Search:
             if is_far(self.scene, current):
                 self.scene = relinearised(self.scene, current)
                 self._fitted.clear()
-                current = restarted(self.scene, current)
+                current = fit_set(self.scene, current.items, current.noise)
                 seen = self._scan(current)
             if len(current.items) > 1:
                 current, slots, seen = self._reexamined(current, slots, seen)
@@ -136,20 +137,18 @@ class Search:
     def _scan(
         self, current: ModelSet, noise: NoiseValues | None = None, flips: bool = False
     ) -> Scan:
-        something = ANOTHER if current.items else None
-        prior = self._prior(something)
         return scan(
             self.scene,
             self.generic,
-            prior,
+            self._prior(current),
             current.data,
             noise or current.noise,
             self.signs if flips else self.signs[:0],
         )
 
-    def _prior(self, something: float | None) -> Prior:
-        if something is None:
-            return Prior.of(self.scene.hypotheses, self.generic)
+    def _prior(self, current: ModelSet) -> Prior:
+        """Of one item more."""
+        something = ANOTHER if current.items else SOMETHING
         return Prior.of(self.scene.hypotheses, self.generic, something)
 
     def _best_addition(
@@ -179,7 +178,7 @@ class Search:
         return best, Slot(slot.items, scores)
 
     def _options(self, current: ModelSet, seen: Scan) -> list[tuple[Item, float]]:
-        prior = self._prior(ANOTHER if current.items else None)
+        prior = self._prior(current)
         # Scores count from the set as it is, under the noise that suits it best.
         offset = base_score(self.scene, current, seen) - current.score
         options = []

@@ -41,11 +41,7 @@ class Campaign:
         later = np.zeros(blocks.n, dtype=bool)
         members = blocks.member[self.measured :]
         later[members[members < blocks.n]] = True
-        return replace(self.scene, data=self.scene.data.without(later | self._left_out()))
-
-    def _left_out(self) -> NDArray[np.bool_]:
-        rows = self.scene.data.left_out[..., None].astype(float)
-        return self.scene.blocks.unpack(rows)[:, 0, 0] > 0
+        return replace(self.scene, data=self.scene.data.without(later | self.scene.data.faulty))
 
 
 def campaign_of(

@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.columns import entry_key
+from elastocal.diagnosis.gram import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, packed_columns
+from elastocal.diagnosis.model_set import Item, packed_columns, with_items
 from elastocal.diagnosis.noise import NoiseValues, project
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.separate_rivals import RivalSet
-from elastocal.diagnosis.sums import EntrySums
 
 Array = NDArray[np.float64]
 
@@ -31,10 +30,8 @@ def best_imitations(
         for b, item in enumerate(contest.rivals)
         if isinstance(item.what, Hypothesis) and item.what.settings
     }
-    data = scene.data
-    for item in contest.beside:
-        C = data.masked(packed_columns(scene, item))
-        data = data.with_columns(C, np.full(C.shape[2], item.scales.max() ** -2))
+    widest = tuple(float(item.scales.max()) for item in contest.beside)
+    data = with_items(scene, tuple(contest.beside), widest)
     out: dict[tuple[int, int], Item] = {}
     for a, item in enumerate(contest.rivals):
         others = {b: h for b, h in searched.items() if b != a}
@@ -43,15 +40,10 @@ def best_imitations(
         C = data.masked(packed_columns(scene, item))
         both = data.with_columns(C, np.ones(C.shape[2]))
         at = project(both, noise)
-        fitted = at.beta
-        signal = C @ fitted[data.X.shape[2] :]
-        at = project(replace(data, r=signal), noise)
+        signal = C @ at.beta[data.X.shape[2] :]
+        grams = Grams(scene, data, project(replace(data, r=signal), noise))
         for b, h in others.items():
-            grid = scene.grids[h.name, h.where]
-            E = data.masked(scene.entry(entry_key(h, scene.base.model)))
-            found = EntrySums.of(E, scene.places, at).driven(scene.drive(h, grid.values))
-            s = float(contest.rivals[b].scales.max())
-            explained = (s**2 * found.beta**2 / (1 + s**2 * found.lam)).sum(axis=1)
-            best = grid.values[int(np.argmax(explained))]
+            explained = grams.of_hypothesis(h).explained(float(contest.rivals[b].scales.max()))
+            best = scene.grids[h.name, h.where].values[int(np.argmax(explained))]
             out[a, b] = replace(contest.rivals[b], settings=best)
     return out

@@ -12,7 +12,7 @@ from elastocal.diagnosis.columns import is_driven
 from elastocal.diagnosis.gram import Grams
 from elastocal.diagnosis.heldout import squared_lengths
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import ModelSet, fit_columns, fit_set
+from elastocal.diagnosis.model_set import ModelSet, beside, fit_set
 from elastocal.diagnosis.noise import project
 from elastocal.diagnosis.scene import Scene
 
@@ -31,8 +31,7 @@ def other_settings(scene: Scene, chosen: ModelSet, k: int) -> list[tuple[ModelSe
     what = item.what
     if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
         return [(chosen, 1.0)]
-    others = replace(chosen, items=chosen.without(k))
-    data = fit_columns(scene, others, chosen.scales[:k] + chosen.scales[k + 1 :])
+    data = beside(scene, chosen, k)
     grid = scene.grids[what.name, what.where]
     grams = Grams(scene, data, project(data, chosen.noise))
     own = float(grams.of_hypothesis(what, item.settings[None]).evidence(item.scales)[0])
@@ -71,8 +70,7 @@ def between_visits(scene: Scene, chosen: ModelSet, k: int) -> float:
     if not 0 < later < len(moments):
         return 0.0
     pause = float(moments[later] - moments[later - 1]) / float(np.ptp(moments))
-    signal, _ = signal_of(scene, chosen, k)
-    squares, count = squared_lengths(scene.data, signal)
+    squares, count = squared_lengths(scene.data, signal_of(scene, chosen, k))
     shown = squares > 0
     per_reading = float(squares[shown].sum() / max(count[shown].sum(), 1))
     return pause / 2 * per_reading * float(count.mean())

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from elastocal.diagnosis.result import Diagnosis
+from elastocal.report.console_table import titled
 from elastocal.report.diagnosis_rows import (
     BUDGET,
     CANDIDATES,
@@ -76,14 +76,7 @@ def _print_lines(console: Console, lines: Sequence[tuple[str, str]]) -> None:
 
 def _table(title: str, heads: Sequence[str], rows: Rows) -> Table:
     """The first `heads` columns of the rows; numbers to the right."""
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-    )
+    table = titled(title)
     for k, head in enumerate(heads):
         words = k == 0 or head in WORDS
         table.add_column(head, justify="left" if words else "right", overflow="fold")

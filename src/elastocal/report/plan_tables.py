@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from elastocal.design.plan import Plan
 from elastocal.design.reasons import Predicted, Reason
+from elastocal.report.console_table import titled
 from elastocal.report.units import display, significant
 from elastocal.report.words import printable
 
@@ -47,7 +47,7 @@ def _narrow_poses(console: Console, plan: Plan) -> Table:
 
 def pose_table(plan: Plan, reasons: bool = True, decimals: int = 2) -> Table:
     """Joint values, load, place in the order of execution, and what the pose is there for."""
-    table = _table("Poses")
+    table = titled("Poses")
     table.add_column("pose", justify="right")
     for i, kind in enumerate(plan.model.chain.kinds):
         unit = "°" if kind == "revolute" else "mm"
@@ -72,7 +72,7 @@ def pose_table(plan: Plan, reasons: bool = True, decimals: int = 2) -> Table:
 
 def reason_table(plan: Plan) -> Table:
     """What each pose is there for."""
-    table = _table("Why each pose")
+    table = titled("Why each pose")
     table.add_column("pose", justify="right")
     table.add_column(SERVES, overflow="fold")
     for k, reason in enumerate(plan.reasons):
@@ -91,7 +91,7 @@ def served(reason: Reason) -> str:
 
 def interval_table(plan: Plan) -> Table:
     """Predicted half widths of the 95 % intervals."""
-    table = _table("Predicted intervals")
+    table = titled("Predicted intervals")
     table.add_column("parameter", overflow="fold")
     table.add_column("± 95 %", justify="right")
     table.add_column("unit")
@@ -113,7 +113,7 @@ def _partners(p: Predicted) -> str:
 
 def curve_table(plan: Plan) -> Table:
     """The criterion against the number of poses."""
-    table = _table("Number of poses")
+    table = titled("Number of poses")
     table.add_column("poses", justify="right")
     table.add_column(f"{plan.criterion} {plan.unit}".strip(), justify="right")
     table.add_column("best possible on the pool", justify="right")
@@ -186,14 +186,3 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     if via:
         text += f", {via} points in between to get around obstacles"
     return "Execution", f"{text}, {e.total / 60:.0f} min in all; every move checked."
-
-
-def _table(title: str) -> Table:
-    return Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-    )

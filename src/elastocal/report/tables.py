@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from elastocal.identification.result import Combination, Estimate, IdentificationResult
+from elastocal.report.console_table import titled
 from elastocal.report.noise import candidate_rows, size_rows
 from elastocal.report.rows import any_lopsided, half_head, signed_half, texts
 from elastocal.report.units import display, plain
@@ -148,14 +148,7 @@ def _table(title: str, first: str, truth: Truth | None, brief: bool, lopsided: b
 
 
 def _plain(title: str, first: str) -> Table:
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-    )
+    table = titled(title)
     table.add_column(first, overflow="fold")
     return table
 
