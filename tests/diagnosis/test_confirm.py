@@ -7,46 +7,36 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from support.diagnosis_data import random_data
 
-from elastocal.diagnosis.blocks import Blocks
-from elastocal.diagnosis.confirm import shrinkage
-from elastocal.diagnosis.model_set import ModelSet
-from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.confirm import FRESH, Change, Truth, shrinkage
 
-NOISE = NoiseValues(1.0, np.array([1e-9]), 0.1)
 SIGMA, P, K = 1e-5, 8, 2
+N = 10_000  # measured poses: as many kinds of pose as there are
+SURE = Change()
 
 
-def world(seed: int, poses: int, size: float) -> tuple[ModelSet, ModelSet, float]:
-    """Sets without and with an effect of rms `size` (m), and the true reduction.
+def columns(poses: int, rng: np.random.Generator) -> np.ndarray:
+    """(poses, 3 readings, 3 components, P + K) independent normal numbers, the effect's last."""
+    return 1e-5 * rng.normal(size=(poses, 3, 3, P + K))
 
-    Columns are independent normal numbers, so that the expected squared error on fresh poses is
-    the squared error of the coefficients.
-    """
+
+def world(seed: int, poses: int, size: float) -> tuple[Truth, float]:
+    """What is known of an effect of rms `size` (m) after a fit with and one without it, and by
+    how much the errors at 100 fresh poses really fall."""
     rng = np.random.default_rng((seed, poses))
-    configuration = np.repeat(np.arange(poses), 3)
-    blocks = Blocks.of(configuration, configuration, 3)
-    base = random_data(seed, blocks, p=P, joints=1)
-    X, C = (1e-5 * rng.normal(size=(poses, 9, k)) for k in (P, K))
-    beta, gamma = rng.normal(size=P), size / 1e-5 * np.array([0.8, -0.6])
-    r = X @ beta + C @ gamma + SIGMA * rng.normal(size=(poses, 9))
-    base = replace(
-        base, r=r, X=X, precision=np.full(P, 1e-8), G=np.zeros((poses, 9, 1)),
-        covariance=np.tile(SIGMA**2 * np.eye(9), (poses, 1, 1)), left_out=blocks.absent,
-    )  # fmt: skip
-    scale = 1.0 / (size / 1e-5) ** 2
-    before = ModelSet((), NOISE, base, 0.0, ())
-    after = ModelSet((), NOISE, base.with_columns(C, np.full(K, scale)), 0.0, ())
-    squares = []
-    for chosen, truth in ((before, beta), (after, np.concatenate([beta, gamma]))):
-        A = chosen.data.X.reshape(-1, chosen.data.X.shape[2])
-        M = A.T @ A / SIGMA**2 + np.diag(chosen.data.precision)
-        error = np.linalg.solve(M, A.T @ r.ravel() / SIGMA**2) - truth[: A.shape[1]]
-        missing = truth[A.shape[1] :] if len(truth) > A.shape[1] else np.zeros(0)
-        squares.append(float(error @ error + missing @ missing))
-    squares[0] += float(gamma @ gamma)
-    return before, after, 1 - np.sqrt(squares[1] / squares[0])
+    X = columns(poses, rng).reshape(-1, P + K)
+    truth = np.concatenate([rng.normal(size=P), size / 1e-5 * np.array([0.8, -0.6])])
+    y = X @ truth + SIGMA * rng.normal(size=len(X))
+    after = np.linalg.lstsq(X, y)[0]
+    before = np.concatenate([np.linalg.lstsq(X[:, :P], y)[0], np.zeros(K)])
+    spread = SIGMA * np.linalg.inv(np.linalg.cholesky(X.T @ X)).T
+    real = columns(FRESH, rng)
+    rms = [np.sqrt(((real @ (fit - truth)) ** 2).sum(axis=2).mean()) for fit in (before, after)]
+    fresh = columns(300, rng)
+    rows = fresh.reshape(-1, 3, P + K)
+    pose = np.repeat(np.arange(300), 3)
+    found = Truth(rows @ (before - after), rows @ (after - after), rows @ spread, pose, 1.0)
+    return found, float(1 - rms[1] / rms[0])
 
 
 @lru_cache
@@ -54,10 +44,10 @@ def outcomes(poses: int, size: float, worlds: int = 60) -> np.ndarray:
     """True reduction, estimate, and both ends of the 90 % interval (worlds, 4)."""
     rows = []
     for seed in range(worlds):
-        before, after, true = world(seed, poses, size)
-        found = shrinkage(before, after, [(after, 1.0)], 0.0, np.random.default_rng(seed))
-        assert found.ci95[0] <= found.ci90[0] <= found.reduction <= found.ci90[1] <= found.ci95[1]
-        rows.append((true, found.reduction, *found.ci90))
+        found, true = world(seed, poses, size)
+        fall = shrinkage([found], N, 0.0, SURE, np.random.default_rng(seed))
+        assert fall.ci95[0] <= fall.ci90[0] <= fall.reduction <= fall.ci90[1] <= fall.ci95[1]
+        rows.append((true, fall.reduction, *fall.ci90))
     return np.array(rows)
 
 
@@ -86,26 +76,51 @@ def test_more_poses_make_the_interval_narrower() -> None:
 
 
 def test_a_rival_that_may_be_the_truth_widens_the_interval() -> None:
-    before, after, _ = world(1, 24, 3e-6)
+    """If nothing is there, the model before is the one that is right."""
+    found, _ = world(1, 24, 3e-6)
+    likely = replace(found, probability=0.7)
+    nothing = replace(found, before=found.after, after=-found.before, probability=0.3)
     rng = np.random.default_rng(0)
-    sure = shrinkage(before, after, [(after, 1.0)], 0.0, rng)
-    doubtful = shrinkage(before, after, [(after, 0.7), (before, 0.3)], 0.0, rng)
+    sure = shrinkage([found], N, 0.0, SURE, rng)
+    doubtful = shrinkage([likely, nothing], N, 0.0, SURE, rng)
     assert np.ptp(doubtful.ci90) > 1.2 * np.ptp(sure.ci90)
 
 
-def test_adding_nothing_shrinks_nothing() -> None:
-    before, _, _ = world(2, 24, 1e-5)
-    found = shrinkage(before, before, [(before, 1.0)], 0.0, np.random.default_rng(0))
-    assert found.reduction == 0.0 and found.ci95 == (0.0, 0.0)
+def test_the_same_model_twice_shrinks_nothing() -> None:
+    found, _ = world(2, 24, 1e-5)
+    same = replace(found, after=found.before)
+    fall = shrinkage([same], N, 0.0, SURE, np.random.default_rng(0))
+    assert fall.reduction == 0.0 and fall.ci95 == (0.0, 0.0)
 
 
-def test_a_change_between_visits_leaves_an_error_on_its_wrong_side() -> None:
-    """On average half of `between` is added to what is left."""
-    before, after, _ = world(3, 60, 1e-5)
+def test_what_is_there_without_a_name_stays() -> None:
+    """Both squared errors grow by its square: large enough, it leaves nothing of the reduction."""
+    found, _ = world(3, 60, 1e-5)
+    falls = [
+        shrinkage([found], N, u, SURE, np.random.default_rng(0)).reduction for u in (0, 3e-10, 1e-6)
+    ]
+    assert falls[0] > falls[1] > falls[2]
+    left, whole = (1 - falls[0]) ** 2, ((found.before**2).sum(axis=1)).mean()
+    expected = 1 - np.sqrt((left * whole + 3e-10) / (whole + 3e-10))
+    assert falls[1] == pytest.approx(expected, abs=0.02)
+    assert falls[2] < 1e-3
+
+
+def test_a_change_between_visits_leaves_readings_on_its_wrong_side() -> None:
+    """On average a quarter of the largest share of them: half of half of it."""
+    found, _ = world(3, 60, 1e-5)
+    square = float((found.before**2).sum(axis=1).mean())
     sharp, blurred = (
-        shrinkage(before, after, [(after, 1.0)], b, np.random.default_rng(0)) for b in (0, 1e-10)
+        shrinkage([found], N, 0.0, Change(square, share), np.random.default_rng(0))
+        for share in (0.0, 0.02)
     )
-    assert blurred.reduction < sharp.reduction and blurred.ci90[0] < sharp.ci90[0]
-    # Squared errors of a configuration's nine rows: 9 · (1e-5)² before.
-    left = (1 - sharp.reduction) ** 2 + 0.5 * 1e-10 / 9e-10
-    assert (1 - blurred.reduction) ** 2 == pytest.approx(left, rel=0.15)
+    assert blurred.reduction < sharp.reduction
+    assert np.ptp(blurred.ci90) > np.ptp(sharp.ci90)
+    left = (1 - sharp.reduction) ** 2 + 0.5 * 0.02
+    assert (1 - blurred.reduction) ** 2 == pytest.approx(left, rel=0.25)
+
+
+def test_few_measured_poses_tell_little_of_what_poses_there_are() -> None:
+    found, _ = world(1, 24, 1e-5)
+    few, many = (shrinkage([found], n, 0.0, SURE, np.random.default_rng(0)) for n in (10, 10_000))
+    assert np.ptp(few.ci90) > 1.1 * np.ptp(many.ci90)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from support.cells import kr270_cell, kr270_chain, random_table
@@ -66,3 +67,13 @@ def test_without_load_the_joint_lags_behind_its_last_motion() -> None:
         turned[side] = rigid.predict(replace(still, q=q))
     for side in (1.0, -1.0):
         np.testing.assert_allclose(reading[side], turned[side], atol=2e-8)
+
+
+def test_a_plan_drives_what_was_found_as_it_was_found() -> None:
+    n = len(table())
+    sides = np.where(np.arange(n)[:, None] % 2 == 0, 1.0, -1.0) * np.ones((n, 6))
+    play = replace(ECCENTRICITY, effect="backlash")
+    for keys, law in (({}, "load"), ({"play_side": "load_and_approach"}, "load_and_approach")):
+        found = SimpleNamespace(effects=(play,), model_keys=keys)
+        told = with_recorded_drivers(bare(), table(approach=sides), found)
+        assert told.cell.model.play_side == law

@@ -1,29 +1,23 @@
 """How far the gap shrinks on poses that had no part in choosing or fitting the effect.
 
-The error of a fresh pose is the model's prediction less the truth, without noise.  Each
-configuration c stands for a fresh one: predictions for it come from fits to the others, and miss
-its readings by e₋c, of which n*_c = r_c − X_c θ* is noise, θ* drawn from the posterior given all
-data:
+The error of a model at a fresh pose is its prediction less the truth, without noise:
 
-    before:  n*_c − e⁰₋c,   after:  n*_c − e¹₋c.
+    e(θ*) = f(q, x̂) − h(q, θ*),    θ* ~ posterior given all data,
 
-What is drawn as the truth is at times a rival or nothing, as probable as each is, which
-charges the interval for the selection.  The remaining fraction is the ratio of the rms errors,
-with configurations weighted at random (Bayesian bootstrap, Rubin 1981) for the choice of poses,
-and a set of FRESH poses drawn by these weights.
+where f is the model before and after the effect is added, each fitted by the instrument's noise
+as a calibration would, and h what is held to be the truth: at times a rival or another constant,
+as probable as each is, which charges the interval for the selection.  The remaining fraction is
+the ratio of the rms errors over a set of FRESH poses, drawn anew for every θ* from a population
+that is itself known from the campaign's poses only (Bayesian bootstrap, Rubin 1981).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
-
-from elastocal.diagnosis.heldout import left_out_residual, squared_lengths
-from elastocal.diagnosis.model_set import ModelSet
-from elastocal.diagnosis.noise import project
 
 Array = NDArray[np.float64]
 
@@ -40,52 +34,68 @@ class Shrinkage:
     ci95: tuple[float, float]
 
 
-def shrinkage(
-    before: ModelSet, after: ModelSet, truths: list[tuple[ModelSet, float]], between: float,
-    rng: np.random.Generator,
-) -> Shrinkage:  # fmt: skip
-    """Reduction from `before` to `after`, the truth being each of `truths` with its probability.
+@dataclass(frozen=True)
+class Truth:
+    """What may be true: errors (rows, components) of the models `before` and `after` at fresh
+    poses if it is, at its most probable values; the truth moves by `spread` (rows, components, k)
+    times standard normal numbers.  `pose` (rows,) numbers the fresh pose of each reading."""
 
-    `between` (m²): squared error of all readings, on average over configurations, that a change
-    makes in the pause in which it happened: a fresh pose may fall on the wrong side of it.
+    before: Array
+    after: Array
+    spread: Array
+    pose: NDArray[np.int64]
+    probability: float
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change that happened in a pause between visits: how far (m² per reading) one on its wrong
+    side is off, and the largest `share` of the time that may be on it."""
+
+    square: float = 0.0
+    share: float = 0.0
+
+
+def shrinkage(
+    truths: Sequence[Truth],
+    measured: int,
+    unnamed: float,
+    change: Change,
+    rng: np.random.Generator,
+) -> Shrinkage:
+    """Reduction of the rms error from before to after, one of `truths` being true.
+
+    `measured` is the number of poses that tell what poses there are.
+
+    `unnamed` (m²) is the mean squared length of what is known to be there without a name: neither
+    model has it, and it is taken to be as large at fresh poses as it was at the measured ones.
     """
-    data = before.data
-    missed = [_missed(s) for s in (before, after)]
-    weights = np.array([p for _, p in truths])
+    weights = np.array([t.probability for t in truths])
     which = rng.choice(len(truths), DRAWS, p=weights / weights.sum())
-    ratios = np.empty(DRAWS)
-    draws = {k: _Draws(truths[k][0]) for k in np.unique(which)}
-    for d in range(DRAWS):
-        noise = draws[which[d]](rng)
-        configurations = rng.multinomial(FRESH, rng.dirichlet(np.ones(len(noise)))) / FRESH
-        squares = [float(configurations @ squared_lengths(data, noise - e)[0]) for e in missed]
-        squares[1] += between * rng.random()
-        ratios[d] = 1 - np.sqrt(squares[1] / max(squares[0], 1e-300))
-    low95, low90, middle, high90, high95 = np.quantile(ratios, [0.025, 0.05, 0.5, 0.95, 0.975])
+    parts = [
+        _reductions(truths[k], int((which == k).sum()), measured, unnamed, change, rng)
+        for k in np.unique(which)
+    ]
+    drawn = np.concatenate(parts)
+    low95, low90, middle, high90, high95 = np.quantile(drawn, [0.025, 0.05, 0.5, 0.95, 0.975])
     return Shrinkage(float(middle), (float(low90), float(high90)), (float(low95), float(high95)))
 
 
-def _missed(chosen: ModelSet) -> Array:
-    """Left-out residuals (C, m) of a fit weighted by the instrument's noise alone.
-
-    That is what a calibration does that knows nothing of the joints' scatter; and the scatter
-    fitted beside a missing effect is the effect, which weights by it would spare.
-    """
-    at = project(chosen.data, chosen.noise.of_instrument())
-    return chosen.data.masked(left_out_residual(at))
-
-
-class _Draws:
-    """Noise r − X θ* (C, m) with θ* from the posterior of a set."""
-
-    def __init__(self, chosen: ModelSet) -> None:
-        at, data = chosen.at, chosen.data
-        self.X, self.r = data.masked(data.X), data.masked(data.r)
-        self.factor = at.factor
-        self.mean = at.beta
-
-    def __call__(self, rng: np.random.Generator) -> Array:
-        spread = linalg.solve_triangular(
-            self.factor, rng.normal(size=len(self.mean)), lower=True, trans="T"
-        )
-        return np.asarray(self.r - self.X @ (self.mean + spread))
+def _reductions(
+    truth: Truth, n: int, measured: int, unnamed: float, change: Change, rng: np.random.Generator
+) -> Array:
+    """(n,) draws."""
+    moved = truth.spread @ rng.normal(size=(truth.spread.shape[2], n))
+    poses, at, count = np.unique(truth.pose, return_inverse=True, return_counts=True)
+    share = rng.dirichlet(np.full(len(poses), measured / len(poses)), n)
+    chosen = rng.multinomial(FRESH, share)
+    mean = []
+    for error in (truth.before, truth.after):
+        squares = ((error[:, :, None] - moved) ** 2).sum(axis=1)
+        total = np.zeros((len(poses), n))
+        np.add.at(total, at, squares)
+        readings = chosen @ count
+        mean.append((chosen.T * total).sum(axis=0) / readings + unnamed)
+    late = rng.binomial(readings, change.share * rng.random(n)) / readings
+    mean[1] = mean[1] + late * change.square
+    return np.asarray(1 - np.sqrt(mean[1] / np.maximum(mean[0], 1e-300)))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.baseline import Baseline, fit_baseline
 from elastocal.diagnosis.budget import budget
-from elastocal.diagnosis.confirm import Shrinkage, shrinkage
+from elastocal.diagnosis.confirm import shrinkage
 from elastocal.diagnosis.curves import curves_of
 from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.extend import settings_of
@@ -19,16 +18,17 @@ from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.listing import candidates, too_small, warnings
 from elastocal.diagnosis.locate import location, structure_tests
-from elastocal.diagnosis.model_set import fit_set
 from elastocal.diagnosis.noise import fit_noise
 from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.diagnosis.play_law import with_likelier_play
 from elastocal.diagnosis.recorded_drivers import model_keys, with_recorded_drivers
 from elastocal.diagnosis.refit import refit
 from elastocal.diagnosis.result import Diagnosis, Finding
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.screen import Screened, screen
 from elastocal.diagnosis.search import Search
-from elastocal.diagnosis.uncertain_settings import between_visits, other_settings
+from elastocal.diagnosis.truths import Confirmation
+from elastocal.diagnosis.uncertain_settings import between_visits
 from elastocal.diagnosis.verdict import Answer, judge
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.checks import check_table
@@ -38,7 +38,6 @@ from elastocal.measurements import Measurements
 Progress = Callable[[str], None]
 
 FEWEST = 8  # configurations
-WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as the truth
 
 
 def diagnose(
@@ -64,13 +63,14 @@ def diagnose(
     base = fit_baseline(model, table, options.seed)
     hypotheses, untested = possible(model, table, options.without)
     progress("columns of what could be missing")
-    scene = scene_of(base, hypotheses)
+    scene = with_likelier_play(scene_of(base, hypotheses))
+    base = scene.base
     scene, found, screened = _searched(scene, options, progress)
     answer = judge(found)
     progress("confirming")
     rng = np.random.default_rng(options.seed)
     gap, steps = budget(scene, found, rng)
-    findings = _findings(found, answer, rng)
+    findings = _findings(found, answer, base, rng)
     tests = structure_tests(found.first)
     chosen = found.chosen
     nothing = found.slots[0].probabilities()[1]
@@ -93,7 +93,7 @@ def diagnose(
         warnings=warnings(scene, found, screened),
         n_readings=scene.blocks.n,
         n_configurations=len(scene.blocks.member),
-        model_keys=model_keys(model, findings),
+        model_keys=model_keys(base.model, findings),
     )
 
 
@@ -141,18 +141,24 @@ def _check_enough(table: Measurements) -> None:
         )
 
 
-def _findings(found: Found, answer: Answer, rng: np.random.Generator) -> tuple[Finding, ...]:
+def _findings(
+    found: Found, answer: Answer, plain: Baseline, rng: np.random.Generator
+) -> tuple[Finding, ...]:
     """The known items with their probabilities, parameters and confirmed shrinkage."""
     chosen, scene = found.chosen, found.scene
     known = [k for k, item in enumerate(chosen.items) if item.known]
     if not known:
         return ()
-    parameters = refit(scene, chosen)
+    confirmation = Confirmation.of(found, plain, rng)
+    parameters = refit(confirmation.parameters, [chosen.items[k] for k in known])
     findings = []
     for k in known:
         what = chosen.items[k].what
         assert isinstance(what, Hypothesis)
-        fall = _shrinkage(found, answer, k, rng)
+        truths = confirmation.truths(k, answer.rivals[k])
+        change = between_visits(scene, chosen, k)
+        measured = len(scene.blocks.member)
+        fall = shrinkage(truths, measured, confirmation.unnamed, change, rng)
         findings.append(
             Finding(
                 what.name,
@@ -166,18 +172,3 @@ def _findings(found: Found, answer: Answer, rng: np.random.Generator) -> tuple[F
             )
         )
     return tuple(findings)
-
-
-def _shrinkage(found: Found, answer: Answer, k: int, rng: np.random.Generator) -> Shrinkage:
-    """How far adding item k shrinks the error, the other items being in the model already."""
-    chosen, scene = found.chosen, found.scene
-    before = found.nothing if len(chosen.items) == 1 else fit_set(
-        scene, chosen.without(k), chosen.noise
-    )  # fmt: skip
-    p = answer.probability[k]
-    truths = [(same, p * share) for same, share in other_settings(scene, chosen, k)]
-    for item, share in answer.rivals[k][1:]:
-        if share > WORTH_A_DRAW:
-            items = (*chosen.items[:k], replace(item, log_prior=0.0), *chosen.items[k + 1 :])
-            truths.append((fit_set(scene, items, chosen.noise), share))
-    return shrinkage(before, chosen, truths, between_visits(scene, chosen, k), rng)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from elastocal.diagnosis.hypotheses import recorded
-from elastocal.diagnosis.result import Finding
+from elastocal.diagnosis.result import Diagnosis, Finding
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
@@ -16,14 +16,20 @@ CHOICES = (
 )
 
 
-def with_recorded_drivers(model: Model, table: Measurements) -> Model:
+def with_recorded_drivers(
+    model: Model, table: Measurements, found: Diagnosis | None = None
+) -> Model:
     """The model with effects driven by the best that the table records.
 
     Growth follows a measured temperature rather than a warm-up curve, and play rests where the
-    last motion left it where that is known.  Effects that the cell has active stay as they are.
+    last motion left it where that is known.  Effects that the cell has active stay as they are;
+    those of a diagnosis are driven as `found`.
     """
     spec = model.cell.model
     active = {p.effect for p in model.parameters}
+    if found is not None:
+        otherwise = {effect for key, _, _, effect in CHOICES if key not in found.model_keys}
+        active |= otherwise & {e.effect for e in found.effects}
     keys = {
         key: value
         for key, value, column, effect in CHOICES

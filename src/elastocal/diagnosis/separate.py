@@ -60,7 +60,7 @@ def plan_extra(
         spec = replace(model.cell.model, torque="computed")
         model = Model(model.chain, replace(model.cell, model=spec))
         notes.append("torques of poses not measured yet are computed from load and weights")
-    model = with_recorded_drivers(model, table)
+    model = with_recorded_drivers(model, table, diagnosis)
     suspects = Suspects(model, table, diagnosis)
     progress("extra poses: fitting the model as it is")
     base = fit_baseline(model, table, seed)

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.alike import signal_of
 from elastocal.diagnosis.columns import is_driven
+from elastocal.diagnosis.confirm import Change
 from elastocal.diagnosis.gram import Grams
 from elastocal.diagnosis.heldout import squared_lengths
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import ModelSet, beside, fit_set
+from elastocal.diagnosis.model_set import Item, ModelSet, beside
 from elastocal.diagnosis.noise import project
 from elastocal.diagnosis.scene import Scene
 
@@ -22,15 +23,15 @@ MOST = 6  # settings that are kept
 WORTH = 0.02  # probability from which one is
 
 
-def other_settings(scene: Scene, chosen: ModelSet, k: int) -> list[tuple[ModelSet, float]]:
-    """The set with item k at each of its plausible settings, and their probabilities.
+def other_settings(scene: Scene, chosen: ModelSet, k: int) -> list[tuple[Item, float]]:
+    """Item k at each of its plausible settings, its own first, and their probabilities.
 
-    Only the set itself where the item has none.
+    Only the item itself where it has none.
     """
     item = chosen.items[k]
     what = item.what
     if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
-        return [(chosen, 1.0)]
+        return [(item, 1.0)]
     data = beside(scene, chosen, k)
     grid = scene.grids[what.name, what.where]
     grams = Grams(scene, data, project(data, chosen.noise))
@@ -41,36 +42,29 @@ def other_settings(scene: Scene, chosen: ModelSet, k: int) -> list[tuple[ModelSe
     each[nearest] = own
     share = np.exp(each - each.max())
     share /= share.sum()
-    order = [int(i) for i in np.argsort(-share)[:MOST] if share[i] > WORTH or i == nearest]
-    out = []
-    for i in order:
-        if i == nearest:
-            out.append((chosen, float(share[i])))
-            continue
-        moved = replace(item, settings=grid.values[i])
-        items = (*chosen.items[:k], moved, *chosen.items[k + 1 :])
-        out.append((fit_set(scene, items, chosen.noise), float(share[i])))
-    return out
+    others = [int(i) for i in np.argsort(-share)[:MOST] if share[i] > WORTH and i != nearest]
+    out = [(item, float(share[nearest]))]
+    return out + [(replace(item, settings=grid.values[i]), float(share[i])) for i in others]
 
 
-def between_visits(scene: Scene, chosen: ModelSet, k: int) -> float:
-    """Largest mean squared error (m², summed over a configuration) of a misplaced change.
+def between_visits(scene: Scene, chosen: ModelSet, k: int) -> Change:
+    """How far readings on the wrong side of a change are off, and how many there may be.
 
     A change between two visits is put into the middle of the pause; fresh readings that fall
-    between that and the true moment, a fraction of up to half the pause over the duration, are
-    off by the whole change.  Zero for effects that do not change once.
+    between that and the true moment, a share of up to half the pause over the duration, are
+    off by the whole change.  Nothing for effects that do not change once.
     """
     what = chosen.items[k].what
     time = scene.base.seen.table.time
     changes = isinstance(what, Hypothesis) and any(s.kind == "change_time" for s in what.settings)
     if not changes or time is None:
-        return 0.0
+        return Change()
     moments = np.unique(time)
     later = int(np.searchsorted(moments, chosen.items[k].settings[0]))
     if not 0 < later < len(moments):
-        return 0.0
+        return Change()
     pause = float(moments[later] - moments[later - 1]) / float(np.ptp(moments))
     squares, count = squared_lengths(scene.data, signal_of(scene, chosen, k))
     shown = squares > 0
     per_reading = float(squares[shown].sum() / max(count[shown].sum(), 1))
-    return pause / 2 * per_reading * float(count.mean())
+    return Change(per_reading, pause / 2)

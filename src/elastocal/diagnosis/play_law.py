@@ -1,0 +1,56 @@
+"""On which law the play of an arm's gears follows: load alone, or load and last motion.
+
+A gear whose friction is small swings into the middle of its play, or onto the flank that any
+load pushes it to; one that is stiff in its bearings stays where the last motion left it until the
+load exceeds the friction.  Both are met, and the wrong one leaves most of the effect standing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.diagnosis.gram import Grams, scales_of
+from elastocal.diagnosis.model_set import Item, fit_set
+from elastocal.diagnosis.noise import NoiseValues, fit_noise, project
+from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.manipulator.model import Model
+
+EFFECT, KEY, BY_LOAD, BY_BOTH = "backlash", "play_side", "load", "load_and_approach"
+TRIED = 2  # joints whose play is fitted under each law
+
+
+def with_likelier_play(scene: Scene) -> Scene:
+    """The scene under the law of play that its readings make likelier.
+
+    Where no side of approach is recorded, or the cell has play already, it stays as it is.
+    """
+    spec = scene.base.model.cell.model
+    play = [h for h in scene.hypotheses if h.name == EFFECT]
+    if spec.play_side != BY_BOTH or not play:
+        return scene
+    noise = fit_noise(scene.data)
+    other = _under(scene.base, BY_LOAD)
+    under_other = scene_of(other, play)
+    under_other = replace(under_other, data=replace(under_other.data, left_out=scene.data.left_out))
+    if _best(under_other, noise) <= _best(scene, noise):
+        return scene
+    fresh = scene_of(other, list(scene.hypotheses))
+    return replace(fresh, data=replace(fresh.data, left_out=scene.data.left_out))
+
+
+def _under(base: Baseline, law: str) -> Baseline:
+    model = base.model
+    spec = replace(model.cell.model, play_side=law)  # type: ignore[arg-type]
+    return replace(base, model=Model(model.chain, replace(model.cell, model=spec)))
+
+
+def _best(scene: Scene, noise: NoiseValues) -> float:
+    """Highest log evidence of play in one joint, the noise fitted beside it."""
+    play = [h for h in scene.hypotheses if h.name == EFFECT]
+    grams = Grams(scene, scene.data, project(scene.data, noise))
+    evidence = [float(grams.of_hypothesis(h).evidence(scales_of(h)).max()) for h in play]
+    likeliest = [play[i] for i in np.argsort(evidence)[::-1][:TRIED]]
+    return max(fit_set(scene, (Item(h, np.zeros(0), 0.0),), noise).score for h in likeliest)

@@ -1,0 +1,173 @@
+"""What may be true at fresh poses, given what was found: each as probable as it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.diagnosis.alike import signal_of
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.diagnosis.confirm import Truth
+from elastocal.diagnosis.estimate import fit_extended
+from elastocal.diagnosis.extend import extended
+from elastocal.diagnosis.found import Found
+from elastocal.diagnosis.fresh import fresh_table
+from elastocal.diagnosis.heldout import squared_lengths
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.noise_draws import noise_draws
+from elastocal.diagnosis.refit import Linear, Posterior
+from elastocal.diagnosis.scene import Scene
+from elastocal.diagnosis.uncertain_settings import other_settings
+from elastocal.manipulator.observation import Observations, observe
+
+Array = NDArray[np.float64]
+
+DRAWN = 200  # fresh poses that the sets are drawn from
+NOISES = 10  # values of the noise that a truth is drawn under
+NUDGE = 0.01  # of a setting's grid step: a difference quotient in constants that are not parameters
+WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as the truth
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """Models before and after effects are added, and fresh poses to compare them at.
+
+    `fitted` is the exact model with all known effects, fitted to the scene's readings; `plain` the
+    cell's own model.
+    """
+
+    scene: Scene
+    chosen: ModelSet
+    plain: Baseline
+    fitted: Baseline
+    seen: Observations
+    noise: tuple[NoiseValues, ...]
+
+    @classmethod
+    def of(cls, found: Found, plain: Baseline, rng: np.random.Generator) -> Confirmation:
+        chosen, scene = found.chosen, found.scene
+        fitted = fit_extended(scene, chosen, _known(chosen.items))
+        table = fresh_table(plain.model, plain.seen.table, DRAWN, rng)
+        seen = observe(table, plain.model.observe)
+        noise = noise_draws(chosen.data, chosen.noise, NOISES, rng)
+        return cls(scene, chosen, plain, fitted, seen, tuple(noise))
+
+    @cached_property
+    def parameters(self) -> Posterior:
+        """The exact model's values, weighted by all the noise that was found."""
+        return Linear.of(self.scene, self.fitted).posterior(self.chosen.noise)
+
+    @cached_property
+    def _after(self) -> Array:
+        return self._calibrated(self.fitted)
+
+    def truths(self, k: int, rivals: tuple[tuple[Item, float], ...]) -> list[Truth]:
+        """Errors without and with item k if the truth is item k at any plausible setting, or one
+        of its `rivals`, of which itself is the first, with their probabilities."""
+        others = _known(self.chosen.without(k))
+        before = self._calibrated(
+            fit_extended(self.scene, self.chosen, others) if others else self.plain
+        )
+        out = []
+        for item, share in other_settings(self.scene, self.chosen, k):
+            known = _known((*self.chosen.items[:k], item, *self.chosen.items[k + 1 :]))
+            at = replace(self.fitted, model=extended(self.plain.model, known))
+            out += self._truth(at, known, item, before, rivals[0][1] * share)
+        for item, share in rivals[1:]:
+            if share < WORTH_A_DRAW or not item.known:
+                continue
+            items = (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
+            rival = fit_set(self.scene, items, self.chosen.noise)
+            known = _known(items)
+            at = fit_extended(self.scene, rival, known)
+            out += self._truth(at, known, item, before, share)
+        return out
+
+    @property
+    def unnamed(self) -> float:
+        """Mean squared length (m²) of what is in the set without a name."""
+        total = 0.0
+        for k, item in enumerate(self.chosen.items):
+            if not item.known:
+                signal = signal_of(self.scene, self.chosen, k)
+                squares, count = squared_lengths(self.scene.data, signal)
+                total += float(squares.sum() / count.sum())
+        return total
+
+    def _calibrated(self, base: Baseline) -> Array:
+        """What a model reads at the fresh poses, fitted as a calibration would that knows nothing
+        of the joints' scatter; and the scatter fitted beside a missing effect is the effect,
+        which weights by it would spare."""
+        return base.model.predict(self.seen.table, base.x, self.seen)
+
+    def _truth(
+        self, base: Baseline, known: list[Item], item: Item, before: Array, probability: float
+    ) -> list[Truth]:
+        """If that model is true, under each of the noises."""
+        measured = self._by_constant(base, known, item, self.scene.base.seen)
+        linear = Linear.of(self.scene, base, measured, self._prior(known))
+        at = base.model.regressor(self.seen.table, base.x, observations=self.seen)
+        B = np.hstack([at.B, self._by_constant(base, known, item, self.seen)])
+        start = np.append(base.x, np.zeros(measured.shape[1]))
+        size = self.seen.size
+        shown = min(size, 3)
+
+        def lengths(rows: Array) -> Array:
+            return rows.reshape(-1, size, *rows.shape[1:])[:, :shown]
+
+        out = []
+        for noise in self.noise:
+            fit = linear.posterior(noise)
+            true = at.prediction + B @ (fit.x - start)
+            out.append(
+                Truth(
+                    lengths(before - true),
+                    lengths(self._after - true),
+                    lengths(B @ fit.spread),
+                    self.seen.configuration,
+                    probability / len(self.noise),
+                )
+            )
+        return out
+
+    def _prior(self, known: list[Item]) -> dict[str, float]:
+        """Prior deviations of the effects' parameters: their typical sizes."""
+        out = {}
+        for item in known:
+            assert isinstance(item.what, Hypothesis)
+            size = self.scene.sizes[item.what.name, item.what.where]
+            for p, s in zip(item.what.parameters, size, strict=True):
+                out[f"{item.what.where}.{p.key}"] = float(s)
+        return out
+
+    def _by_constant(
+        self, base: Baseline, known: list[Item], item: Item, seen: Observations
+    ) -> Array:
+        """Difference quotients (rows, k) in the item's constants that vary smoothly, each by the
+        step of the grid it was searched on: it is not known better than the data tell."""
+        what = item.what
+        assert isinstance(what, Hypothesis)
+        columns = []
+        for s, setting in enumerate(what.settings):
+            if setting.kind == "change_time":
+                continue
+            grid = self.scene.grids[what.name, what.where]
+            step = float(grid.step[np.abs(grid.values - item.settings).sum(axis=1).argmin(), s])
+            ends = []
+            for sign in (1, -1):
+                moved = item.settings.copy()
+                moved[s] += sign * NUDGE * step
+                items = [replace(i, settings=moved) if i.same_as(item) else i for i in known]
+                model = extended(self.plain.model, items)
+                ends.append(model.predict(seen.table, base.x, seen))
+            columns.append((ends[0] - ends[1]) / (2 * NUDGE))
+        return np.stack(columns, axis=1) if columns else np.zeros((seen.size * len(seen.lead), 0))
+
+
+def _known(items: tuple[Item, ...]) -> list[Item]:
+    return [item for item in items if item.known]

@@ -1,0 +1,96 @@
+"""Fresh poses are such as the campaign might have had, and none that it had."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from support.diagnosis_data import campaign
+
+from elastocal.diagnosis.fresh import fresh_table
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import observe
+from elastocal.measurements import Measurements
+
+N = 50
+
+
+@lru_cache
+def drawn(observe: str = "position") -> tuple[Model, Measurements, Measurements]:
+    model, table = campaign(observe=observe)
+    table = replace(table, temperature=20 + 1e-3 * table.time)
+    return model, table, fresh_table(model, table, N, np.random.default_rng(5))
+
+
+def test_there_are_as_many_as_asked_each_like_a_measured_one() -> None:
+    _, table, fresh = drawn()
+    assert len(np.unique(fresh.configuration)) == N
+    for c in np.unique(fresh.configuration):
+        own = fresh.take(fresh.configuration == c)
+        assert sorted(own.marker) == sorted(table.marker[table.configuration == 0])
+        assert len(np.unique(own.force, axis=0)) == 2
+        assert len(np.unique(own.q, axis=0)) == 1
+
+
+def test_every_joint_has_been_at_its_angle_and_no_arm_in_its_pose() -> None:
+    """The side of approach comes with the angle of its joint."""
+    _, table, fresh = drawn()
+    for j in range(table.q.shape[1]):
+        pairs = {(a, s) for a, s in zip(table.q[:, j], table.approach[:, j], strict=True)}
+        found = {(a, s) for a, s in zip(fresh.q[:, j], fresh.approach[:, j], strict=True)}
+        assert found <= pairs and len(found) > 10
+    assert not {tuple(q) for q in fresh.q} & {tuple(q) for q in table.q}
+
+
+def test_markers_stay_where_they_were_measured() -> None:
+    model, table, fresh = drawn()
+    was, now = (model.target_poses(t)[1] for t in (table, fresh))
+    assert (now >= was.min(axis=0)).all() and (now <= was.max(axis=0)).all()
+
+
+def test_times_are_the_campaigns_and_one_per_visit() -> None:
+    _, table, fresh = drawn()
+    assert fresh.time.min() >= table.time.min() and fresh.time.max() <= table.time.max()
+    assert np.ptp(fresh.time) > 0.9 * np.ptp(table.time)
+    visits = np.column_stack([fresh.configuration, fresh.force[:, 2]])
+    assert len(np.unique(np.column_stack([visits, fresh.time]), axis=0)) == 2 * N
+    np.testing.assert_allclose(fresh.temperature, 20 + 1e-3 * fresh.time)
+
+
+def test_loaded_and_unloaded_readings_still_pair() -> None:
+    model, _, fresh = drawn("deflection")
+    seen = observe(fresh, "deflection")
+    assert len(seen.lead) == len(fresh) // 2
+    assert np.isfinite(model.predict(fresh, None, seen)).all()
+
+
+def test_the_same_seed_draws_the_same_poses() -> None:
+    model, table, fresh = drawn()
+    again = fresh_table(model, table, N, np.random.default_rng(5))
+    other = fresh_table(model, table, N, np.random.default_rng(6))
+    np.testing.assert_array_equal(again.q, fresh.q)
+    assert not np.array_equal(other.q, fresh.q)
+
+
+def test_where_nothing_recorded_is_there_nothing_is_invented() -> None:
+    model, table, _ = drawn()
+    bare = replace(table, time=None, approach=None, temperature=None)
+    fresh = fresh_table(model, bare, N, np.random.default_rng(5))
+    assert fresh.time is None and fresh.approach is None and fresh.temperature is None
+
+
+@pytest.mark.parametrize("n", [8, 9])
+def test_repeats_keep_their_own_side_of_approach(n: int) -> None:
+    """A configuration that was measured from both sides is met from both sides."""
+    model, table, _ = drawn()
+    few = table.take(table.configuration < n)
+    both = np.concatenate([np.arange(len(few)), np.arange(len(few))])
+    repeated = few.take(both)
+    repeat = (np.arange(len(both)) >= len(few)).astype(np.int64)
+    sides = np.where(repeat[:, None] == 1, -1.0, 1.0) * np.ones_like(repeated.q)
+    repeated = replace(repeated, repeat=repeat, approach=sides)
+    fresh = fresh_table(model, repeated, N, np.random.default_rng(1))
+    np.testing.assert_array_equal(fresh.approach[fresh.repeat == 0], 1.0)
+    np.testing.assert_array_equal(fresh.approach[fresh.repeat == 1], -1.0)

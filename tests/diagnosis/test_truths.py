@@ -1,0 +1,121 @@
+"""Errors that are expected at fresh poses against those that a campaign made there has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from support.cells import kr270_chain
+from support.diagnosis_data import FAULTS, campaign, cell, measured
+
+from elastocal.diagnosis.alike import signal_of
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.confirm import Truth
+from elastocal.diagnosis.found import Found
+from elastocal.diagnosis.generic import generic_blocks
+from elastocal.diagnosis.heldout import squared_lengths
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import Item, fit_set
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.scan import Scan
+from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.diagnosis.truths import DRAWN, NOISES, Confirmation
+
+SILENT = 1e-9
+
+
+@lru_cache
+def confirmation(name: str, wrong_setting: float | None = None) -> tuple[Confirmation, Item]:
+    """After the fault of that name has been found, at its own constants or at another."""
+    model, table = campaign(name)
+    base = fit_baseline(model, table)
+    scene = scene_of(base, possible(model, table)[0])
+    fault = FAULTS[name]
+    (h,) = (h for h in scene.hypotheses if (h.name, h.where) == fault.key)
+    values = [fault.settings[s.key] for s in h.settings]
+    item = Item(h, np.array(values if wrong_setting is None else [wrong_setting]), 0.0)
+    found = _found(scene, (item,))
+    return Confirmation.of(found, base, np.random.default_rng(3)), item
+
+
+def _found(scene: Scene, items: tuple[Item, ...]) -> Found:
+    """Only what the confirmation reads of it."""
+    nothing: Scan = None  # type: ignore[assignment]
+    plain, chosen = fit_set(scene, ()), fit_set(scene, items)
+    return Found(scene, chosen, (), (), plain, nothing, nothing)
+
+
+def rms(rows: np.ndarray) -> float:
+    return float(np.sqrt((rows**2).sum(axis=1).mean()))
+
+
+def of_one(found: Confirmation, item: Item) -> Truth:
+    return found.truths(0, ((item, 1.0),))[0]
+
+
+@pytest.mark.parametrize("name", ["encoder_scale:joint3", "payload_error:load"])
+def test_the_errors_expected_are_those_of_fresh_readings(name: str) -> None:
+    """Before: the effect that the plain fit could not absorb.  After: what noise left."""
+    found, item = confirmation(name)
+    truth = of_one(found, item)
+    fresh = found.seen.table
+    plain = cell(sigma=SILENT)
+    readings = measured(kr270_chain(), plain, [FAULTS[name]], fresh, 1).position.ravel()
+    before, after = (
+        rms((fit.model.predict(fresh, fit.x) - readings).reshape(-1, 3))
+        for fit in (found.plain, found.fitted)
+    )
+    spread = float(np.sqrt((truth.spread**2).sum(axis=(1, 2)).mean()))
+    assert np.hypot(rms(truth.before), spread) == pytest.approx(before, rel=0.25)
+    assert np.hypot(rms(truth.after), spread) == pytest.approx(after, rel=0.5)
+    assert after < 0.5 * before
+
+
+def test_a_constant_that_is_not_known_well_widens_what_is_possible() -> None:
+    found, item = confirmation("gear_ripple:joint5")
+    truth = of_one(found, item)
+    known = len(found.fitted.x)
+    assert truth.spread.shape[2] == known + 1
+    column = found._by_constant(found.fitted, [item], item, found.seen)
+    assert rms(column.reshape(-1, 3)) > 0
+
+
+def test_a_change_time_has_no_slope() -> None:
+    found, item = confirmation("encoder_jump:joint4")
+    assert of_one(found, item).spread.shape[2] == len(found.fitted.x)
+
+
+def test_readings_are_numbered_by_fresh_pose() -> None:
+    found, item = confirmation("encoder_scale:joint3")
+    truth = of_one(found, item)
+    assert len(np.unique(truth.pose)) == DRAWN
+    assert truth.before.shape == truth.after.shape == truth.spread.shape[:2]
+
+
+def test_a_rival_is_held_for_true_as_often_as_it_is_probable() -> None:
+    """Unlikely ones and blocks without a name are no truth; the settings share the item's."""
+    found, item = confirmation("encoder_scale:joint3")
+    others = {(h.name, h.where): h for h in found.scene.hypotheses}
+    rival = Item(others["gear_eccentricity", "joint4"], np.zeros(0), 0.0)
+    block = Item(generic_blocks(found.scene)[0], np.zeros(0), 0.0)
+    truths = found.truths(0, ((item, 0.7), (rival, 0.2), (block, 0.1), (rival, 1e-4)))
+    shares = [t.probability for t in truths]
+    assert shares == pytest.approx([0.07] * NOISES + [0.02] * NOISES)
+    # If the rival were true the model with the item in it would be wrong.
+    assert rms(truths[-1].after) > 3 * rms(truths[0].after)
+
+
+def test_what_has_no_name_is_as_large_as_in_the_readings() -> None:
+    found, item = confirmation("encoder_scale:joint3")
+    assert found.unnamed == 0.0
+    (block,) = (
+        b for b in generic_blocks(found.scene) if (b.driver, b.where) == ("joint3 angle", "joint3")
+    )
+    noise = NoiseValues.usual(6)
+    only = fit_set(found.scene, (Item(block, np.zeros(0), 0.0),), noise)
+    unnamed = replace(found, chosen=only).unnamed
+    named = fit_set(found.scene, (item,), noise)
+    squares, count = squared_lengths(found.scene.data, signal_of(found.scene, named, 0))
+    assert unnamed == pytest.approx(float(squares.sum() / count.sum()), rel=0.5)
