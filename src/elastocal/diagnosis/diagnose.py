@@ -27,6 +27,7 @@ from elastocal.diagnosis.result import Diagnosis, Finding
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.screen import Screened, screen
 from elastocal.diagnosis.search import Search
+from elastocal.diagnosis.thin import thinned
 from elastocal.diagnosis.truths import Confirmation
 from elastocal.diagnosis.uncertain_settings import between_visits
 from elastocal.diagnosis.verdict import Answer, judge
@@ -58,6 +59,7 @@ def diagnose(
     options = options or DiagnosisOptions()
     check_table(model, table)
     _check_enough(table)
+    table, left_out = thinned(table)
     model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")
     base = fit_baseline(model, table, options.seed)
@@ -90,7 +92,7 @@ def diagnose(
         p_value=found.p_values[0] if found.p_values else p_first,
         curves=curves_of(found.scene, chosen),
         untested=(*untested, *too_small(scene, found)),
-        warnings=warnings(scene, found, screened),
+        warnings=(*filter(None, [left_out]), *warnings(scene, found, screened)),
         n_readings=scene.blocks.n,
         n_configurations=len(scene.blocks.member),
         model_keys=model_keys(base.model, findings),

@@ -21,6 +21,7 @@ from elastocal.diagnosis.separate_result import ExtraPlan, RivalPair
 from elastocal.diagnosis.separate_rivals import RivalSet, Suspects, check_open
 from elastocal.diagnosis.separate_rows import campaign_of, rows_of
 from elastocal.diagnosis.separate_search import ENOUGH, expected, expected_of_random, fewest
+from elastocal.diagnosis.thin import thinned
 from elastocal.errors import InsufficientDataError, require
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
@@ -60,6 +61,7 @@ def plan_extra(
         spec = replace(model.cell.model, torque="computed")
         model = Model(model.chain, replace(model.cell, model=spec))
         notes.append("torques of poses not measured yet are computed from load and weights")
+    table, _ = thinned(table)
     model = with_recorded_drivers(model, table, diagnosis)
     suspects = Suspects(model, table, diagnosis)
     progress("extra poses: fitting the model as it is")

@@ -1,0 +1,56 @@
+"""Of a large table a part is looked at, from its first hour to its last, and that is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from support.diagnosis_data import campaign
+
+from elastocal.diagnosis.thin import MOST_IN_ONE, MOST_ROWS, thinned
+from elastocal.manipulator.observation import observe
+from elastocal.measurements import Measurements
+
+
+def repeated(times: int, poses: int = 40) -> Measurements:
+    """The campaign of 40 poses over and over, as `times` · 40 configurations."""
+    table = campaign("encoder_scale:joint3")[1]
+    table = table.take(table.configuration < poses)
+    every = table.take(np.tile(np.arange(len(table)), times))
+    lap = np.repeat(np.arange(times), len(table))
+    labels = tuple(str(k) for k in range(times * poses))
+    return replace(
+        every, configuration=every.configuration + poses * lap, configuration_labels=labels,
+        row=np.arange(len(every)) + 2, time=every.time + (table.time.max() + 30.0) * lap,
+    )  # fmt: skip
+
+
+def test_a_small_table_is_looked_at_whole() -> None:
+    table = campaign("encoder_scale:joint3")[1]
+    assert thinned(table) == (table, None)
+
+
+def test_configurations_stay_whole_and_evenly_spaced() -> None:
+    table = repeated(100)
+    kept, said = thinned(table)
+    assert 0.9 * MOST_ROWS < len(kept) <= MOST_ROWS
+    assert f"{len(kept)} of {len(table)} rows" in said
+    assert (np.bincount(kept.configuration)[np.unique(kept.configuration)] == 6).all()
+    times = np.unique(kept.time)
+    assert np.ptp(times) > 0.99 * np.ptp(table.time)
+    assert np.diff(times).max() < 10 * np.ptp(table.time) / len(times)
+
+
+def test_many_readings_of_one_configuration_are_thinned_alike() -> None:
+    """As many of each marker, loaded and unloaded, so that deflections still pair."""
+    table = campaign("encoder_scale:joint3")[1]
+    times = 50
+    every = table.take(np.tile(np.arange(len(table)), times))
+    every = replace(every, repeat=np.repeat(np.arange(times), len(table)))
+    kept, said = thinned(every)
+    assert said is not None
+    one = kept.take(kept.configuration == 7)
+    assert len(one) == MOST_IN_ONE
+    counts = np.unique(np.column_stack([one.marker, one.force[:, 2]]), axis=0, return_counts=True)
+    assert (counts[1] == MOST_IN_ONE // 6).all()
+    assert len(observe(kept, "deflection").lead) == len(kept) // 2
