@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.diagnosis_data import SIGMA, diagnosed, random_data
+from support.diagnosis_data import SIGMA, campaign, diagnosed, random_blocks, random_data
 
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.budget import _left_out_together
 from elastocal.diagnosis.heldout import (
+    blocks_of_time,
     left_out_residual,
     noise_rms,
     rms_with_interval,
     squared_lengths,
 )
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import Item, fit_set
 from elastocal.diagnosis.noise import NoiseValues, covariance, project
+from elastocal.diagnosis.scene import scene_of
 
 NOISE = NoiseValues(1.2, np.array([4e-6, 9e-6, 1e-5]), 0.4)
 SEEDS = range(4)
@@ -30,6 +36,46 @@ def test_left_out_residuals_are_those_of_fits_without_the_configuration(seed: in
         beta = np.linalg.solve(M + np.diag(data.precision), z)
         expected = r[c] - X[c] @ beta
         np.testing.assert_allclose(found[c], expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_groups_are_left_out_together(seed: int) -> None:
+    data = random_data(seed)
+    together = np.array([0, 1, 0, 2, 1])
+    found = left_out_residual(project(data, NOISE), together)
+    inverse, X, r = np.linalg.inv(covariance(data, NOISE)), data.masked(data.X), data.masked(data.r)
+    for g in range(3):
+        rest = together != g
+        M = np.einsum("cmp,cmn,cnq->pq", X[rest], inverse[rest], X[rest])
+        z = np.einsum("cmp,cmn,cn->p", X[rest], inverse[rest], r[rest])
+        beta = np.linalg.solve(M + np.diag(data.precision), z)
+        expected = (r - X @ beta)[~rest]
+        np.testing.assert_allclose(found[~rest], expected, rtol=1e-6, atol=1e-12)
+    alone = left_out_residual(project(data, NOISE), np.arange(5))
+    np.testing.assert_allclose(alone, left_out_residual(project(data, NOISE)), rtol=1e-6)
+
+
+def test_blocks_of_time_follow_each_other() -> None:
+    """By the first reading of each configuration, whatever the order of the rows."""
+    blocks = random_blocks(3, sizes=(3, 2) * 15)
+    time = np.random.default_rng(0).uniform(0, 100, blocks.n)
+    first = np.append(time, np.inf)[blocks.member].min(axis=1)
+    tenth = blocks_of_time(blocks, time)
+    assert np.bincount(tenth).tolist() == [3] * 10
+    assert (np.diff(tenth[np.argsort(first)]) >= 0).all()
+
+
+def test_a_drift_is_judged_on_hours_that_were_left_out() -> None:
+    """Between two neighbours it needs no model; what does not go with time is left out singly."""
+    model, table = campaign("thermal_expansion:link2")
+    base = fit_baseline(model, table)
+    scene = scene_of(base, possible(model, table)[0])
+    (h,) = (h for h in scene.hypotheses if (h.name, h.where) == ("thermal_expansion", "link2"))
+    chosen = fit_set(scene, (Item(h, np.array([1200.0]), 0.0),))
+    drift = _left_out_together(scene, chosen)
+    assert drift is not None and len(np.unique(drift)) == 10
+    (still,) = (h for h in scene.hypotheses if h.label == "encoder_scale at joint3")
+    assert _left_out_together(scene, fit_set(scene, (Item(still, np.zeros(0), 0.0),))) is None
 
 
 @pytest.mark.parametrize("seed", SEEDS)

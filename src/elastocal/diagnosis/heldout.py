@@ -1,4 +1,4 @@
-"""Errors on configurations left out of the fit, in closed form."""
+"""Errors on configurations, or blocks of time, left out of the fit, in closed form."""
 
 from __future__ import annotations
 
@@ -10,13 +10,40 @@ from elastocal.diagnosis.noise import NoiseValues, NoisyData, Projection, covari
 
 Array = NDArray[np.float64]
 
+Labels = NDArray[np.int64]
+
 DRAWS = 1000
+TENTHS = 10  # blocks of time that are left out in turn
 
 
-def left_out_residual(at: Projection) -> Array:
-    """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others."""
-    P = at.inverse - at.H @ at.H.transpose(0, 2, 1)
-    return np.asarray(np.linalg.solve(P, at.u[..., None])[..., 0])
+def left_out_residual(at: Projection, together: Labels | None = None) -> Array:
+    """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others.
+
+    `together` (C,) numbers the group that each is left out with; by itself where None.  For a
+    group, with V and H of its configurations,
+
+        P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
+    """
+    if together is None:
+        P = at.inverse - at.H @ at.H.transpose(0, 2, 1)
+        return np.asarray(np.linalg.solve(P, at.u[..., None])[..., 0])
+    Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
+    out = Vu[..., 0]
+    for g in np.unique(together):
+        own = together == g
+        H = at.H[own]
+        inner = np.eye(H.shape[2]) - np.einsum("cmp,cmq->pq", H, VH[own])
+        z = np.linalg.solve(inner, np.einsum("cmp,cm->p", H, Vu[own, :, 0]))
+        out[own] += VH[own] @ z
+    return np.asarray(out)
+
+
+def blocks_of_time(blocks: Blocks, time: Array) -> Labels:
+    """Which tenth of the campaign (C,) each configuration was first measured in; `time` (N,)."""
+    padded = np.append(time, np.inf)
+    first = padded[blocks.member].min(axis=1)
+    order = np.argsort(np.argsort(first, kind="stable"), kind="stable")
+    return np.asarray(order * TENTHS // len(first))
 
 
 def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
