@@ -19,7 +19,6 @@ from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.manipulator.model import Model
 
 EFFECT, KEY, BY_LOAD, BY_BOTH = "backlash", "play_side", "load", "load_and_approach"
-TRIED = 2  # joints whose play is fitted under each law
 
 
 def with_likelier_play(scene: Scene) -> Scene:
@@ -37,8 +36,10 @@ def with_likelier_play(scene: Scene) -> Scene:
     under_other = replace(under_other, data=replace(under_other.data, left_out=scene.data.left_out))
     if _best(under_other, noise) <= _best(scene, noise):
         return scene
-    fresh = scene_of(other, list(scene.hypotheses))
-    return replace(fresh, data=replace(fresh.data, left_out=scene.data.left_out))
+    rows = scene.columns.rows.copy()
+    for h in play:
+        rows[:, :, scene.columns.places[h.name, h.where]] = under_other.columns.of(h)
+    return replace(scene, base=other, columns=replace(scene.columns, base=other, rows=rows))
 
 
 def _under(base: Baseline, law: str) -> Baseline:
@@ -48,9 +49,9 @@ def _under(base: Baseline, law: str) -> Baseline:
 
 
 def _best(scene: Scene, noise: NoiseValues) -> float:
-    """Highest log evidence of play in one joint, the noise fitted beside it."""
+    """Log evidence of play in the joint where it is likeliest, the noise fitted beside it."""
     play = [h for h in scene.hypotheses if h.name == EFFECT]
     grams = Grams(scene, scene.data, project(scene.data, noise))
     evidence = [float(grams.of_hypothesis(h).evidence(scales_of(h)).max()) for h in play]
-    likeliest = [play[i] for i in np.argsort(evidence)[::-1][:TRIED]]
-    return max(fit_set(scene, (Item(h, np.zeros(0), 0.0),), noise).score for h in likeliest)
+    likeliest = play[int(np.argmax(evidence))]
+    return fit_set(scene, (Item(likeliest, np.zeros(0), 0.0),), noise).score

@@ -36,16 +36,27 @@ def relinearised(scene: Scene, chosen: ModelSet) -> Scene:
     fitted = fit_extended(scene, chosen, [chosen.items[k] for k in _direct(chosen)])
     model = fitted.model
     x = dict(zip(model.names, fitted.x, strict=True))
-    added = np.array([k for k, name in enumerate(model.names) if name not in base.model.names])
-    B = model.regressor(base.seen.table, fitted.x, added, base.seen).B
-    away = np.array([fitted.x[k] - model.parameters[k].nominal for k in added])
     moved = replace(
-        base,
-        x=np.array([x[name] for name in base.model.names]),
-        residual=fitted.residual + B @ away,
+        base, x=np.array([x[name] for name in base.model.names]), residual=fitted.residual
     )
     fresh = scene_of(moved, list(scene.hypotheses), model, fitted.x)
-    return replace(fresh, data=replace(fresh.data, left_out=scene.data.left_out))
+    # Put back by the scene's own columns, which will have to explain it: those of the equilibrium
+    # differ from them by a thousandth, and a large effect is a thousand deviations.
+    back = np.zeros((*fitted.residual.reshape(-1, base.seen.size).shape, 1))
+    for k in _direct(chosen):
+        what = chosen.items[k].what
+        assert isinstance(what, Hypothesis)
+        away = [x[f"{what.where}.{p.key}"] - p.nominal for p in what.parameters]
+        back[:, :, 0] += fresh.columns.observed(fresh.columns.of(what)) @ np.array(away)
+    return replace(
+        fresh,
+        base=replace(moved, residual=fitted.residual + back.ravel()),
+        data=replace(
+            fresh.data,
+            r=fresh.data.r + fresh.blocks.pack(back)[:, :, 0],
+            left_out=scene.data.left_out,
+        ),
+    )
 
 
 def _direct(chosen: ModelSet) -> list[int]:

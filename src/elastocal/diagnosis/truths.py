@@ -15,10 +15,10 @@ from elastocal.diagnosis.estimate import fit_extended
 from elastocal.diagnosis.extend import extended
 from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.fresh import fresh_table
-from elastocal.diagnosis.heldout import squared_lengths
+from elastocal.diagnosis.heldout import left_out_residual, squared_lengths
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
-from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.model_set import Item, ModelSet, beside, fit_set
+from elastocal.diagnosis.noise import NoiseValues, project
 from elastocal.diagnosis.noise_draws import noise_draws
 from elastocal.diagnosis.refit import Linear, Posterior
 from elastocal.diagnosis.scene import Scene
@@ -90,12 +90,15 @@ class Confirmation:
 
     @property
     def unnamed(self) -> float:
-        """Mean squared length (m²) of what is in the set without a name."""
+        """Mean squared length (m²) of what is in the set without a name, of each block what the
+        fitted parameters cannot follow: the error of configurations left out of a fit to it."""
         total = 0.0
         for k, item in enumerate(self.chosen.items):
             if not item.known:
                 signal = signal_of(self.scene, self.chosen, k)
-                squares, count = squared_lengths(self.scene.data, signal)
+                alone = replace(beside(self.scene, self.chosen, k), r=signal)
+                error = left_out_residual(project(alone, self.chosen.noise.of_instrument()))
+                squares, count = squared_lengths(alone, alone.masked(error))
                 total += float(squares.sum() / count.sum())
         return total
 
