@@ -46,7 +46,13 @@ def relinearised(scene: Scene, chosen: ModelSet) -> Scene:
     for k in _direct(chosen):
         what = chosen.items[k].what
         assert isinstance(what, Hypothesis)
-        away = [x[f"{what.where}.{p.key}"] - p.nominal for p in what.parameters]
+        # What an effect tries from several starts has no size about any of them.
+        starts = what.effect.starts(what.where, model.chain, model.cell)
+        open_keys = {key for start in starts for key in start}
+        away = [
+            0.0 if p.key in open_keys else x[f"{what.where}.{p.key}"] - p.nominal
+            for p in what.parameters
+        ]
         back[:, :, 0] += fresh.columns.observed(fresh.columns.of(what)) @ np.array(away)
     return replace(
         fresh,

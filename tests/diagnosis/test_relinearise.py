@@ -1,0 +1,57 @@
+"""About the exact fit the linear scene leaves exactly what the exact fit leaves."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from support.diagnosis_data import campaign
+
+from elastocal.diagnosis.baseline import Baseline, fit_baseline
+from elastocal.diagnosis.estimate import fit_extended
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
+from elastocal.diagnosis.relinearise import is_far, relinearised
+from elastocal.diagnosis.scene import Scene, away, scene_of
+
+SPRING = ("gravity_compensator", "joint2")
+
+
+@lru_cache
+def about_the_spring() -> tuple[Scene, Scene, ModelSet, Baseline]:
+    """The scene before and after, the set with the spring, and the exact fit with it."""
+    model, table = campaign(":".join(SPRING))
+    base = fit_baseline(model, table)
+    scene = scene_of(base, possible(model, table)[0])
+    (h,) = (h for h in scene.hypotheses if (h.name, h.where) == SPRING)
+    chosen = fit_set(scene, (Item(h, np.zeros(0), 0.0),))
+    return scene, relinearised(scene, chosen), chosen, fit_extended(scene, chosen, chosen.items)
+
+
+def test_the_residual_at_the_exact_fit_is_that_of_the_exact_fit() -> None:
+    """A spring makes a signal of hundreds of deviations: a thousandth of it would not do."""
+    scene, fresh, chosen, exact = about_the_spring()
+    assert is_far(scene, chosen)
+    h = chosen.items[0].what
+    x = dict(zip(exact.model.names, exact.x, strict=True))
+    moved = np.array([x[f"{h.where}.{p.key}"] - p.nominal for p in h.parameters])
+    moved[1:3] = 0.0  # the anchor may be anywhere about the joint: it has no size from the example
+    explained = fresh.packed(h, np.zeros(0)) @ (moved / fresh.sizes[SPRING])
+    width = fresh.fitted.width
+    beta = np.zeros(len(width))
+    n = len(away(fresh.base))
+    shown = np.abs(exact.model.regressor(exact.seen.table, exact.x).B[:, :n]).max(axis=0) > 0
+    assert shown.sum() <= len(beta)
+    beta[: shown.sum()] = (away(fresh.base)[shown]) / width[: shown.sum()]
+    left = fresh.data.r - fresh.data.X @ beta - explained
+    expected = fresh.blocks.pack(exact.residual.reshape(-1, 3, 1))[:, :, 0]
+    np.testing.assert_allclose(left, expected, atol=1e-9)
+
+
+def test_the_spring_leaves_nothing_for_its_imitators() -> None:
+    """Before, its geometry is linearised where it is not, and eccentricity takes up the rest."""
+    _, fresh, chosen, _ = about_the_spring()
+    (other,) = (h for h in fresh.hypotheses if h.label == "gear_eccentricity at joint2")
+    alone = fit_set(fresh, chosen.items, chosen.noise)
+    both = fit_set(fresh, (*chosen.items, Item(other, np.zeros(0), 0.0)), chosen.noise)
+    assert both.score < alone.score + 5
