@@ -25,7 +25,7 @@ LAYERS = (
     {"simulation", "identification"},
     {"design", "diagnosis", "compensation", "export"},
     {"report"},
-    {"demo", "study"},
+    {"demo"},
     {"cli", "__main__"},
 )
 

@@ -1,0 +1,252 @@
+"""elastocal study: the command, its messages and exit codes, Ctrl-C and SIGTERM."""
+
+import builtins
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pandas as pd
+import pytest
+from rich.console import Console
+from support.study_folders import SCRIPT, numbers, run_study, write_study
+from typer.testing import CliRunner
+
+from elastocal.cli import app
+from elastocal.cli.study_progress import StudyProgress
+from elastocal.studies.dataset import read_results
+
+# A child may inherit that SIGINT is ignored; here it must not.
+PROGRAM = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from elastocal.cli import main; main()"
+)
+SUMMARY = """
+
+def summary(frame):
+    return f"rows: {len(frame)}, tasks in order: {list(frame.task.unique()) == sorted(frame.task)}"
+"""
+SLOW = "import time\n" + SCRIPT.replace("    x = rng", "    time.sleep({sleep})\n    x = rng")
+
+
+def study(*arguments):
+    return CliRunner().invoke(app, ["study", *map(str, arguments)])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_study(tmp_path / "study")
+
+
+def test_it_runs_once_and_then_finds_nothing_to_do(folder):
+    first = study(folder, "--jobs", 1)
+    assert first.exit_code == 0, first.stderr
+    assert first.stdout == f"12 of 12 tasks done; results in {folder / 'results'}\n"
+    assert "… 12/12 tasks" in first.stderr and "per minute" in first.stderr
+    second = study(folder, "--jobs", 1, "--no-progress")
+    assert second.exit_code == 0 and "12 of 12 tasks done (12 were there)" in second.stdout
+    assert second.stderr == ""
+
+
+def test_options_seed_output_and_only(folder, tmp_path):
+    out = tmp_path / "elsewhere"
+    arguments = (folder, "--jobs", 1, "--seed", 3, "--set", "replicates=2", "-o", out)
+    assert "1 of 1 tasks done;" in study(*arguments, "--only", 1).stdout
+    assert "4 of 4 tasks done (1 were there);" in study(*arguments).stdout
+    assert set(numbers(out)["replicate"]) == {0, 1} and not (folder / "results").exists()
+
+
+def test_a_summary_is_written_once_all_is_there(tmp_path):
+    script = SCRIPT + SUMMARY.replace("sorted(frame.task)", "sorted(set(frame.task))")
+    folder = write_study(tmp_path / "study", script)
+    study(folder, "--jobs", 1, "--only", 3)
+    assert not (folder / "result.md").exists()
+    told = study(folder, "--jobs", 1)
+    assert (folder / "result.md").read_text() == "rows: 24, tasks in order: True\n"
+    assert told.stdout.endswith("rows: 24, tasks in order: True\n")
+    study(folder, "--jobs", 1, "-o", tmp_path / "other")
+    assert (tmp_path / "other.md").read_text() == "rows: 24, tasks in order: True\n"
+
+
+def test_a_wrong_summary_keeps_the_results(tmp_path):
+    script = SCRIPT + "\n\ndef summary(frame):\n    return frame.of_no_such_column\n"
+    folder = write_study(tmp_path / "study", script)
+    told = study(folder, "--jobs", 1)
+    assert told.exit_code == 2
+    assert "study.py, line 13: summary() raised AttributeError" in told.stderr
+    assert len(numbers(folder / "results")) == 24
+
+
+def test_failures_end_with_exit_1_and_their_number(tmp_path):
+    script = SCRIPT.replace("    x = rng", '    1 / (task["replicate"] - 2)\n    x = rng')
+    folder = write_study(tmp_path / "study", script + SUMMARY)
+    told = study(folder, "--jobs", 1)
+    assert told.exit_code == 1
+    assert "10 of 12 tasks done, 2 failed; results in" in told.stdout
+    assert "first failure: task 2: ZeroDivisionError: division by zero" in told.stdout
+    assert "_failures.log; --retry-failed" in told.stdout
+    assert "2 failed" in told.stderr and "Traceback" not in told.stdout + told.stderr
+    assert not (folder / "result.md").exists()
+
+
+def test_a_changed_study_is_refused_and_started_anew_on_demand(folder):
+    study(folder, "--jobs", 1)
+    told = study(folder, "--jobs", 1, "--seed", 4)
+    assert told.exit_code == 2 and "the seed was 11, now it is 4" in told.stderr
+    assert study(folder, "--jobs", 1, "--seed", 4, "--restart").exit_code == 0
+    assert study(folder, "--jobs", 1, "--seed", 4).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--set", "replicats=3"), "did you mean 'replicates'?"),
+        (("--jobs", "2", "--cluster", "config"), "--jobs is for this machine"),
+        (("-o", "{folder}"), "holds study.py, study.toml, which no study wrote"),
+    ],
+)
+def test_wrong_arguments_are_told(folder, arguments, told):
+    result = study(folder, *(a.format(folder=folder) for a in arguments))
+    assert result.exit_code == 2
+    assert told in result.stderr and "Traceback" not in result.stderr
+
+
+def test_a_folder_without_a_study_is_told(tmp_path):
+    assert "no such folder" in study(tmp_path / "none").stderr
+    result = study(tmp_path)
+    assert result.exit_code == 2 and "holds no study.py" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("missing", "arguments", "told"),
+    [
+        ("pyarrow", (), "pip install 'elastocal[parquet]'"),
+        ("distributed", ("--cluster", "config"), "pip install 'elastocal[cluster]'"),
+    ],
+)
+def test_a_missing_extra_is_named(folder, monkeypatch, missing, arguments, told):
+    imported = builtins.__import__
+
+    def without(name, *rest, **more):
+        if name.partition(".")[0] == missing:
+            raise ImportError(name)
+        return imported(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    result = study(folder, *arguments)
+    assert result.exit_code == 2 and told in result.stderr
+    assert not list(folder.glob("results/part-*"))
+
+
+def begin(folder, *arguments, **how):
+    command = [sys.executable, "-c", PROGRAM, "study", str(folder), "--no-progress", *arguments]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **how
+    )
+
+
+def slow_study(tmp_path, sleep):
+    """Tasks that last, and a folder in which each leaves a mark as it begins."""
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    script = SLOW.replace("{sleep}", str(sleep))
+    script = script.replace(
+        "    time.sleep",
+        f'    open("{marks}/" + str(task["n"]) + "_" + str(task["replicate"]), "w").close()\n'
+        "    time.sleep",
+    )
+    return write_study(tmp_path / "study", script), marks
+
+
+def wait_for(marks, number, process):
+    while len(os.listdir(marks)) < number:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.01)
+
+
+posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+
+
+@posix
+@pytest.mark.parametrize(
+    ("jobs", "number", "whole_group"),
+    [("1", signal.SIGINT, False), ("2", signal.SIGINT, True), ("2", signal.SIGTERM, False)],
+)
+def test_an_interrupted_study_goes_on_and_ends_as_an_undisturbed_one(
+    tmp_path, jobs, number, whole_group
+):
+    folder, marks = slow_study(tmp_path, 0.15)
+    with begin(folder, "--jobs", jobs, start_new_session=True) as process:
+        wait_for(marks, 4, process)
+        if whole_group:  # as Ctrl-C in a terminal does
+            os.killpg(process.pid, number)
+        else:
+            process.send_signal(number)
+        out, told = process.communicate(timeout=60)
+    assert process.returncode == 130, told
+    assert "stopping: the running tasks have" in told and "Traceback" not in told
+    assert "the same command goes on with the rest" in out
+    kept = read_results(folder / "results")
+    begun = len(os.listdir(marks))
+    assert 4 <= begun < 12
+    assert kept["task"].nunique() == begun  # what ran was waited for
+    assert study(folder, "--jobs", jobs).exit_code == 0
+    run_study(folder, tmp_path / "undisturbed")
+    pd.testing.assert_frame_equal(numbers(folder / "results"), numbers(tmp_path / "undisturbed"))
+
+
+@posix
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_second_interrupt_stops_at_once(tmp_path, jobs):
+    folder, marks = slow_study(tmp_path, '0.01 if task["replicate"] < 2 else 600')
+    with begin(folder, "--jobs", jobs) as process:
+        wait_for(marks, 2 + int(jobs), process)
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.3)
+        out, told = process.communicate(timeout=30)
+    assert process.returncode == 130 and "Traceback" not in told
+    assert "2 of 12 tasks done;" in out
+    assert set(read_results(folder / "results")["task"]) == {0, 1}
+
+
+@posix
+def test_a_killed_study_leaves_nothing_half_written(tmp_path):
+    folder, marks = slow_study(tmp_path, 0.05)
+    with begin(folder, "--jobs", "1") as process:
+        wait_for(marks, 6, process)
+        process.kill()
+    assert study(folder, "--jobs", "1").exit_code == 0
+    run_study(folder, tmp_path / "undisturbed")
+    pd.testing.assert_frame_equal(numbers(folder / "results"), numbers(tmp_path / "undisturbed"))
+
+
+@posix
+def test_a_study_on_a_cluster_is_interrupted_and_goes_on(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    folder, marks = slow_study(tmp_path, 0.15)
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+    ) as cluster:
+        arguments = ("--cluster", cluster.scheduler_address)
+        with begin(folder, *arguments) as process:
+            wait_for(marks, 4, process)
+            process.send_signal(signal.SIGINT)
+            _, told = process.communicate(timeout=60)
+        assert process.returncode == 130 and "Traceback" not in told
+        assert read_results(folder / "results")["task"].nunique() == len(os.listdir(marks)) < 12
+        assert study(folder, *arguments).exit_code == 0
+    run_study(folder, tmp_path / "undisturbed")
+    pd.testing.assert_frame_equal(numbers(folder / "results"), numbers(tmp_path / "undisturbed"))
+
+
+def test_a_terminal_sees_a_bar_with_rate_and_time_left(monkeypatch):
+    screen = Console(file=io.StringIO(), force_terminal=True, width=120)
+    monkeypatch.setattr("elastocal.cli.study_progress.console", lambda stderr: screen)
+    with StudyProgress(True) as progress:
+        progress.begin(40, 10, 1)
+        progress.advance(True)
+    last = screen.file.getvalue().rpartition("━")[2]
+    assert "11/40 tasks" in last and "per minute" in last and "left, 2 failed" in last

@@ -1,0 +1,212 @@
+"""On a Dask cluster of two workers: the same numbers, whichever of them dies."""
+
+import os
+import signal
+import threading
+import time
+
+import pandas as pd
+import pytest
+from support.study_folders import numbers, run_study, write_study
+
+from elastocal.errors import InputError
+from elastocal.studies.cluster import run_at
+from elastocal.studies.cluster_client import ClusterLostError, connect
+from elastocal.studies.dataset import read_results
+from elastocal.studies.stopping import Stop
+
+dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
+distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+
+# A task notes that it began; where told so, it kills its worker after that.
+MARKED = """\
+import os, signal, time
+from pathlib import Path
+
+HERE = Path("{marks}")
+LETHAL = {lethal}
+
+
+def tasks(options):
+    return [{{"n": 4, "label": "marked", "replicate": k}} for k in range({count})]
+
+
+def run(task, rng):
+    k = task["replicate"]
+    (HERE / f"{{k}}_{{os.urandom(4).hex()}}").touch()
+    times = len(list(HERE.glob(f"{{k}}_*")))
+    if times <= LETHAL.get(k, 0):
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep({sleep})
+    return {{"mean": rng.normal(), "inside": True, "above": 1}}
+"""
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two worker processes that are replaced when they die; a task may be killed twice."""
+    settings = {"distributed.scheduler.allowed-failures": 2}
+    with (
+        dask.config.set(settings),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+        ) as cluster,
+    ):
+        yield cluster
+
+
+def marked(tmp_path, lethal=None, count=12, sleep=0.02):
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    script = MARKED.format(marks=marks, lethal=lethal or {}, count=count, sleep=sleep)
+    return write_study(tmp_path / "study", script), marks
+
+
+def at(address, stop=None, told=None):
+    stop, told = stop or Stop(), [] if told is None else told
+    return lambda study: (
+        lambda jobs: run_at(address, study.package, study.digest, jobs, stop, told.append)
+    )
+
+
+def begun(marks):
+    return [int(path.name.partition("_")[0]) for path in marks.iterdir()]
+
+
+def test_the_numbers_are_those_of_one_process(cluster, tmp_path):
+    folder = write_study(tmp_path / "study")
+    run_study(folder, tmp_path / "here")
+    run_study(folder, tmp_path / "there", at(cluster.scheduler_address))
+    pd.testing.assert_frame_equal(numbers(tmp_path / "there"), numbers(tmp_path / "here"))
+
+
+def test_a_worker_that_dies_in_the_middle_costs_nothing(cluster, tmp_path):
+    folder, marks = marked(tmp_path, lethal={5: 1})
+    ending = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
+    assert (ending.done, ending.failed) == (12, 0)
+    assert begun(marks).count(5) == 2  # it was killed, and ran again
+    killed = numbers(tmp_path / "r")
+    assert list(killed["task"]) == list(range(12))
+    run_study(folder, tmp_path / "undisturbed")
+    pd.testing.assert_frame_equal(killed, numbers(tmp_path / "undisturbed"))
+
+
+def test_a_worker_that_is_killed_from_outside_costs_nothing(cluster, tmp_path):
+    folder, marks = marked(tmp_path, count=40)
+
+    def kill_one():
+        while len(list(marks.iterdir())) < 8:
+            time.sleep(0.01)
+        with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
+            os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+        killed.set()
+
+    killed = threading.Event()
+    threading.Thread(target=kill_one, daemon=True).start()
+    ending = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
+    assert killed.wait(10)
+    assert (ending.done, ending.failed) == (40, 0)
+    assert list(numbers(tmp_path / "r")["task"]) == list(range(40))
+
+
+def test_a_task_that_always_kills_its_worker_fails_and_is_told(cluster, tmp_path):
+    folder, marks = marked(tmp_path, lethal={3: 10**6}, count=8)
+    ending = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
+    assert (ending.done, ending.failed) == (7, 1)
+    assert begun(marks).count(3) == 3
+    (error,) = read_results(tmp_path / "r", failed=True)["task_error"]
+    assert error.startswith("its worker process died 3 times")
+
+
+def test_others_on_the_same_worker_are_not_blamed(tmp_path):
+    folder, marks = marked(tmp_path, lethal={1: 10**6}, count=6, sleep=0.2)
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=4, processes=True, dashboard_address=":0"
+        ) as crowded,
+    ):
+        ending = run_study(folder, tmp_path / "r", at(crowded.scheduler_address))
+    assert (ending.done, ending.failed) == (5, 1)
+    assert begun(marks).count(1) == 2
+    assert list(numbers(tmp_path / "r")["task"]) == [0, 2, 3, 4, 5]
+
+
+def test_a_cluster_that_gets_its_workers_later(tmp_path):
+    folder, _ = marked(tmp_path, count=4)
+    told = []
+    with distributed.LocalCluster(
+        n_workers=0, threads_per_worker=1, processes=False, dashboard_address=":0"
+    ) as empty:
+        threading.Timer(1.5, empty.scale, (1,)).start()
+        ending = run_study(folder, tmp_path / "r", at(empty.scheduler_address, told=told))
+    assert ending.done == 4
+    assert told == ["the cluster has no worker; waiting for one"]
+
+
+def test_a_task_that_raises_fails_alone(cluster, tmp_path):
+    folder, _ = marked(tmp_path)
+    script = (
+        (folder / "study.py")
+        .read_text()
+        .replace("    time.sleep", "    k == 2 and 1 / 0\n    time.sleep")
+    )
+    write_study(folder, script)
+    ending = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
+    assert (ending.done, ending.failed) == (11, 1)
+    assert "line" in (tmp_path / "r" / "_failures.log").read_text("utf-8")
+
+
+def test_a_stop_waits_for_what_is_out_and_the_rest_runs_later(cluster, tmp_path):
+    folder, marks = marked(tmp_path, count=30)
+    stop = Stop()
+
+    def ask():
+        while len(list(marks.iterdir())) < 6:
+            time.sleep(0.01)
+        stop.asked = True
+
+    threading.Thread(target=ask, daemon=True).start()
+    first = run_study(folder, tmp_path / "r", at(cluster.scheduler_address, stop), stop=stop)
+    assert first.stopped and 6 <= first.done < 30
+    assert first.done == len(begun(marks))
+    second = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
+    assert (second.before, second.done) == (first.done, 30)
+    assert sorted(begun(marks)) == list(range(30))
+
+
+def test_a_cluster_in_the_configuration_of_dask(cluster, tmp_path):
+    folder, _ = marked(tmp_path, count=3)
+    with dask.config.set({"scheduler-address": cluster.scheduler_address}):
+        assert run_study(folder, tmp_path / "r", at("config")).done == 3
+
+
+def test_no_scheduler_is_told(monkeypatch):
+    monkeypatch.setattr("elastocal.studies.cluster_client.ANSWER", 0.5)
+    nothing = dask.config.set({"scheduler-address": None})
+    with nothing, pytest.raises(InputError, match="names no scheduler"):
+        connect("config")
+    with pytest.raises(InputError, match="no scheduler answers"):
+        connect("tcp://127.0.0.1:9")
+    with pytest.raises(InputError, match="--cluster"):
+        connect("nowhere at all")
+
+
+def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path, monkeypatch):
+    monkeypatch.setattr("elastocal.studies.cluster.PATIENCE", 1.0)
+    folder, marks = marked(tmp_path, count=200, sleep=0.05)
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0"
+    )
+
+    def close():
+        while len(list(marks.iterdir())) < 5:
+            time.sleep(0.01)
+        cluster.close()
+
+    threading.Thread(target=close, daemon=True).start()
+    with pytest.raises(ClusterLostError, match="went away"):
+        run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
+    kept = read_results(tmp_path / "r")
+    assert 3 <= len(kept) < 200
+    assert run_study(folder, tmp_path / "r", only=len(kept) + 5).before >= len(kept)

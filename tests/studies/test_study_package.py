@@ -1,0 +1,156 @@
+"""What travels to a worker, and what a worker imports."""
+
+import sys
+
+import pytest
+from support.study_folders import SCRIPT, TOML, write_study
+
+from elastocal.errors import InputError
+from elastocal.studies.conduct import prepare
+from elastocal.studies.definition import read_definition
+from elastocal.studies.execution import execute
+from elastocal.studies.package import Package, pack
+
+WITH_PARTS = """\
+from pathlib import Path
+
+import study_part_of_test
+
+
+def tasks(options):
+    return [{"k": 0}]
+
+
+def run(task, rng):
+    text = (Path(__file__).parent / "data" / "number.txt").read_text()
+    return {"mean": study_part_of_test.FACTOR * float(text)}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    toml = TOML.replace("seed = 11", 'seed = 11\nfiles = ["data/number.txt"]')
+    folder = write_study(tmp_path / "study", WITH_PARTS, toml)
+    (folder / "study_part_of_test.py").write_text("FACTOR = 2\n")
+    (folder / "data").mkdir()
+    (folder / "data" / "number.txt").write_text("21")
+    return folder
+
+
+def result_of(study, package=None):
+    return execute(package or study.package, study.digest, study.jobs[0])
+
+
+def test_a_part_that_changed_is_imported_anew(folder):
+    assert result_of(prepare(folder)).rows[0]["mean"] == 42
+    (folder / "study_part_of_test.py").write_text("FACTOR = 30  # another length\n")
+    assert result_of(prepare(folder)).rows[0]["mean"] == 630
+
+
+def test_two_studies_may_have_parts_of_one_name(folder, tmp_path):
+    other = write_study(tmp_path / "other", WITH_PARTS, TOML)
+    (other / "study_part_of_test.py").write_text("FACTOR = 3\n")
+    (other / "data").mkdir()
+    (other / "data" / "number.txt").write_text("1")
+    first, second = prepare(folder), prepare(other)
+    assert result_of(first).rows[0]["mean"] == 42
+    assert result_of(second).rows[0]["mean"] == 3
+
+
+def test_every_file_that_is_part_of_the_study_counts(folder):
+    digests = {pack(read_definition(folder)).digest}
+    for name in ("study.py", "study_part_of_test.py", "data/number.txt"):
+        with open(folder / name, "a") as handle:
+            handle.write(" ")
+        digests.add(pack(read_definition(folder)).digest)
+    assert len(digests) == 4
+    (folder / "notes.md").write_text("no part of it")
+    assert pack(read_definition(folder)).digest in digests
+
+
+def test_a_worker_without_the_folder_unpacks_it(folder, tmp_path, monkeypatch):
+    study = prepare(folder)
+    monkeypatch.setattr("elastocal.studies.package._LOADED", {})
+    elsewhere = Package(tmp_path / "not here", study.package.contents, study.package.columns)
+    assert result_of(study, elsewhere).rows[0]["mean"] == 42
+    module = sys.modules["study_part_of_test"]
+    assert not module.__file__.startswith(str(folder))
+
+
+def test_a_worker_of_another_version_refuses(folder):
+    study = prepare(folder)
+    package = Package(folder, study.package.contents, study.package.columns, version="0.0.1")
+    assert "this worker has elastocal" in result_of(study, package).error
+
+
+def refused(folder, *options):
+    with pytest.raises(InputError) as error:
+        prepare(folder, None, options)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("seed = 11", "sead = 11", "unknown key 'sead' (did you mean 'seed'?)"),
+        ("seed = 11", "", "key seed takes a whole number"),
+        ("seed = 11", "seed = -1", "key seed takes a whole number"),
+        ("seed = 11", "seed = ", "not valid TOML"),
+        ("seed = 11", "seed = 1\nfiles = ['../x']", "outside the folder"),
+        ("seed = 11", "seed = 1\nfiles = ['x.csv']", "'x.csv', which is no file of the folder"),
+        ('mean = "mm"', "mean = 3", "key columns.mean takes the unit"),
+        ("[columns]", "[colums]", "unknown key 'colums'"),
+    ],
+)
+def test_a_wrong_study_file_is_told_by_its_key(tmp_path, old, new, told):
+    folder = write_study(tmp_path / "study", SCRIPT, TOML.replace(old, new))
+    message = refused(folder)
+    assert str(folder / "study.toml") in message and told in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "told"),
+    [
+        ("def run", "def run(:", 6, "SyntaxError"),
+        ("def tasks", "import nothing_of_this_name\ndef tasks", 1, "ModuleNotFoundError"),
+        ("    return [{", "    1 / 0\n    return [{", 2, "tasks() raised ZeroDivisionError"),
+    ],
+)
+def test_an_error_in_study_py_is_told_by_its_line(tmp_path, old, new, line, told):
+    folder = write_study(tmp_path / "study", SCRIPT.replace(old, new, 1))
+    message = refused(folder)
+    assert f"study.py, line {line}: " in message and told in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("def run", "def ran", "defines no function run()"),
+        ('return [{"n"', 'return [{"task_row"', "'task_row' cannot be a key"),
+        ('{"n": n,', '{"n": {n},', "task 0: Object of type set"),
+        ('{"n": n,', '{"n": float("nan"),', "task 0: Out of range float"),
+        ('replicates"])]', 'replicates"] * 0)]', "tasks() gives no task"),
+    ],
+)
+def test_wrong_tasks_are_told(tmp_path, old, new, told):
+    assert told in refused(write_study(tmp_path / "study", SCRIPT.replace(old, new, 1)))
+
+
+@pytest.mark.parametrize(
+    ("assignment", "told"),
+    [
+        ("replicats=3", "no option 'replicats' (did you mean 'replicates'?)"),
+        ("replicates=3.5", "takes a whole number"),
+        ("replicates=true", "takes a whole number"),
+        ("replicates", "--set takes KEY=VALUE"),
+        ("scale=big", "takes a number"),
+    ],
+)
+def test_a_wrong_option_is_told(tmp_path, assignment, told):
+    assert told in refused(write_study(tmp_path / "study"), assignment)
+
+
+def test_options_reach_tasks(tmp_path):
+    study = prepare(write_study(tmp_path / "study"), None, ["replicates = 2", "scale=3"])
+    assert len(study.jobs) == 4
+    assert study.definition.options["scale"] == 3.0

@@ -1,0 +1,88 @@
+"""Small studies to run, and runners that end early or in another order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from elastocal.studies.conduct import Ending, Study, conduct, prepare
+from elastocal.studies.dataset import opened, read_results
+from elastocal.studies.execution import execute
+from elastocal.studies.local import run_local
+from elastocal.studies.stopping import Stop
+
+SCRIPT = """\
+def tasks(options):
+    return [{"n": n, "label": "few" if n < 9 else "many", "replicate": k}
+            for n in (4, 16) for k in range(options["replicates"])]
+
+
+def run(task, rng):
+    x = rng.normal(size=task["n"])
+    return [{"mean": x.mean(), "inside": abs(x.mean()) < 1, "above": int((x > 0).sum())},
+            {"mean": x.max(), "inside": False}]
+"""
+TOML = """\
+seed = 11
+[options]
+replicates = 6
+scale = 1.0
+[columns]
+mean = "mm"
+inside = "yes/no"
+above = "count"
+"""
+NUMBERS = ["task", "task_hash", "n", "label", "replicate", "task_row", "mean", "inside", "above"]
+
+
+def write_study(folder: Path, script: str = SCRIPT, toml: str = TOML) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "study.py").write_text(script, encoding="utf-8")
+    (folder / "study.toml").write_text(toml, encoding="utf-8")
+    return folder
+
+
+class Watched:
+    """What a watcher was told."""
+
+    def __init__(self) -> None:
+        self.begun: tuple[int, int, int] | None = None
+        self.seen: list[bool] = []
+
+    def begin(self, total: int, done: int, failed: int) -> None:
+        self.begun = (total, done, failed)
+
+    def advance(self, failed: bool) -> None:
+        self.seen.append(failed)
+
+
+def here(study: Study, order: Callable[[list[Any]], list[Any]] = list, stop_after: int = 10**9):
+    """A runner in this process that takes the tasks in `order` and ends after so many."""
+
+    def runner(jobs) -> Iterator[Any]:
+        for job in order(list(jobs))[:stop_after]:
+            yield execute(study.package, study.digest, job)
+
+    return runner
+
+
+def on_processes(study: Study, workers: int, stop: Stop | None = None):
+    stop = stop or Stop()
+    return lambda jobs: run_local(study.package, study.digest, jobs, workers, stop)
+
+
+def run_study(
+    folder: Path, results: Path, runner=None, seed: int | None = None, stop=None, **how: Any
+) -> Ending:
+    """The study in `folder` run into `results` by `runner(study)`, by default in this process."""
+    study = prepare(folder, seed)
+    with opened(results) as dataset:
+        return conduct(study, dataset, (runner or here)(study), stop or Stop(), Watched(), **how)
+
+
+def numbers(results: Path) -> pd.DataFrame:
+    """What must not depend on who computed it, and when."""
+    return read_results(results)[NUMBERS]
