@@ -44,6 +44,8 @@ demo: $(RUN_TIME)
 test test-long: export OPENBLAS_NUM_THREADS = 1
 test test-long: export OMP_NUM_THREADS = 1
 test test-long: export MKL_NUM_THREADS = 1
+# What the tests compile stays with them.
+test test-long: export ELASTOCAL_CACHE = $(CURDIR)/$(VENV)/cache
 
 test: $(TEST_TOOLS)
 	$(PYTEST) $(PYTEST_ARGS)

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.manipulator.backend import BackendReport
 from elastocal.manipulator.tape import Tape
 
 MAX_STEPS = 30
@@ -22,10 +23,22 @@ class Equilibrium:
     equilibrium with deflections below LARGEST counts: beyond that no arm is elastic any more.
     """
 
-    def __init__(self, inputs: Sequence[ca.SX], p: ca.SX, theta: ca.SX, residual: ca.SX) -> None:
+    def __init__(
+        self,
+        inputs: Sequence[ca.SX],
+        p: ca.SX,
+        theta: ca.SX,
+        residual: ca.SX,
+        backend: str | None = None,
+    ) -> None:
         self.size = theta.shape[0]
         jacobian = ca.jacobian(residual, theta)
-        self._tape = Tape([*inputs, p, theta], [residual, jacobian])
+        self._tape = Tape([*inputs, p, theta], [residual, jacobian], backend)
+
+    @property
+    def report(self) -> BackendReport:
+        """What evaluated F and F_θ last."""
+        return self._tape.report
 
     def solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there.

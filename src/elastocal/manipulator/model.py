@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from elastocal.cell import Cell, EffectChoice
 from elastocal.errors import ElastocalError
+from elastocal.manipulator.backend import summary
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.choice import load_chain
 from elastocal.manipulator.effects.base import Effect
@@ -42,13 +43,20 @@ class Model:
     """p_i = h(q_i, f_i, …; X) for a chain with effects; CasADi differentiates it exactly.
 
     `parameters` are those of all active effects, in order; `nominal` their nominal values.
-    `extra` effects with their places act besides those that the cell chooses.
+    `extra` effects with their places act besides those that the cell chooses.  `backend` is
+    "auto", "numpy" or "compiled"; None follows `set_default_backend` and ELASTOCAL_BACKEND.
     """
 
-    def __init__(self, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]] = ()) -> None:
+    def __init__(
+        self,
+        chain: Chain,
+        cell: Cell,
+        extra: Sequence[tuple[Effect, str]] = (),
+        backend: str | None = None,
+    ) -> None:
         self.chain, self.cell = chain, cell
         self.observe = cell.model.observe
-        self._symbolic = SymbolicArm(chain, cell, extra)
+        self._symbolic = SymbolicArm(chain, cell, extra, backend)
         self.parameters = self._symbolic.parameters
 
     @classmethod
@@ -66,7 +74,7 @@ class Model:
     def with_effects(self, effects: tuple[EffectChoice, ...]) -> Model:
         """The same arm with another choice of effects."""
         spec = replace(self.cell.model, effects=effects)
-        return Model(self.chain, replace(self.cell, model=spec))
+        return Model(self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend)
 
     @cached_property
     def rigid(self) -> Model:
@@ -74,7 +82,7 @@ class Model:
         spec = self.cell.model
         nominal = replace(spec.nominal, base_position=None, base_rotation=None)
         spec = replace(spec, effects=(), observe="position", nominal=nominal, link_gravity=False)
-        return Model(self.chain, replace(self.cell, model=spec))
+        return Model(self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,6 +96,10 @@ class Model:
     def all_names(self) -> list[str]:
         """Every name that `meant_by` understands."""
         return sorted({v for p in self.parameters for v in (p.name, p.where, p.effect)})
+
+    def backend_report(self) -> str:
+        """What evaluates this model, for reports: engine, compiler, cached or not, threads."""
+        return summary(self._symbolic.backend_reports.values())
 
     @property
     def nominal(self) -> Array:

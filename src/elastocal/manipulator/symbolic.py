@@ -10,6 +10,7 @@ import casadi as ca
 from elastocal.cell import Cell
 from elastocal.manipulator import rigid
 from elastocal.manipulator.arm import Arm
+from elastocal.manipulator.backend import BackendReport
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.choice import choose_effects, set_constants
 from elastocal.manipulator.effects.base import Effect
@@ -22,10 +23,17 @@ class SymbolicArm:
     """h(inputs, X, θ) and F(inputs, X, θ) = θ − law(τ) of one row, as CasADi expressions.
 
     `parameters` are those of all active effects, in order; `arm.inputs` what a row must give.
-    `extra` effects with their places act besides those that the cell chooses.
+    `extra` effects with their places act besides those that the cell chooses.  `backend` is that
+    of its tapes.
     """
 
-    def __init__(self, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]] = ()) -> None:
+    def __init__(
+        self,
+        chain: Chain,
+        cell: Cell,
+        extra: Sequence[tuple[Effect, str]] = (),
+        backend: str | None = None,
+    ) -> None:
         arm = Arm(chain, cell)
         chosen = [*choose_effects(chain, cell), *extra]
         parameters: list[Parameter] = []
@@ -49,6 +57,7 @@ class SymbolicArm:
         for effect, place, own in bound:
             effect.read(arm, place, own)
         self.arm = arm
+        self.backend = backend
         self.parameters = tuple(parameters)
         self.p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
         self._reading = self._expression(cell.model.observe)
@@ -115,7 +124,18 @@ class SymbolicArm:
     @cached_property
     def equilibrium(self) -> Equilibrium:
         inputs = list(self.arm.inputs.values())
-        return Equilibrium(inputs, self.p, self.arm.theta, self._residual)
+        return Equilibrium(inputs, self.p, self.arm.theta, self._residual, self.backend)
+
+    @property
+    def backend_reports(self) -> dict[str, BackendReport]:
+        """What evaluated each tape last, by the tape's name and number of columns."""
+        reports = {
+            f"{name}[{len(columns)}]" if columns else name: tape.report
+            for (name, columns), tape in self._tapes.items()
+        }
+        if "equilibrium" in self.__dict__:  # built: a cached property
+            reports["equilibrium"] = self.equilibrium.report
+        return reports
 
     def tape(self, name: str, columns: tuple[int, ...] = ()) -> Tape:
         """Tapes are built on first use: "reading", "slopes", "B" (of `columns`), "frames"."""
@@ -130,16 +150,17 @@ class SymbolicArm:
             frames = [arm.T_tracker_flange, arm.reading["position"], arm.reading["rotation"]]
             if self._linear:
                 frames = [ca.reshape(self._linearised(ca.vec(f)), *f.shape) for f in frames]
-            return Tape(inputs, frames)
+            return Tape(inputs, frames, self.backend)
         h = self._linearised(self._reading) if self._linear else self._reading
         if name == "reading":
-            return Tape(inputs, [h])
+            return Tape(inputs, [h], self.backend)
         if name == "slopes":
-            return Tape(inputs, [ca.jacobian(h, theta)])
+            return Tape(inputs, [ca.jacobian(h, theta)], self.backend)
         if not self.implicit:
-            return Tape(inputs, [h, ca.jacobian(h, p)[:, columns]])
+            return Tape(inputs, [h, ca.jacobian(h, p)[:, columns]], self.backend)
         # Adjoint of the equilibrium: with λ = F_θ⁻ᵀ h_θᵀ the total derivative of component c is
         # the partial one of h_c − λ_cᵀ F, a few reverse sweeps instead of all of ∂F/∂X.
         adjoint = ca.SX.sym("adjoint", h.shape[0], theta.shape[0])
         lagrangian = h - adjoint @ self._residual
-        return Tape([*inputs, ca.vec(adjoint.T)], [h, ca.jacobian(lagrangian, p)[:, columns]])
+        B = ca.jacobian(lagrangian, p)[:, columns]
+        return Tape([*inputs, ca.vec(adjoint.T)], [h, B], self.backend)

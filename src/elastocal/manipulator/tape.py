@@ -1,155 +1,145 @@
-"""Batch evaluation: CasADi's instruction tape replayed on numpy arrays.
-
-A CasADi `SX` function is a list of scalar instructions.  Replaying each instruction once on an
-array of all poses costs one numpy call per instruction and chunk instead of one CasADi call per
-pose, and the same replay runs on complex arrays, which complex-step checks use.
-"""
+"""Batch evaluation: a list of expressions on all rows of a table at once, behind one call."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.errors import InputError
+from elastocal.manipulator.backend import BackendReport, Work, checked, chosen_backend
+from elastocal.manipulator.backend_function import TapeFunction
+from elastocal.manipulator.backend_numpy import Replay
+from elastocal.manipulator.compiled import Compiled, compile_tape, find_compiled
+from elastocal.manipulator.compiled_build import HOW_TO_GET_ONE, NoCompiler
+from elastocal.manipulator.threads import row_blocks, run_blocks, thread_count
+
 CHUNK = 8192  # rows at a time: registers stay in cache, numpy's call overhead is spread
-
-
-def _twice(x: Any, out: Any = None) -> Any:
-    return np.multiply(x, 2.0, out=out)
-
-
-def _if_else_zero(condition: Any, value: Any, out: Any = None) -> Any:
-    # np.where and not a product: the branch not taken may be infinite or NaN.
-    chosen = np.where(np.not_equal(condition, 0), value, 0.0)
-    if out is None:
-        return chosen[()]
-    out[:] = chosen
-    return out
-
-
-def _abs(x: Any, out: Any = None) -> Any:
-    # On complex numbers the analytic continuation, so that complex steps stay derivatives.
-    if np.iscomplexobj(x):
-        return np.multiply(x, np.where(np.real(x) < 0, -1.0, 1.0), out=out)
-    return np.abs(x, out=out)
-
-
-def _sign(x: Any, out: Any = None) -> Any:
-    return np.multiply(np.sign(np.real(x)), 1.0, out=out)
-
-
-def _not(x: Any, out: Any = None) -> Any:
-    return np.multiply(np.logical_not(x), 1.0, out=out)
-
-
-def _as_number(compare: Callable) -> Callable:
-    def replay(a: Any, b: Any, out: Any = None) -> Any:
-        return np.multiply(compare(a, b), 1.0, out=out)
-
-    return replay
-
-
-UNARY: dict[int, Any] = {
-    ca.OP_NEG: np.negative, ca.OP_EXP: np.exp, ca.OP_LOG: np.log, ca.OP_SQRT: np.sqrt,
-    ca.OP_SQ: np.square, ca.OP_SIN: np.sin, ca.OP_COS: np.cos, ca.OP_TAN: np.tan,
-    ca.OP_ASIN: np.arcsin, ca.OP_ACOS: np.arccos, ca.OP_ATAN: np.arctan, ca.OP_FABS: _abs,
-    ca.OP_SIGN: _sign, ca.OP_SINH: np.sinh, ca.OP_COSH: np.cosh, ca.OP_TANH: np.tanh,
-    ca.OP_INV: np.reciprocal, ca.OP_LOG1P: np.log1p, ca.OP_EXPM1: np.expm1,
-    ca.OP_FLOOR: np.floor, ca.OP_CEIL: np.ceil, ca.OP_ASSIGN: np.positive,
-    ca.OP_TWICE: _twice, ca.OP_NOT: _not,
-}  # fmt: skip
-BINARY: dict[int, Any] = {
-    ca.OP_ADD: np.add, ca.OP_SUB: np.subtract, ca.OP_MUL: np.multiply, ca.OP_DIV: np.divide,
-    ca.OP_POW: np.power, ca.OP_CONSTPOW: np.power, ca.OP_ATAN2: np.arctan2,
-    ca.OP_FMIN: np.fmin, ca.OP_FMAX: np.fmax, ca.OP_HYPOT: np.hypot, ca.OP_FMOD: np.fmod,
-    ca.OP_LT: _as_number(np.less), ca.OP_LE: _as_number(np.less_equal),
-    ca.OP_EQ: _as_number(np.equal), ca.OP_NE: _as_number(np.not_equal),
-    ca.OP_AND: _as_number(np.logical_and), ca.OP_OR: _as_number(np.logical_or),
-    ca.OP_IF_ELSE_ZERO: _if_else_zero, ca.OP_COPYSIGN: np.copysign,
-}  # fmt: skip
-
-
-CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
+COMPILED_CHUNK = 1024  # compiled code has no overhead to spread; small pieces share out evenly
+LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
+# Compiled code takes about 0.15 ns per instruction and row; a thread must have 0.5 ms to do.
+WORK_OF_A_THREAD = 3_000_000  # instructions × rows
 
 
 class Tape:
-    """An `SX` expression list as a replayable tape.
+    """An `SX` expression list, evaluated row by row on arrays.
 
     `inputs` and `outputs` are lists of SX vectors / matrices.  Calling the tape takes one array
     per input: (n, size) for a quantity that varies by row, (size,) for one that is the same in
-    every row; it returns one array (n, rows, columns) per output.
+    every row; it returns one array (n, rows, columns) per output, float64, or complex where an
+    input is.  `backend` is "auto", "numpy" or "compiled"; None follows `set_default_backend`.
+    Complex numbers are always replayed.
+
+    A call raises NotImplementedError where it replays an operation that numpy lacks, ValueError
+    for arrays of other shapes, InputError where `backend` is "compiled" and nothing can compile.
     """
 
-    def __init__(self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX]) -> None:
-        # cse: the derivative code repeats the chain's products many times over.
-        function = ca.Function("tape", list(inputs), list(outputs), {"cse": True})
-        self.shapes = [out.shape for out in outputs]
-        self.n_registers = function.sz_w()
-        self.n_instructions = function.n_instructions()
-        self._program = [_step(function, k, self.shapes) for k in range(self.n_instructions)]
+    def __init__(
+        self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], backend: str | None = None
+    ) -> None:
+        self._asked = None if backend is None else checked(backend, "backend")
+        self._function = TapeFunction(inputs, outputs)
+        self.shapes = self._function.shapes
+        self._sizes = self._function.sizes
+        self.n_instructions = self._function.n_instructions
+        self._forget()
+
+    def _forget(self) -> None:
+        self._lock = threading.Lock()
+        self._work = Work(self.n_instructions)
+        self._compiled: Compiled | None = None
+        self._looked = False
+        self._refused = ""
+        self._report = BackendReport("none")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Expressions only: libraries, locks and instructions are found again where it goes."""
+        kept = ("_asked", "_function", "shapes", "_sizes", "n_instructions")
+        return {key: self.__dict__[key] for key in kept}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._forget()
+
+    @cached_property
+    def _replay(self) -> Replay:
+        return Replay(self._function)
+
+    @property
+    def report(self) -> BackendReport:
+        """What evaluated the last call."""
+        return self._report
 
     def __call__(self, *inputs: NDArray, chunk: int = CHUNK) -> list[NDArray]:
-        arrays = [np.asarray(a) for a in inputs]
-        n = max((len(a) for a in arrays if a.ndim == 2), default=1)
+        arrays, n = self._rows(inputs)
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
-        size = max(min(chunk, n), 1)
-        buffer = np.empty((self.n_registers, size), dtype=dtype)
-        stage = [np.zeros((r * c, size), dtype=dtype) for r, c in self.shapes]
-        for start in range(0, n, size):
-            m = min(size, n - start)
-            self._replay(arrays, slice(start, start + m), buffer[:, :m], [s[:, :m] for s in stage])
-            for result, s in zip(results, stage, strict=True):
-                result.reshape(n, -1)[start : start + m] = s[:, :m].T
+        engine = self._engine(dtype, n, -(-n // max(chunk, 1)))
+        if isinstance(engine, Compiled):
+            blocks = row_blocks(n, min(chunk, COMPILED_CHUNK))
+            threads = 1 + n * self.n_instructions // WORK_OF_A_THREAD
+        else:
+            width = engine.n_registers + sum(r * c for r, c in self.shapes)
+            blocks = row_blocks(n, min(chunk, max(LARGEST_BUFFER // max(width, 1), 1)))
+            threads = len(blocks)
+        threads = min(threads, len(blocks), _threads_here())
+        self._note(engine, threads)
+        run_blocks(lambda share: engine.evaluate(arrays, results, share), blocks, threads)
         return results
 
-    def _replay(self, arrays: list[NDArray], rows: slice, buffer: NDArray, stage: list) -> None:
-        columns = [a[rows].T.copy() if a.ndim == 2 else a for a in arrays]
-        views = list(buffer)
-        # A register holds a row of `buffer` where it varies by pose, else a scalar.
-        register: list[Any] = [None] * self.n_registers
-        varies = [False] * self.n_registers
-        for kind, op, out, a, b in self._program:
-            if kind == BINARY_OP:
-                if varies[a] or varies[b]:
-                    register[out] = op(register[a], register[b], out=views[out])
-                    varies[out] = True
-                else:
-                    register[out] = op(register[a], register[b])
-                    varies[out] = False
-            elif kind == UNARY_OP:
-                varies[out] = varies[a]
-                register[out] = op(register[a], out=views[out]) if varies[a] else op(register[a])
-            elif kind == READ:
-                value = columns[a][b]
-                varies[out] = value.ndim == 1
-                if varies[out]:
-                    views[out][:] = value
-                    value = views[out]
-                register[out] = value
-            elif kind == WRITE:
-                stage[a][b] = register[out]
-            else:
-                register[out], varies[out] = op, False
+    def _rows(self, inputs: Sequence[NDArray]) -> tuple[list[NDArray], int]:
+        """The inputs as arrays of the right shapes, and the number of rows."""
+        arrays = [np.asarray(a) for a in inputs]
+        arrays = [a if a.dtype.kind == "c" else a.astype(np.float64, copy=False) for a in arrays]
+        n = max((len(a) for a in arrays if a.ndim == 2), default=1)
+        shapes = [a.shape for a in arrays]
+        per_row, common = [(n, size) for size in self._sizes], [(size,) for size in self._sizes]
+        fit = [s in pair for s, *pair in zip(shapes, per_row, common, strict=False)]
+        if len(shapes) != len(self._sizes) or not all(fit):
+            raise ValueError(f"inputs of shapes {shapes}; this tape takes {self._sizes} per row")
+        return arrays, n
+
+    def _engine(self, dtype: np.dtype, rows: int, blocks: int) -> Replay | Compiled:
+        backend = chosen_backend(self._asked)
+        if backend == "numpy" or dtype != np.float64:
+            return self._replay
+        with self._lock:
+            if self._compiled is None and backend == "compiled":
+                try:
+                    self._compiled = compile_tape(self._function)
+                except NoCompiler as error:
+                    raise InputError(f"backend compiled: {error}; {HOW_TO_GET_ONE}") from None
+            if self._compiled is None and not self._refused:
+                self._compiled = self._where_it_pays(rows, blocks)
+            return self._compiled or self._replay
+
+    def _where_it_pays(self, rows: int, blocks: int) -> Compiled | None:
+        """Compiled code under "auto", this call counted; None where replaying is still cheaper."""
+        self._work.add(rows, blocks)
+        try:
+            if self._work.pays_to_compile:
+                return compile_tape(self._function)
+            if self._work.pays_to_look and not self._looked:
+                self._looked = True
+                return find_compiled(self._function)
+        except NoCompiler as error:
+            self._refused = str(error)
+        return None
+
+    def _note(self, engine: Replay | Compiled, threads: int) -> None:
+        threads = max(threads, 1)
+        if isinstance(engine, Compiled):
+            compiler = str(engine.compiler)
+            self._report = BackendReport("compiled", compiler, threads, engine.cached)
+        else:
+            self._report = BackendReport("numpy", threads=threads, reason=self._refused)
 
 
-def _step(function: ca.Function, k: int, shapes: list[tuple[int, int]]) -> tuple:
-    """Instruction k as (kind, operation or constant, register, first, second operand)."""
-    code = function.instruction_id(k)
-    into, out = function.instruction_input(k), function.instruction_output(k)
-    if code == ca.OP_CONST:
-        return (CONSTANT, np.float64(function.instruction_constant(k)), out[0], 0, 0)
-    if code == ca.OP_INPUT:
-        return (READ, None, out[0], into[0], into[1])
-    if code == ca.OP_OUTPUT:
-        sparsity = function.sparsity_out(out[0])
-        row, column = sparsity.row()[out[1]], sparsity.get_col()[out[1]]
-        return (WRITE, None, into[0], out[0], row * shapes[out[0]][1] + column)
-    if code in BINARY:
-        return (BINARY_OP, BINARY[code], out[0], into[0], into[1])
-    if code in UNARY:
-        return (UNARY_OP, UNARY[code], out[0], into[0], 0)
-    raise NotImplementedError(f"CasADi operation {code} has no numpy counterpart in the tape")
+def _threads_here() -> int:
+    """One in a thread of the caller's own: who started it has shared the work out already."""
+    return thread_count() if threading.current_thread() is threading.main_thread() else 1

@@ -1,0 +1,82 @@
+"""A tape replayed on numpy arrays, one numpy call per instruction and block of rows.
+
+A CasADi `SX` function is a list of scalar instructions.  Replaying each instruction once on an
+array of all poses costs one numpy call per instruction and block instead of one CasADi call per
+pose, and the same replay runs on complex arrays, which complex-step checks use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.manipulator.backend_function import TapeFunction
+from elastocal.manipulator.backend_instructions import instructions
+from elastocal.manipulator.backend_plan import Plan
+
+
+class Replay:
+    """A tape's instructions, and `evaluate`, which replays them on whole blocks of rows.
+
+    Raises NotImplementedError for a CasADi operation that numpy has no counterpart for.
+    """
+
+    def __init__(self, function: TapeFunction) -> None:
+        self._table, self._constants, self.n_registers = instructions(function)
+        widths = [*function.sizes, *[rows * columns for rows, columns in function.shapes]]
+        self._ends = [int(end) for end in self.n_registers + np.cumsum([0, *widths])]
+        self._plans: dict[tuple[bool, ...], Plan] = {}
+
+    def _plan(self, by_row: tuple[bool, ...]) -> Plan:
+        if by_row not in self._plans:
+            self._plans[by_row] = Plan(self._table, self._ends, by_row)
+        return self._plans[by_row]
+
+    def evaluate(
+        self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
+    ) -> None:
+        """Rows of `blocks` of `results` (n, rows, columns), all of one type."""
+        if not results:
+            return
+        plan = self._plan(tuple(a.ndim == 2 for a in inputs))
+        common = self._in_common(plan, inputs)
+        size = max((block.stop - block.start for block in blocks), default=0)
+        buffer = np.empty((self.n_registers, size), dtype=results[0].dtype)
+        flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
+        stage = [np.zeros((f.shape[1], size), dtype=f.dtype) for f in flat]
+        for block in blocks:
+            m = block.stop - block.start
+            slots = list(buffer[:, :m])
+            for a in inputs:
+                slots += list(a[block].T.copy()) if a.ndim == 2 else _cells(a)
+            for s in stage:
+                slots += list(s[:, :m])
+            slots += common
+            for operation, first, second, out in plan.steps:
+                if second >= 0:
+                    operation(slots[first], slots[second], slots[out])
+                else:
+                    operation(slots[first], slots[out])
+            for f, s in zip(flat, stage, strict=True):
+                f[block] = s[:, :m].T
+
+    def _in_common(self, plan: Plan, inputs: Sequence[NDArray]) -> list[NDArray]:
+        """The values that are the same in all rows."""
+        slots: list[Any] = [None] * (plan.first_common + plan.n_common)
+        for start, a in zip(self._ends, inputs, strict=False):
+            if a.ndim == 1:
+                slots[start : start + len(a)] = _cells(a)
+        for place, k in plan.constants:
+            slots[place] = self._constants[k, ...]
+        for operation, first, second, out in plan.once:
+            operands = (slots[first],) if second < 0 else (slots[first], slots[second])
+            slots[out] = np.asarray(operation(*operands))
+        return slots[plan.first_common :]
+
+
+def _cells(a: NDArray) -> list[NDArray]:
+    """The numbers of `a` (n,) as arrays without axes: numpy takes these faster than scalars."""
+    return [a[k, ...] for k in range(len(a))]
