@@ -89,12 +89,23 @@ def _show_version(wanted: bool) -> None:
 
 
 @app.callback()
+@reporting_errors
 def options(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")
     ] = False,
+    backend: Annotated[
+        str | None,
+        typer.Option(help="What evaluates the model: auto, numpy or compiled; default: auto."),
+    ] = None,
 ) -> None:
     """Calibrate industrial robot arms and explain what is left over."""
+    from elastocal.manipulator.backend import VARIABLE, chosen_backend
+
+    # By the environment, so that processes which a command starts choose the same.
+    if backend is not None:
+        os.environ[VARIABLE] = backend
+    chosen_backend()
 
 
 def check_outputs(*paths: Path | None) -> None:
