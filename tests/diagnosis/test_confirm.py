@@ -107,7 +107,7 @@ def test_what_is_there_without_a_name_stays() -> None:
 
 
 def test_a_change_between_visits_leaves_readings_on_its_wrong_side() -> None:
-    """On average a quarter of the largest share of them: half of half of it."""
+    """Half of the largest share of them on average, all readings of a visit together."""
     found, _ = world(3, 60, 1e-5)
     square = float((found.before**2).sum(axis=1).mean())
     sharp, blurred = (

@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cells import kr270_chain
-from support.diagnosis_data import campaign
+from support.diagnosis_data import JUMP_TIME, VISIT_TIME, campaign
 
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
+from elastocal.diagnosis.model_set import Item, fit_set, refine
+from elastocal.diagnosis.scene import scene_of
 from elastocal.diagnosis.settings_grid import Grid, change_times, grid_of
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
@@ -118,3 +121,16 @@ def test_what_has_no_constant_to_search_has_one_point(visits) -> None:
     assert (
         CATALOGUE["gear_eccentricity"].settings("joint1", kr270_chain(), campaign()[0].cell) == ()
     )
+
+
+def test_a_change_is_found_to_the_visit_however_many_there_are() -> None:
+    """200 visits, of which 120 moments are tried: the right one is sought about the best."""
+    model, table = campaign("encoder_jump:joint4", n=100)
+    scene = scene_of(fit_baseline(model, table), [hypothesis("encoder_jump", "joint4")])
+    (h,) = scene.hypotheses
+    grid = scene.grids[h.name, h.where].values[:, 0]
+    assert len(grid) < len(scene.moments)
+    far = grid[np.abs(grid - JUMP_TIME).argsort()[1]]
+    chosen = fit_set(scene, (Item(h, np.array([far]), 0.0),))
+    found = float(refine(scene, chosen, 0).items[0].settings[0])
+    assert abs(found - JUMP_TIME) <= VISIT_TIME

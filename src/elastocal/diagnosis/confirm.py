@@ -50,10 +50,12 @@ class Truth:
 @dataclass(frozen=True)
 class Change:
     """A change that happened in a pause between visits: how far (m² per reading) one on its wrong
-    side is off, and the largest `share` of the time that may be on it."""
+    side is off, the largest `share` of the time that may be on it, and the number of `visits` of
+    a pose: the readings of a visit are on the same side."""
 
     square: float = 0.0
     share: float = 0.0
+    visits: float = 1.0
 
 
 def shrinkage(
@@ -96,6 +98,7 @@ def _reductions(
         np.add.at(total, at, squares)
         readings = chosen @ count
         mean.append((chosen.T * total).sum(axis=0) / readings + unnamed)
-    late = rng.binomial(readings, change.share * rng.random(n)) / readings
+    times = round(FRESH * change.visits)
+    late = rng.binomial(times, change.share * rng.random(n)) / times
     mean[1] = mean[1] + late * change.square
     return np.asarray(1 - np.sqrt(mean[1] / np.maximum(mean[0], 1e-300)))

@@ -190,17 +190,25 @@ def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
     if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
         return chosen
     (setting,) = what.settings
-    if setting.kind == "change_time":
-        return chosen
     data = beside(scene, chosen, k)
     grams = Grams(scene, data, project(data, chosen.noise))
     grid = scene.grids[what.name, what.where]
     near = int(np.abs(grid.values[:, 0] - item.settings[0]).argmin())
     width, centre = float(grid.step[near, 0]), float(item.settings[0])
-    for _ in range(3):
-        trial = np.clip(centre + np.linspace(-width, width, 21), setting.lower, setting.upper)
+
+    def best_of(trial: Array) -> float:
         found = grams.of_hypothesis(what, trial[:, None]).evidence(item.scales)
-        centre, width = float(trial[int(np.argmax(found))]), width / 8
+        return float(trial[int(np.argmax(found))])
+
+    if setting.kind == "change_time":
+        trial = scene.moments[np.abs(scene.moments - centre) <= width]
+        if len(trial) <= 1 or len(scene.moments) == len(grid.values):
+            return chosen
+        centre = best_of(trial)
+    else:
+        for _ in range(3):
+            trial = centre + np.linspace(-width, width, 21)
+            centre, width = best_of(np.clip(trial, setting.lower, setting.upper)), width / 8
     refined = replace(item, settings=np.array([centre]))
     return fit_set(scene, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), chosen.noise)
 

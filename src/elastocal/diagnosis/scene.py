@@ -21,7 +21,7 @@ from elastocal.diagnosis.columns import (
 )
 from elastocal.diagnosis.hypotheses import Hypothesis, recorded
 from elastocal.diagnosis.noise import NoisyData
-from elastocal.diagnosis.settings_grid import Grid, grid_of
+from elastocal.diagnosis.settings_grid import Grid, grid_of, moments_between
 from elastocal.diagnosis.sums import VisitPlaces
 from elastocal.identification.solve import is_placed
 from elastocal.manipulator.effects import CATALOGUE
@@ -114,6 +114,13 @@ class Scene:
             for h in self.hypotheses
             if is_driven(h)
         }
+
+    @cached_property
+    def moments(self) -> Array:
+        """Every moment at which something may have changed between two visits; none without
+        times."""
+        time = self.visit_table.time
+        return np.zeros(0) if time is None else moments_between(time[self.present.ravel()])
 
     def drive(self, h: Hypothesis, settings: Array) -> Array:
         """D (G, C, v, d, k) at each visit, per typical size, at `settings` (G, …)."""

@@ -49,12 +49,16 @@ def grid_of(hypothesis: Hypothesis, visits: Measurements, chain: Chain) -> Grid:
     return Grid(values[:, None], np.full(len(values), -np.log(len(values))), step[:, None])
 
 
-def change_times(time: Array) -> Array:
-    """Moments between visits, two visits at least on either side."""
+def moments_between(time: Array) -> Array:
+    """Every moment between two visits, two visits at least on either side."""
     known = np.sort(time)
     middle = np.unique((known[1:-2] + known[2:-1]) / 2)
-    if not len(middle):
-        middle = np.array([known.mean()])
+    return middle if len(middle) else np.array([known.mean()])
+
+
+def change_times(time: Array) -> Array:
+    """Moments between visits that are tried first: CHANGE_TIMES at most, evenly spaced."""
+    middle = moments_between(time)
     if len(middle) > CHANGE_TIMES:
         chosen = np.linspace(0, len(middle) - 1, CHANGE_TIMES).round().astype(int)
         middle = middle[chosen]

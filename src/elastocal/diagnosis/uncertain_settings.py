@@ -67,4 +67,4 @@ def between_visits(scene: Scene, chosen: ModelSet, k: int) -> Change:
     squares, count = squared_lengths(scene.data, signal_of(scene, chosen, k))
     shown = squares > 0
     per_reading = float(squares[shown].sum() / max(count[shown].sum(), 1))
-    return Change(per_reading, pause / 2)
+    return Change(per_reading, pause / 2, float(scene.present.sum() / len(scene.present)))
