@@ -88,7 +88,8 @@ def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Ar
     B = whole.regressor(table, x).B
     of = {key: [i for i, p in enumerate(whole.parameters) if p.effect == key[0]] for key in RIVALS}
     X = B[:, [whole.names.index(name) for name in model.names]] * widths(base)
-    widest = np.array([3 * whole.parameters[i].typical for i in of[RIVALS[b]]])
+    # Five times the widest of the size prior, as large as the verdict lets a rival be.
+    widest = np.array([15 * whole.parameters[i].typical for i in of[RIVALS[b]]])
     Z = np.hstack([X, B[:, of[RIVALS[b]]] * widest])
     typical = np.array([whole.parameters[i].typical for i in of[RIVALS[a]]])
     signal = B[:, of[RIVALS[a]]] @ (typical * size)

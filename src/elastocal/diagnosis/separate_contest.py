@@ -1,7 +1,7 @@
 """How far apart rivals are, and how probably the right one is named, after any set of visits.
 
-With W's nuisance columns X (prior precision Λ) and rival b's columns C_b (widest size s_b)
-eliminated, the signal C_a γ of rival a keeps the squared length
+With W's nuisance columns X (prior precision Λ) and rival b's columns C_b (as large as the verdict
+lets a rival be, s_b) eliminated, the signal C_a γ of rival a keeps the squared length
 
     d²_ab(γ) = min_{β, η} |C_a γ − X β − C_b η|²_V⁻¹ + |β|²_Λ + |η|²/s_b² = γᵀ D_ab γ,
     D_ab = S_aa − S_ab (S_bb + I/s_b²)⁻¹ S_ba,
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from elastocal.diagnosis.alike import PLAUSIBLE
 from elastocal.diagnosis.evidence import evidence_of
 from elastocal.diagnosis.separate_rivals import RivalSet
 from elastocal.diagnosis.separate_rows import Rows, eliminated
@@ -94,7 +95,8 @@ class Contest:
             truth, rival = self.rows.groups[a], self.rows.imitation(a, b)
             of_a = slice(truth.start - p, truth.stop - p)
             of_b = slice(rival.start - p, rival.stop - p)
-            tie = np.eye(rival.stop - rival.start) / self.rivals.rivals[b].scales.max() ** 2
+            size = PLAUSIBLE * self.rivals.rivals[b].scales.max()
+            tie = np.eye(rival.stop - rival.start) / size**2
             taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
             D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
             g = self.draws[a]
