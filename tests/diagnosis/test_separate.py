@@ -126,6 +126,21 @@ def test_rivals_that_stay_alike_are_planned_for_as_one(narrow) -> None:
     assert extra.probability_before == pytest.approx(0.7)
 
 
+def test_no_pose_is_asked_for_where_only_alike_rivals_are_left() -> None:
+    """The third rival has lost already: what a pose could tell apart is told apart."""
+    trio = {
+        ("gear_eccentricity", "joint2"): 0.5,
+        ("link_mass_error", "link2"): 0.49,
+        ("encoder_scale", "joint2"): 0.01,
+    }
+    model, table = campaign(
+        {"joint2.eccentricity_sin": 1e-4, "joint2.eccentricity_cos": 1e-4}, 2.0, link_gravity=True
+    )
+    extra = plan_extra(model, table, diagnosis_of(trio), most=3)
+    assert extra.n_poses == 0 and extra.plan is None and not extra.separable
+    assert any("no pose separates" in text for text in extra.advice)
+
+
 def test_the_side_of_approach_is_chosen_where_rivals_depend_on_it() -> None:
     """Approached from one side only, hysteresis is an offset of the joint times its load."""
     pair = {("hysteresis", "joint3"): 0.5, ("joint_hardening", "joint3"): 0.5}

@@ -82,7 +82,8 @@ def plan_extra(
         advice.inseparable_advice(pair, distance, len(pool)) for pair, distance in hopeless.items()
     ]
     notes += advice.other_means(list(hopeless))
-    worthwhile = any(c.open for c in contests)
+    # Where what can be told apart is told apart already, only what cannot be is left.
+    worthwhile = any(c.open for c in contests) and expected(contests, ()) < ENOUGH
     progress("extra poses: choosing")
     chosen = fewest(contests, most) if worthwhile else []
     after = expected(contests, chosen)
