@@ -78,7 +78,7 @@ def test_a_constant_that_is_not_known_well_widens_what_is_possible() -> None:
     truth = of_one(found, item)
     known = len(found.fitted.x)
     assert truth.spread.shape[2] == known + 1
-    column = found._by_constant(found.fitted, [item], item, found.seen)
+    column = found._by_constant(found.fitted, [item], item)[1]
     assert rms(column.reshape(-1, 3)) > 0
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.diagnosis.baseline import visits
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
@@ -24,8 +25,8 @@ def fresh_table(
     angle (with the side it came from, and the torque at it) is that of another one drawn at
     random, independently of the other joints, and all markers stay inside the box that the
     measured ones span: floor and fixtures keep fresh poses out of the same regions (unless
-    hardly any is inside).  Times are
-    uniform over the campaign's.  Readings are left as they are and mean nothing.
+    hardly any is inside).  Times are uniform over the campaign's.  Readings are left as they are
+    and mean nothing.
     """
     drawn = _recombined(table, CANDIDATES * n, rng)
     low, high = (end(model.target_poses(table)[1], axis=0) for end in (np.min, np.max))
@@ -60,8 +61,7 @@ def _recombined(table: Measurements, n: int, rng: np.random.Generator) -> Measur
             values[:, j] = getattr(table, name)[source, j]
     if table.time is None:
         return fresh
-    visit = np.column_stack([configuration, fresh.repeat, fresh.force])
-    at = np.unique(visit, axis=0, return_inverse=True)[1].ravel()
+    at = visits(fresh)
     time = rng.uniform(table.time.min(), table.time.max(), at.max() + 1)[at]
     warmth = None
     if table.temperature is not None:

@@ -193,7 +193,7 @@ def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
     data = beside(scene, chosen, k)
     grams = Grams(scene, data, project(data, chosen.noise))
     grid = scene.grids[what.name, what.where]
-    near = int(np.abs(grid.values[:, 0] - item.settings[0]).argmin())
+    near = grid.nearest(item.settings)
     width, centre = float(grid.step[near, 0]), float(item.settings[0])
 
     def best_of(trial: Array) -> float:

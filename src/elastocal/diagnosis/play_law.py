@@ -18,7 +18,7 @@ from elastocal.diagnosis.noise import NoiseValues, fit_noise, project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.manipulator.model import Model
 
-EFFECT, KEY, BY_LOAD, BY_BOTH = "backlash", "play_side", "load", "load_and_approach"
+EFFECT, BY_LOAD, BY_BOTH = "backlash", "load", "load_and_approach"
 
 
 def with_likelier_play(scene: Scene) -> Scene:

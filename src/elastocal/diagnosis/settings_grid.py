@@ -30,6 +30,10 @@ class Grid:
     log_prior: Array
     step: Array
 
+    def nearest(self, settings: Array) -> int:
+        """The point that stands for `settings` (settings,), which were refined from it."""
+        return int(np.abs(self.values - settings).sum(axis=1).argmin())
+
 
 def grid_of(hypothesis: Hypothesis, visits: Measurements, chain: Chain) -> Grid:
     """Grid of a hypothesis' settings for these visits; one empty point where it has none."""

@@ -88,7 +88,7 @@ class Confirmation:
             out += self._truth(at, known, item, before, share)
         return out
 
-    @property
+    @cached_property
     def unnamed(self) -> float:
         """Mean squared length (m²) of what is in the set without a name, of each block what the
         fitted parameters cannot follow: the error of configurations left out of a fit to it."""
@@ -112,10 +112,10 @@ class Confirmation:
         self, base: Baseline, known: list[Item], item: Item, before: Array, probability: float
     ) -> list[Truth]:
         """If that model is true, under each of the noises."""
-        measured = self._by_constant(base, known, item, self.scene.base.seen)
+        measured, fresh = self._by_constant(base, known, item)
         linear = Linear.of(self.scene, base, measured, self._prior(known))
         at = base.model.regressor(self.seen.table, base.x, observations=self.seen)
-        B = np.hstack([at.B, self._by_constant(base, known, item, self.seen)])
+        B = np.hstack([at.B, fresh])
         start = np.append(base.x, np.zeros(measured.shape[1]))
         size = self.seen.size
         shown = min(size, 3)
@@ -148,28 +148,29 @@ class Confirmation:
                 out[f"{item.what.where}.{p.key}"] = float(s)
         return out
 
-    def _by_constant(
-        self, base: Baseline, known: list[Item], item: Item, seen: Observations
-    ) -> Array:
-        """Difference quotients (rows, k) in the item's constants that vary smoothly, each by the
-        step of the grid it was searched on: it is not known better than the data tell."""
+    def _by_constant(self, base: Baseline, known: list[Item], item: Item) -> list[Array]:
+        """Difference quotients (rows, k) in the item's constants that vary smoothly, of the
+        measured readings and of the fresh ones, each by the step of the grid it was searched on:
+        it is not known better than the data tell."""
         what = item.what
         assert isinstance(what, Hypothesis)
-        columns = []
+        sets = (self.scene.base.seen, self.seen)
+        columns = [np.zeros((seen.size * len(seen.lead), 0)) for seen in sets]
         for s, setting in enumerate(what.settings):
             if setting.kind == "change_time":
                 continue
             grid = self.scene.grids[what.name, what.where]
-            step = float(grid.step[np.abs(grid.values - item.settings).sum(axis=1).argmin(), s])
+            step = float(grid.step[grid.nearest(item.settings), s])
             ends = []
             for sign in (1, -1):
                 moved = item.settings.copy()
                 moved[s] += sign * NUDGE * step
                 items = [replace(i, settings=moved) if i.same_as(item) else i for i in known]
                 model = extended(self.plain.model, items)
-                ends.append(model.predict(seen.table, base.x, seen))
-            columns.append((ends[0] - ends[1]) / (2 * NUDGE))
-        return np.stack(columns, axis=1) if columns else np.zeros((seen.size * len(seen.lead), 0))
+                ends.append([model.predict(seen.table, base.x, seen) for seen in sets])
+            slopes = [(up - down) / (2 * NUDGE) for up, down in zip(*ends, strict=True)]
+            columns = [np.column_stack(pair) for pair in zip(columns, slopes, strict=True)]
+        return columns
 
 
 def _known(items: tuple[Item, ...]) -> list[Item]:

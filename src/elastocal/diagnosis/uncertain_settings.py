@@ -38,7 +38,7 @@ def other_settings(scene: Scene, chosen: ModelSet, k: int) -> list[tuple[Item, f
     own = float(grams.of_hypothesis(what, item.settings[None]).evidence(item.scales)[0])
     each = grams.of_hypothesis(what).evidence(item.scales)
     # The chosen one stands for the point of the grid that it was refined from.
-    nearest = int(np.abs(grid.values - item.settings).sum(axis=1).argmin())
+    nearest = grid.nearest(item.settings)
     each[nearest] = own
     share = np.exp(each - each.max())
     share /= share.sum()
