@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.backends import system_compiler
 from support.cells import kr270_cell, kr270_chain, random_table
+from support.expressions import X, Y, built
 
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.tape import COMPILED_CHUNK, Tape
@@ -49,7 +50,6 @@ def assert_alike(found: np.ndarray, expected: np.ndarray) -> None:
 
 # --- operations ----------------------------------------------------------------------------
 
-X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 UNARY = {
     "neg": -X, "exp": ca.exp(X), "log": ca.log(X), "sqrt": ca.sqrt(X), "sq": X * X,
     "sin": ca.sin(X), "cos": ca.cos(X), "tan": ca.tan(X), "asin": ca.asin(X), "acos": ca.acos(X),
@@ -92,17 +92,9 @@ trees = st.recursive(
 )
 
 
-def built(tree, symbols: dict[str, ca.SX]) -> ca.SX:
-    if isinstance(tree, str):
-        return symbols[tree]
-    if isinstance(tree, float):
-        return ca.SX(tree)
-    operation, *operands = tree
-    source = UNARY[operation] if len(operands) == 1 else BINARY[operation]
-    parts = [built(operand, symbols) for operand in operands]
-    if operation == "copysign":  # a NaN's sign is the library's affair
-        parts[1] = ca.fmax(parts[1], -1e300)
-    return ca.substitute(source, ca.vertcat(*[X, Y][: len(parts)]), ca.vertcat(*parts))
+def signed(operation: str, parts: list[ca.SX]) -> list[ca.SX]:
+    """A NaN's sign is the library's affair."""
+    return [parts[0], ca.fmax(parts[1], -1e300)] if operation == "copysign" else parts
 
 
 # Several expressions to one compilation: starting the compiler takes longer than they do.
@@ -111,7 +103,10 @@ def built(tree, symbols: dict[str, ca.SX]) -> ca.SX:
 def test_random_expressions(forest, seed: int) -> None:
     """Ill-conditioned ones amplify last digits: two replays bound what that may amount to."""
     symbols = {name: ca.SX.sym(name) for name in "xyp"}
-    inputs, outputs = list(symbols.values()), [built(tree, symbols) for tree in forest]
+    inputs, outputs = (
+        list(symbols.values()),
+        [built(tree, symbols, {**UNARY, **BINARY}, signed) for tree in forest],
+    )
     rng = np.random.default_rng(seed)
     values = [rng.normal(size=(6, 1)), rng.normal(size=(6, 1)), rng.normal(size=1)]
     near = [v * (1 + 4 * np.finfo(float).eps) for v in values]

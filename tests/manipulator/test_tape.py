@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.expressions import X, Y, built
 
 from elastocal.manipulator import backend_operations
 from elastocal.manipulator.tape import CHUNK, Tape
-
-X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 
 UNARY = {
     "neg": -X, "exp": ca.exp(X), "log": ca.log(X), "sqrt": ca.sqrt(X), "sq": X * X,
@@ -114,23 +113,12 @@ expressions = st.recursive(
 )
 
 
-def built(tree, symbols: dict[str, ca.SX]) -> ca.SX:
-    if isinstance(tree, str):
-        return symbols[tree]
-    if isinstance(tree, float):
-        return ca.SX(tree)
-    operation, *operands = tree
-    parts = [built(operand, symbols) for operand in operands]
-    source = UNARY[operation] if len(parts) == 1 else BINARY[operation]
-    return ca.substitute(source, ca.vertcat(*[X, Y][: len(parts)]), ca.vertcat(*parts))
-
-
 @given(tree=expressions, seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=150, deadline=None)
 def test_random_expressions_and_their_derivatives(tree, seed: int) -> None:
     """x and y vary by row, p is the same in all: registers of both sorts get reused."""
     symbols = {name: ca.SX.sym(name) for name in "xyp"}
-    expression = built(tree, symbols)
+    expression = built(tree, symbols, {**UNARY, **BINARY})
     inputs = list(symbols.values())
     slopes = ca.jacobian(expression, ca.vertcat(*inputs))
     rng = np.random.default_rng(seed)
