@@ -1,0 +1,129 @@
+"""A calibrated arm: the cell's model with the parameter values that an identification wrote."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from elastocal.cell_reader import read_cell
+from elastocal.errors import InputError
+from elastocal.files import read_text
+from elastocal.manipulator.chain import Array
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.model import Model
+
+SCHEMA = "elastocal/identification/1"
+MOST_BYTES = 200_000_000  # a covariance of 3000 parameters
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """`model` and the values x (parameters,) it predicts with; `source` is the result file.
+
+    `covariance` (determined, determined) belongs to the parameters `determined`; what the data
+    did not determine is held in x at the value the identification predicted with.
+    """
+
+    model: Model
+    x: Array
+    determined: tuple[str, ...]
+    covariance: Array
+    source: str
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Name → value in SI units."""
+        return dict(zip(self.model.names, map(float, self.x), strict=True))
+
+
+def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrated:
+    """The model of a cell file with the values of a result file (`identify -o`).
+
+    Raises InputError where either file is invalid, or where the result belongs to another
+    model than the cell describes; the message names the parameters that differ.
+    """
+    cell = read_cell(cell_path, known_effects=tuple(CATALOGUE))
+    result = _read_result(Path(result_path))
+    held = _held(result, result_path)
+    # A cell that lists no markers took them from the table; their names stand in the parameters.
+    markers = tuple(
+        dict.fromkeys(
+            where.removeprefix("marker:")
+            for where in (name.rpartition(".")[0] for name in held)
+            if where.startswith("marker:")
+        )
+    )
+    model = Model.from_cell(cell, markers)
+    _check_same(model, held, cell_path, result_path)
+    determined = tuple(str(name) for name in result.get("covariance_of", ()))
+    covariance = np.asarray(result.get("covariance", ()), dtype=float)
+    if not set(determined) <= set(held) or covariance.size != len(determined) ** 2:
+        raise InputError(
+            f"{result_path}: covariance of {covariance.size} numbers for {len(determined)} names "
+            "in covariance_of; write the result anew with identify -o"
+        )
+    return Calibrated(
+        model,
+        np.array([held[name] for name in model.names]),
+        determined,
+        covariance.reshape(len(determined), len(determined)),
+        str(result_path),
+    )
+
+
+def _read_result(path: Path) -> dict[str, Any]:
+    try:
+        result = json.loads(read_text(path, "result of identify", MOST_BYTES))
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"{path}, line {error.lineno}: not JSON ({error.msg}); "
+            "give the file that identify -o wrote"
+        ) from None
+    found = result.get("schema") if isinstance(result, dict) else None
+    if found != SCHEMA:
+        raise InputError(
+            f"{path}: schema is {found!r}, and {SCHEMA!r} is needed; "
+            "give the file that identify -o wrote"
+        )
+    return dict(result)
+
+
+def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
+    entries = result.get("parameters")
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: key parameters is no list; write the result with identify -o")
+    held = {}
+    for k, entry in enumerate(entries):
+        try:
+            name, value = str(entry["name"]), float(entry["held"])
+        except (TypeError, KeyError, ValueError):
+            raise InputError(
+                f"{path}: parameters[{k}] needs a name and a number under held; "
+                "write the result anew with identify -o"
+            ) from None
+        if not np.isfinite(value):
+            raise InputError(f"{path}: parameters[{k}] '{name}' holds {value}, no finite number")
+        if name in held:
+            raise InputError(f"{path}: parameter '{name}' is listed twice")
+        held[name] = value
+    return held
+
+
+def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:
+    absent = [name for name in model.names if name not in held]
+    surplus = [name for name in held if name not in set(model.names)]
+    if absent or surplus:
+        told = [
+            f"{what} {', '.join(names[:4])}{' …' if len(names) > 4 else ''}"
+            for what, names in (("the result lacks", absent), ("the cell has no", surplus))
+            if names
+        ]
+        raise InputError(
+            f"{result} was not identified with {cell}: {'; '.join(told)}; "
+            "give the cell that identify was run with"
+        )
