@@ -1,24 +1,21 @@
 """Do the intervals hold, and what does not knowing the noise cost?
 
-    python study.py [--replicates 4000] [--jobs 2]
+    elastocal study experiment_design/coverage [--set replicates=200]
 
 Every scenario of scenarios.py, estimated by elastocal's default, by an oracle that knows the
-noise, by the paper's methods, by a robust fit and by OLS with a cluster-robust covariance.
-Chunks of replicates are written to runs/ as they are done: stop and start as you like.  Prints the
-tables and writes result.md.
+noise, by the paper's methods, by a robust fit and by OLS with a cluster-robust covariance.  A
+task is 50 campaigns of one scenario.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
-from pathlib import Path
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
-from rich.progress import Progress
-from scenarios import SCENARIOS, Scenario, Setting, setting
-from tables import report
+import pandas as pd
+from scenarios import SCENARIOS, Setting, setting
+from tables import report, totals
 
 from elastocal.identification.covariance.cluster import cluster_robust
 from elastocal.identification.published import eq14, ols
@@ -27,13 +24,32 @@ from elastocal.identification.robust.mm_estimate import mm_estimate
 from elastocal.identification.variance.screen import screen
 from elastocal.identification.variance.search import settle
 
-HERE = Path(__file__).parent
 CHUNK = 50
 PUBLISHED_EVERY = 10  # thirty iterations of a weighted fit each: a tenth of the replicates do
 METHODS = (
     "default", "oracle", "OLS, CR2", "OLS, eq. (8)", "eq. (14) by group",
     "eq. (14) per residual", "Tukey MM",
 )  # fmt: skip
+
+
+def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    for first in range(0, options["replicates"], CHUNK):
+        for scenario in SCENARIOS:
+            campaigns = min(CHUNK, options["replicates"] - first)
+            yield {"scenario": scenario.key, "first": first, "campaigns": campaigns}
+
+
+def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Totals over the campaigns, by method and parameter.  A campaign's seed follows from its
+    scenario and number, as it did before this study had others: `rng` is not used."""
+    scenario = next(s for s in SCENARIOS if s.key == task["scenario"])
+    s, numbers = setting(scenario), range(task["first"], task["first"] + task["campaigns"])
+    found = np.array([estimates(s, replicate) for replicate in numbers])
+    return totals(found, METHODS, s.names)
+
+
+def summary(frame: pd.DataFrame) -> str:
+    return report(frame, METHODS)
 
 
 def estimates(s: Setting, replicate: int) -> np.ndarray:
@@ -62,43 +78,3 @@ def estimates(s: Setting, replicate: int) -> np.ndarray:
         put("eq. (14) by group", group[-1].x, group[-1].std, np.inf)
         put("eq. (14) per residual", last.x, last.std, np.inf)
     return found
-
-
-def run_chunk(scenario: Scenario, first: int, folder: Path) -> None:
-    path = folder / f"{scenario.key}_{first:06d}.npy"
-    found = np.array([estimates(setting(scenario), first + k) for k in range(CHUNK)])
-    temporary = path.with_suffix(".tmp")
-    with open(temporary, "wb") as handle:
-        np.save(handle, found)
-    os.replace(temporary, path)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--replicates", type=int, default=4000)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--folder", type=Path, default=HERE / "runs")
-    chosen = parser.parse_args()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a process per core has no use for more
-    chosen.folder.mkdir(exist_ok=True)
-    firsts = range(0, chosen.replicates, CHUNK)
-    wanted = [(s, first) for s in SCENARIOS for first in firsts]
-    open_ = [(s, f) for s, f in wanted if not (chosen.folder / f"{s.key}_{f:06d}.npy").exists()]
-    with Progress() as bar:
-        task = bar.add_task("replicates", total=len(wanted), completed=len(wanted) - len(open_))
-        runs = Parallel(chosen.jobs, return_as="generator_unordered")(
-            delayed(run_chunk)(s, first, chosen.folder) for s, first in open_
-        )
-        for _ in runs:
-            bar.advance(task)
-    results = {
-        s: np.concatenate([np.load(chosen.folder / f"{s.key}_{f:06d}.npy") for f in firsts])
-        for s in SCENARIOS
-    }
-    text = report(results, METHODS)
-    print(text)
-    (HERE / "result.md").write_text(text, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

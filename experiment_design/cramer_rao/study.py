@@ -1,24 +1,25 @@
 """Does identification reach the Cramér–Rao bound, started from nothing?
 
-    python study.py [--seeds 20] [--jobs 2]
+    elastocal study experiment_design/cramer_rao
 
 UR10 and KR 270-2 with 1 mm / 1 mrad random geometry errors (six per link and joint offsets), a
 tracker anywhere at any attitude, an unknown marker, 0.05 mm noise, 30 to 1000 random poses.
 Reported: position error on 200 noise-free held-out poses, root mean square over poses and seeds,
 beside the Cramér–Rao prediction √(mean tr(B_t (BᵀB)⁻¹ B_tᵀ) σ²) of the minimal complete set at
-the true parameters.  Prints the table and writes result.md.
+the true parameters.
 """
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib import metadata
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
+import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Cell, EffectChoice, ModelSpec, Robot, Tool
@@ -29,11 +30,18 @@ from elastocal.manipulator.model import Model
 from elastocal.manipulator.urdf import read_urdf
 from elastocal.measurements import Measurements
 
-HERE = Path(__file__).parent
+ARMS = ("UR10", "KR 270-2")
 EFFECTS = ("base_frame", "joint_offset", "link_geometry", "marker_position")
 SIGMA = 5e-5
 SIZES = (30, 100, 300, 1000)
 TEST_POSES = 200
+
+
+def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    for arm in ARMS:
+        for poses in SIZES:
+            for draw in range(options["draws"]):
+                yield {"arm": arm, "poses": poses, "draw": draw}
 
 
 def chain_of(name: str) -> Chain:
@@ -70,13 +78,15 @@ def true_values(model: Model, rng: np.random.Generator) -> np.ndarray:
     return x
 
 
-def one(name: str, n: int, seed: int) -> tuple[float, float, int]:
-    """Mean square error and its prediction in m², and the number of fitted parameters."""
-    rng = np.random.default_rng([seed, n])
-    chain = chain_of(name)
+def run(task: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Mean square error and its prediction, and the number of fitted parameters.  The draws follow
+    from the task's own numbers, as they did before this study had others: `rng` is not used."""
+    n = task["poses"]
+    rng = np.random.default_rng([task["draw"], n])
+    chain = chain_of(task["arm"])
     effects = tuple(EffectChoice(e) for e in EFFECTS)
     tool = Tool(markers={"M1": np.array([0.05, 0.08, 0.12])})
-    cell = Cell(name, None, Robot(), tool, model=ModelSpec(effects=effects))
+    cell = Cell(task["arm"], None, Robot(), tool, model=ModelSpec(effects=effects))
     arm = Model(chain, cell)
     x = true_values(arm, rng)
     table, test = random_table(chain, n, rng), random_table(chain, TEST_POSES, rng)
@@ -93,34 +103,22 @@ def one(name: str, n: int, seed: int) -> tuple[float, float, int]:
     information = (B[:, kept] * sizes[kept]).T @ (B[:, kept] * sizes[kept])
     B_test = arm.regressor(test, x, kept).B * sizes[kept]
     spread = np.einsum("ij,ji->", B_test, np.linalg.solve(information, B_test.T))
-    return (
-        float((error**2).sum() / TEST_POSES),
-        float(spread * SIGMA**2 / TEST_POSES),
-        len(found.determined),
-    )
+    return {
+        "squared_error": float((error**2).sum() / TEST_POSES) * 1e6,
+        "bound": float(spread * SIGMA**2 / TEST_POSES) * 1e6,
+        "fitted": len(found.determined),
+    }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--jobs", type=int, default=2)
-    chosen = parser.parse_args()
+def summary(frame: pd.DataFrame) -> str:
     lines = [
         "| arm | poses | fitted | error on held-out poses (mm) | Cramér–Rao (mm) | ratio |",
         "|---|---|---|---|---|---|",
     ]
-    print("\n".join(lines))
-    for name in ("UR10", "KR 270-2"):
-        for n in SIZES:
-            runs = Parallel(chosen.jobs)(delayed(one)(name, n, s) for s in range(chosen.seeds))
-            error, bound = (np.sqrt(np.mean([r[k] for r in runs])) * 1e3 for k in (0, 1))
-            fitted = "–".join(str(v) for v in sorted({r[2] for r in runs}))
-            lines.append(
-                f"| {name} | {n} | {fitted} | {error:.4f} | {bound:.4f} | {error / bound:.3f} |"
-            )
-            print(lines[-1], flush=True)
-    (HERE / "result.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    for (arm, poses), rows in frame.groupby(["arm", "poses"], sort=False):
+        error, bound = (np.sqrt(rows[key].mean()) for key in ("squared_error", "bound"))
+        fitted = "–".join(str(v) for v in sorted(set(rows["fitted"])))
+        lines.append(
+            f"| {arm} | {poses} | {fitted} | {error:.4f} | {bound:.4f} | {error / bound:.3f} |"
+        )
+    return "\n".join(lines)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import t
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "coverage"
 sys.path.insert(0, str(FOLDER))
@@ -75,25 +76,26 @@ def test_the_study_estimates_what_the_tool_does():
         assert estimate.std * 1e6 == pytest.approx(std[k], rel=0.02)
 
 
-def test_a_study_is_resumed_where_it_stopped(tmp_path):
-    """The second run reads what the first has written and adds the missing chunk only."""
-    scenario = NAMES["polar_3"]
-    study.run_chunk(scenario, 0, tmp_path)
-    path = tmp_path / "polar_3_000000.npy"
-    first = np.load(path)
-    assert first.shape == (study.CHUNK, len(study.METHODS), 9, 3)
-    study.run_chunk(scenario, 0, tmp_path)
-    np.testing.assert_array_equal(np.load(path), first)  # seeds are those of the replicates
-    default, oracle = (first[:, study.METHODS.index(m), :, 0] for m in ("default", "oracle"))
-    assert np.sqrt((default**2).mean()) < 1.5 * np.sqrt((oracle**2).mean())
+def test_a_task_holds_the_totals_of_its_campaigns():
+    """Added up by hand from the estimates of the same campaigns."""
+    scenario, campaigns = NAMES["polar_3"], 4
+    task = {"scenario": scenario.key, "first": 20, "campaigns": campaigns}
+    rows = study.run(task, np.random.default_rng(0))
+    setting = scenarios.setting(scenario)
+    found = np.array([study.estimates(setting, 20 + k) for k in range(campaigns)])
+    assert len(rows) == len(study.METHODS) * len(setting.names)
+    for row in rows:
+        m, j = study.METHODS.index(row["method"]), setting.names.index(row["parameter"])
+        one = found[~np.isnan(found[:, m, j, 0]), m, j]
+        inside = np.abs(one[:, 0]) <= one[:, 1] * t.isf(0.025, np.minimum(one[:, 2], 1e9))
+        assert row["run"] == len(one) and row["held_95"] == inside.sum()
+        assert row["squares"] == pytest.approx((one[:, 0] ** 2).sum(), rel=1e-12)
+    by_method = {m: sum(r["run"] for r in rows if r["method"] == m) for m in study.METHODS}
+    assert by_method["default"] == campaigns * 9 and by_method["OLS, eq. (8)"] == 9
 
 
 @pytest.mark.long
 def test_the_command_runs_from_nothing(tmp_path):
-    command = [sys.executable, str(FOLDER / "study.py"), "--replicates", "50", "--jobs", "2"]
-    kept = (FOLDER / "result.md").read_text(encoding="utf-8")
-    try:
-        subprocess.run([*command, "--folder", str(tmp_path)], check=True, capture_output=True)
-        assert "| table 1, 6 repeats |" in (FOLDER / "result.md").read_text(encoding="utf-8")
-    finally:
-        (FOLDER / "result.md").write_text(kept, encoding="utf-8")
+    command = [sys.executable, "-m", "elastocal", "study", str(FOLDER), "--set", "replicates=50"]
+    subprocess.run([*command, "-o", str(tmp_path / "out")], check=True, capture_output=True)
+    assert "| table 1, 6 repeats |" in (tmp_path / "out.md").read_text(encoding="utf-8")
