@@ -1,21 +1,22 @@
 """The results as tables: bars, confusion, reliability, size, distance, poses.
 
-    python result_tables.py DIR
+    python result_tables.py RESULTS
 
-writes result.md and reliability.png beside the records of a run.
+prints those of the worlds done so far, also while the study runs, and draws reliability.png here.
 """
 
 from __future__ import annotations
 
 import itertools
+import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import date
 from pathlib import Path
 
 import numpy as np
-import records
+import pandas as pd
 from bars import Row, bar_rows, wilson
 from calibration import answerable, draw_reliability, reliability
 from records import Record
@@ -23,19 +24,31 @@ from scipy.stats import norm
 from score import claims, is_unknown, location_right, one_effect, outright, sure
 from suites import FACTORS, SUITES
 
+from elastocal.studies.dataset import read_results
+
 DISTANCES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, np.inf)
 
 
-def write_report(folder: Path) -> str:
-    """Write result.md and reliability.png beside the records; the text."""
-    every = {suite: records.read(folder, suite) for suite in SUITES}
-    done = [r for found in every.values() for r in found]
-    if not done:
-        return "no world has been diagnosed yet"
-    commits = ", ".join(sorted({r["commit"] for r in done}))
+def records_of(frame: pd.DataFrame) -> list[Record]:
+    """The records of the study's rows, with the version of elastocal that each was made by."""
+    lines = zip(frame["record"], frame["elastocal"], strict=True)
+    return [json.loads(text) | {"version": version} for text, version in lines]
+
+
+def by_suite(done: Iterable[Record]) -> dict[str, list[Record]]:
+    every: dict[str, list[Record]] = {suite: [] for suite in SUITES}
+    for record in done:
+        every[record["suite"]].append(record)
+    return every
+
+
+def report(done: Sequence[Record]) -> str:
+    """All tables of these worlds."""
+    every = by_suite(done)
+    versions = ", ".join(sorted({r["version"] for r in done}))
     sections = [
         f"# Blind check of `diagnose`, seed {done[0]['seed']}",
-        f"{date.today().isoformat()}, commit {commits}, {len(done)} worlds. "
+        f"{date.today().isoformat()}, elastocal {versions}, {len(done)} worlds. "
         "Intervals: Wilson, 95 %. An empty row has not been run.",
         "## Bars\n\n" + _bars(bar_rows(every)),
     ]
@@ -51,11 +64,8 @@ def write_report(folder: Path) -> str:
         if every[suite]:
             sections.append(f"## Effects {title}, twice the size\n\n" + unknown(every[suite]))
     points = reliability(answerable(every))
-    draw_reliability(points, folder / "reliability.png")
     sections.append("## Reliability, all but outside and taken out\n\n" + _reliability(points))
-    text = "\n\n".join(sections) + "\n"
-    (folder / "result.md").write_text(text, encoding="utf-8")
-    return text
+    return "\n\n".join(sections) + "\n"
 
 
 def _bars(rows: Sequence[Row]) -> str:
@@ -162,4 +172,6 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 if __name__ == "__main__":
-    print(write_report(Path(sys.argv[1])))
+    found = records_of(read_results(sys.argv[1]))
+    print(report(found))
+    draw_reliability(reliability(answerable(by_suite(found))), Path("reliability.png"))

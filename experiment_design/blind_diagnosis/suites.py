@@ -20,6 +20,7 @@ from instrument import VARIANTS
 FACTORS = (0.1, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0)
 FEW_POSES, MANY_POSES = 60, 300
 LEFT_OUT_FACTOR = 2.0
+MOST = 1000  # worlds of one effect; names have three digits
 # Worlds of suites that are not counted by effect, over those per effect.
 CLEAN, PAIRS = 7, 10
 SIZES = 5  # the sweep over sizes has this much fewer per effect and factor
@@ -52,6 +53,11 @@ def tasks(suite: str, seed: int, per_effect: int) -> Iterator[Task]:
     """The suite's tasks; suites share no world."""
     own = np.random.SeedSequence([seed, list(SUITES).index(suite)]).generate_state(1)
     yield from SUITES[suite](suite, int(own[0]), per_effect)
+
+
+def named(suite: str, seed: int, world: str) -> Task:
+    """The suite's task of this world's name, however many the suite has."""
+    return next(task for task in tasks(suite, seed, MOST) if task.recipe.name == world)
 
 
 def _catalogue(poses: int, suite: str, seed: int, n: int) -> Iterator[Task]:

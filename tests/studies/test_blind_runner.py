@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 pytest.importorskip("mujoco")
@@ -19,15 +20,16 @@ import bars
 import extra_poses
 import one_world
 import records
-import result_tables
 import score
-import suite_run
+import study
 import suites
 import worker
-from calibration import calibration_error, reliability
+from calibration import calibration_error, draw_reliability, reliability
 from draw import ALIKE, Recipe, draw_world
 from visits import draw_poses
 from world_files import write_world
+
+from elastocal.studies.conduct import prepare
 
 ECCENTRIC, MASS, SCALE = (
     ("gear_eccentricity", "joint2"),
@@ -207,7 +209,7 @@ def test_the_tool_sees_neither_the_truth_nor_a_name_that_betrays_it(monkeypatch)
         lambda **k: folders.append(Path(make(**k))) or str(folders[-1]),
     )
     blind = Blindfold()
-    record = one_world.diagnose_world(task(), blind, {"seed": 5, "commit": "abc"})
+    record = one_world.diagnose_world(task(), blind, {"seed": 5})
     ((visible, arguments, files),) = blind.seen
     sealed = next(f for f in folders if f != visible)
     assert files == ["arm.urdf", "cell.toml", "data.csv"]
@@ -286,47 +288,40 @@ def test_the_script_runs_the_command_in_the_folder_and_passes_on_exit_code_and_m
     assert not (tmp_path / "v" / "diagnosis.json").exists()
 
 
-class Stop(Exception):
-    pass
+# --- the study ---------------------------------------------------------------------------------
 
 
-class Silent:
-    """A progress bar for nobody."""
-
-    def add_task(self, *args, **kwargs):
-        return 0
-
-    def advance(self, line):
-        pass
+OPTIONS = dict.fromkeys({name.partition("-")[0] for name in suites.SUITES}, 1)
 
 
-def test_an_interrupted_suite_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    """Five worlds; killed in the third, in the middle of a line."""
-    done = []
+def test_a_task_is_the_suites_world_of_that_name_under_the_studys_seed(monkeypatch):
+    """However many worlds the study has: a part of it draws the same ones."""
+    drawn = []
 
     def one(task, origin):
-        if len(done) == 2:
-            done.append(None)
-            raise Stop
-        done.append(task.recipe.name)
-        return origin | {"suite": task.suite, "world": task.recipe.name}
+        drawn.append(task)
+        return origin | {"suite": task.suite, "answer": None, "seconds": 1.0}
 
-    five = [task(recipe=Recipe(f"w{k}", (5, k))) for k in range(5)]
-    monkeypatch.setattr(suite_run, "tasks", lambda *_: iter(five))
-    monkeypatch.setattr(suite_run, "in_own_worker", one)
-    with pytest.raises(Stop):
-        suite_run.run_suite("left_out", 5, 1, 1, tmp_path, Silent())
-    with open(tmp_path / "left_out.jsonl", "a") as handle:
-        handle.write('{"suite": "left_out", "wor')
-    suite_run.run_suite("left_out", 5, 1, 1, tmp_path, Silent())
-    assert [name for name in done if name] == ["w0", "w1", "w2", "w3", "w4"]
-    assert [r["world"] for r in records.read(tmp_path, "left_out")] == [
-        "w0",
-        "w1",
-        "w2",
-        "w3",
-        "w4",
-    ]
+    monkeypatch.setattr(study, "in_own_worker", one)
+    for k, given in enumerate(study.tasks(OPTIONS)):
+        rng = np.random.default_rng(np.random.SeedSequence(7, spawn_key=(k,)))
+        assert json.loads(study.run(given, rng)["record"])["seed"] == 7
+    whole = [task for suite in suites.SUITES for task in suites.tasks(suite, 7, 1)]
+    assert drawn == whole
+    fewer = list(study.tasks(OPTIONS | {"catalogue": 0, "clean": 0}))
+    assert {t["suite"] for t in fewer} == {
+        name for name in suites.SUITES if name != "catalogue" and "clean" not in name
+    }
+
+
+def test_what_the_study_returns_is_what_study_toml_lists(monkeypatch):
+    monkeypatch.setattr(one_world, "_own_worker", Blindfold)
+    monkeypatch.setattr(study, "named", lambda *_: task())
+    prepared = prepare(FOLDER, seed=5)
+    row = study.run(prepared.jobs[0].task, prepared.jobs[0].rng())
+    assert set(row) == set(prepared.definition.columns)
+    assert row["verdict"] == NOTHING["verdict"] and row["seconds"] == 1.0
+    assert json.loads(row["record"])["truth"]["effects"][0]["effect"] == "encoder_scale"
 
 
 # --- suites -----------------------------------------------------------------------------------
@@ -451,33 +446,37 @@ def test_planned_poses_are_measured_and_diagnosed_beside_as_many_and_twice_as_ma
 # --- tables -----------------------------------------------------------------------------------
 
 
-def test_the_report_counts_every_world_and_says_which_bars_are_met(tmp_path):
+def test_the_report_counts_every_world_and_says_which_bars_are_met():
     def record(suite, k, given, **more):
         sealed = truth(ECCENTRIC) | {"plan": {"poses": 60}}
         return {
-            "suite": suite, "world": f"{suite}-{k}", "seed": 5, "commit": "abc", "factor": None,
+            "suite": suite, "world": f"{suite}-{k}", "seed": 5, "factor": None,
             "seconds": 4.0, "truth": sealed, "answer": given,
         } | more  # fmt: skip
 
-    right, wrong = answer("explained", ECCENTRIC), answer("explained", SCALE)
+    right, wrong, done = answer("explained", ECCENTRIC), answer("explained", SCALE), []
     for k in range(20):
         at = [{"distance": 7.0 if k else 1.5}]
         given = right if k else wrong
-        records.append(tmp_path, record("catalogue", k, given, distances=at))
+        done.append(record("catalogue", k, given, distances=at))
     for k in range(10):
-        records.append(tmp_path, record("clean-outliers", k, NOTHING if k else right))
-    text = result_tables.write_report(tmp_path)
+        done.append(record("clean-outliers", k, NOTHING if k else right))
+    lines = {"record": [json.dumps(r) for r in done], "elastocal": ["0.1+gabc"] * len(done)}
+    text = study.summary(pd.DataFrame(lines))
     cells = [line.strip("| ").split(" | ") for line in text.splitlines()]
     bar = {(row[0], row[1]): row[3:] for row in cells if len(row) == 6}
     alone = "one effect, 60 poses"
-    assert "seed 5" in text and "30 worlds" in text and "commit abc" in text
+    assert "seed 5" in text and "30 worlds" in text and "0.1+gabc" in text
     assert bar[alone, "right"] == ["0.950 (0.764 to 0.991)", "20", "yes"]
     assert bar[alone, "wrong name"] == ["0.050 (0.009 to 0.236)", "20", "NO"]
     assert bar["… with d ≥ 5", "named outright"][1:] == ["19", "yes"]
     assert bar["no effect, outliers", "an effect claimed"][1:] == ["10", "NO"]
     assert "1 × encoder_scale:joint3" in text
+
+
+def test_the_reliability_curve_is_drawn(tmp_path):
+    draw_reliability([(0.8, 0.75, 20), (0.98, 1.0, 50)], tmp_path / "reliability.png")
     assert (tmp_path / "reliability.png").stat().st_size > 0
-    assert (tmp_path / "result.md").read_text() == text
 
 
 def test_alike_pairs_are_named_as_the_tool_names_them():

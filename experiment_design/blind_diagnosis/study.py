@@ -1,0 +1,45 @@
+"""The blind check of `elastocal diagnose`.
+
+    elastocal study experiment_design/blind_diagnosis --seed S [--set catalogue300=0 …]
+
+Draws worlds, seals their truth, has each diagnosed by a process that is not given it, and only
+then scores.  An option per suite says how many worlds of each effect it draws; 0 leaves it out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from one_world import in_own_worker
+from result_tables import records_of, report
+from suites import SUITES, named
+from suites import tasks as suite_tasks
+
+
+def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    for suite in SUITES:
+        per_effect = options[suite.partition("-")[0]]
+        # Names follow from effect and number; the seed comes with `rng`.
+        for task in suite_tasks(suite, 0, per_effect):
+            yield {"suite": suite, "world": task.recipe.name}
+
+
+def run(task: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """The world's record as JSON.  A world follows from the study's seed, its suite and its name,
+    so that a part of the study draws the same worlds as the whole."""
+    seed = int(rng.bit_generator.seed_seq.entropy)  # type: ignore[attr-defined]
+    record = in_own_worker(named(task["suite"], seed, task["world"]), {"seed": seed})
+    answer = record["answer"]
+    return {
+        "verdict": None if answer is None else answer["verdict"],
+        "seconds": record["seconds"],
+        "record": json.dumps(record),
+    }
+
+
+def summary(frame: pd.DataFrame) -> str:
+    return report(records_of(frame))
