@@ -82,6 +82,21 @@ def test_a_constant_that_is_not_known_well_widens_what_is_possible() -> None:
     assert rms(column.reshape(-1, 3)) > 0
 
 
+@pytest.mark.parametrize("bound", [0.5, 1000.0])
+def test_a_constant_at_its_bound_has_the_slope_of_one_beside_it(bound: float) -> None:
+    """The search may end there, and no model can be written beyond it."""
+    found, item = confirmation("gear_ripple:joint5")
+    known = {p.name: k for k, p in enumerate(found.fitted.model.parameters)}
+    base = replace(found.fitted, x=found.fitted.x.copy())
+    base.x[[known["joint5.ripple_sin"], known["joint5.ripple_cos"]]] = 1e-4, 5e-5
+    inside = bound + (1e-4 if bound < 1 else -1e-4)
+    at, beside = (
+        found._by_constant(base, [one], one)[0]
+        for one in (replace(item, settings=np.array([v])) for v in (bound, inside))
+    )
+    assert rms(at - beside) < 0.05 * rms(beside)
+
+
 def test_a_change_time_has_no_slope() -> None:
     found, item = confirmation("encoder_jump:joint4")
     assert of_one(found, item).spread.shape[2] == len(found.fitted.x)

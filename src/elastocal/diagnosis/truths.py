@@ -161,14 +161,18 @@ class Confirmation:
                 continue
             grid = self.scene.grids[what.name, what.where]
             step = float(grid.step[grid.nearest(item.settings), s])
+            # At a bound, where the search may well end, the quotient is one-sided.
+            near = item.settings[s] + NUDGE * step * np.array([1.0, -1.0])
+            near = np.clip(near, setting.lower, setting.upper)
             ends = []
-            for sign in (1, -1):
+            for value in near:
                 moved = item.settings.copy()
-                moved[s] += sign * NUDGE * step
+                moved[s] = value
                 items = [replace(i, settings=moved) if i.same_as(item) else i for i in known]
                 model = extended(self.plain.model, items)
                 ends.append([model.predict(seen.table, base.x, seen) for seen in sets])
-            slopes = [(up - down) / (2 * NUDGE) for up, down in zip(*ends, strict=True)]
+            apart = float(near[0] - near[1]) / step
+            slopes = [(up - down) / apart for up, down in zip(*ends, strict=True)]
             columns = [np.column_stack(pair) for pair in zip(columns, slopes, strict=True)]
         return columns
 
