@@ -34,7 +34,9 @@ Mask = NDArray[np.bool_]
 # Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough
 # to leave them to the data, narrow enough that what no reading shows stays where it is.
 FITTED, FITTED_COMPLIANCE = 5.0, 1.0
-PLACED = 5e-3  # m or rad: base and markers, which the fit has placed already
+# m or rad: base and markers.  The fit has placed them, but an error that it took for another
+# geometry may have moved them by as much; the true effect must be free to bring them back.
+PLACED = 0.1
 KEPT = 1_000_000  # numbers of a search's drives that are kept from scan to scan
 # The load hangs on a flange frame that the markers' freedom leaves undetermined to millimetres.
 LOAD_POINT_TOLERANCE = 2e-3
