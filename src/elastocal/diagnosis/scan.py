@@ -60,7 +60,7 @@ def scan(
     `signs` (F, C) of ±1 are the flips.
     """
     at = project(data, noise)
-    grams = Grams(scene, data, at)
+    grams = Grams(scene, data, at, signs)
     scored, blocks = [], []
     total, flips = [], []
     for h, weight in zip(scene.hypotheses, prior.hypotheses, strict=True):
@@ -75,7 +75,7 @@ def scan(
         scored.append(Scored(evidence, float(each[k]), settings, float(found.distance[k])))
         total.append(weight + evidence)
         if len(signs):
-            flips.append(weight + logsumexp(found.flipped(signs, scales) + log_prior, axis=1))
+            flips.append(weight + logsumexp(found.flipped(scales) + log_prior, axis=1))
     drivers: dict[str, list[float]] = {}
     driver_flips: dict[str, list[Array]] = {}
     for g, weight in zip(generic, prior.blocks, strict=True):
@@ -85,7 +85,7 @@ def scan(
         total.append(weight + evidence)
         drivers.setdefault(g.driver, []).append(evidence)
         if len(signs):
-            flipped = found.flipped(signs)[:, 0]
+            flipped = found.flipped()[:, 0]
             flips.append(weight + flipped)
             driver_flips.setdefault(g.driver, []).append(flipped)
     return Scan(

@@ -35,7 +35,7 @@ Mask = NDArray[np.bool_]
 # to leave them to the data, narrow enough that what no reading shows stays where it is.
 FITTED, FITTED_COMPLIANCE = 5.0, 1.0
 PLACED = 5e-3  # m or rad: base and markers, which the fit has placed already
-KEPT = 1_000_000  # numbers of a search's drives that are kept from scan to scan
+KEPT = 20_000_000  # numbers of a search's drives that are kept from scan to scan
 # The load hangs on a flange frame that the markers' freedom leaves undetermined to millimetres.
 LOAD_POINT_TOLERANCE = 2e-3
 
@@ -123,23 +123,40 @@ class Scene:
         return np.zeros(0) if time is None else moments_between(time[self.present.ravel()])
 
     def drive(self, h: Hypothesis, settings: Array) -> Array:
-        """D (G, C, v, d, k) at each visit, per typical size, at `settings` (G, …)."""
+        """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)
+        where all visits of a configuration are driven alike."""
         key = h.name, h.where, settings.tobytes()
         if key in self._kept:
             return self._kept[key]
-        D = self.drives[h.name, h.where](self.visit_table, settings)
-        D = D.reshape(len(settings), *self.present.shape, *D.shape[2:])
-        D = D * self.present[None, :, :, None, None] * self.sizes[h.name, h.where]
-        if D.size < KEPT:
+        visits, present = self._driven_visits[h.name, h.where]
+        D = self.drives[h.name, h.where](visits, settings) * self.sizes[h.name, h.where]
+        D = D.reshape(*present.shape, *D.shape[1:]) * present[:, :, None, None, None]
+        D = np.ascontiguousarray(D.transpose(0, 1, 3, 2, 4))
+        if D.size + sum(kept.size for kept in self._kept.values()) <= KEPT:
             self._kept[key] = D
         return D
+
+    @cached_property
+    def _driven_visits(self) -> dict[tuple[str, str], tuple[Measurements, Mask]]:
+        """Of each driven hypothesis the visits (C·v) that its drive is evaluated at and which of
+        them there are (C, v): one of each configuration where the others are driven alike."""
+        every, present = self.visit_table, self.present
+        first = np.zeros_like(present)
+        first[:, 0] = True
+        one_each = every.take(first.ravel())
+        out = {}
+        for key, drive in self.drives.items():
+            asked = drive.asked(every).reshape(*present.shape, -1)
+            alike = (asked == asked[:, :1]) | ~present[:, :, None]
+            out[key] = (one_each, present[:, :1]) if alike.all() else (every, present)
+        return out
 
     def packed(self, h: Hypothesis, settings: Array) -> Array:
         """Columns (C, m, k) of a hypothesis at one value of its `settings` (…,), scaled."""
         size = self.sizes[h.name, h.where]
         if not is_driven(h):
             return self.pack(self.columns.of(h)) * size
-        D = self.drives[h.name, h.where](self.base.seen.table, settings[None])[0]
+        D = self.drives[h.name, h.where](self.base.seen.table, settings[None])[:, 0]
         rows = self.columns.entry(entry_key(h, self.base.model)) @ D
         return self.pack(rows) * size
 
