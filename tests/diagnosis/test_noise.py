@@ -14,11 +14,11 @@ from elastocal.diagnosis.noise import (
     NoiseValues,
     NoisyData,
     covariance,
-    fit_noise,
     likelihood,
     log_prior,
     project,
 )
+from elastocal.diagnosis.noise_fit import fit_noise
 
 NOISE = NoiseValues(1.3, np.array([4e-6, 9e-6, 2e-5]), 0.4)
 SEEDS = range(4)

@@ -18,7 +18,7 @@ from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.listing import candidates, too_small, warnings
 from elastocal.diagnosis.locate import location, structure_tests
-from elastocal.diagnosis.noise import fit_noise
+from elastocal.diagnosis.noise_fit import fit_noise
 from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.diagnosis.play_law import with_likelier_play
 from elastocal.diagnosis.recorded_drivers import model_keys, with_recorded_drivers

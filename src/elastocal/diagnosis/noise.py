@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize
+from scipy import linalg
 
 from elastocal.diagnosis.blocks import Blocks
 
@@ -34,8 +34,6 @@ REPEATABILITY, REPEATABILITY_SPREAD = 8e-6, 1.5
 JOINT_SPREAD = 0.7
 SHARED, SHARED_SPREAD = 0.2, 1.2
 ROUNDING = 1e-12
-STRIDE, STRIDES = 1.5, 6  # of the logarithms
-ENOUGH = 0.01  # change of −2ℓ at which a search ends
 SMALLEST, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact
 
 
@@ -105,16 +103,38 @@ class NoisyData:
 
     def masked(self, packed: Array) -> Array:
         """Rows that do not count set to zero (C, m, …)."""
+        if not self.left_out.any():
+            return packed
         keep = ~self.left_out
         return packed * keep.reshape(keep.shape + (1,) * (packed.ndim - 2))
+
+    @cached_property
+    def counting(self) -> Counting:
+        """What is evaluated at many noises, rows that do not count set to zero once."""
+        keep = ~self.left_out
+        both = keep[:, :, None] & keep[:, None, :]
+        return Counting(
+            self.masked(self.r), self.masked(self.X), self.masked(self.G),
+            self.covariance if keep.all() else self.covariance * both,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Counting:
+    """Residual, columns, joint columns and stated covariance with zeros where nothing counts."""
+
+    r: Array
+    X: Array
+    G: Array
+    covariance: Array
 
 
 def covariance(data: NoisyData, noise: NoiseValues) -> Array:
     """V (C, m, m); rows left out have unit variance of their own."""
-    by_joint = (data.G * noise.joint**2) @ data.G.transpose(0, 2, 1)
-    V = noise.factor**2 * data.covariance + by_joint * (data.same_visit + noise.shared**2)
-    keep = ~data.left_out
-    V = V * (keep[:, :, None] & keep[:, None, :])
+    of = data.counting
+    V = (of.G * noise.joint**2) @ of.G.transpose(0, 2, 1)
+    V *= data.same_visit + noise.shared**2
+    V += noise.factor**2 * of.covariance
     m = np.arange(V.shape[1])
     V[:, m, m] += data.left_out
     return V
@@ -159,39 +179,73 @@ def _power(blocks: Array, exponent: float) -> Array:
     return np.asarray((vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1))
 
 
+@dataclass(frozen=True)
+class Weighted:
+    """The data weighted by one noise, whatever the prior of the coefficients: V⁻¹ (C, m, m),
+    V⁻¹X (C·m, p), V⁻¹r (C, m), M = XᵀV⁻¹X (p, p), z = XᵀV⁻¹r (p,), and the part of −2ℓ that
+    stands without X, log|V| + rᵀV⁻¹r + n log 2π."""
+
+    inverse: Array
+    X: Array
+    r: Array
+    M: Array
+    z: Array
+    alone: float
+
+    @classmethod
+    def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
+        V = covariance(data, noise)
+        X, r = data.counting.X, data.counting.r
+        p = X.shape[2]
+        L = np.linalg.cholesky(V)
+        log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
+        inverse: Array = np.asarray(np.linalg.inv(V))
+        VX = (inverse @ X).reshape(-1, p)
+        Vr = (inverse @ r[..., None])[..., 0]
+        alone = log_det + float(r.ravel() @ Vr.ravel()) + data.n_rows * float(np.log(2 * np.pi))
+        return cls(inverse, VX, Vr, X.reshape(-1, p).T @ VX, VX.T @ r.ravel(), alone)
+
+    def factored(self, precision: Array) -> tuple[Array, Array, float]:
+        """L of LLᵀ = M + Λ, L⁻¹z, and ℓ, for a prior of precision Λ (p,)."""
+        # What no reading shows and the prior leaves wide must not drown in rounding.
+        own = precision + ROUNDING * np.diag(self.M).max(initial=0.0)
+        L: Array = linalg.cholesky(self.M + np.diag(own), lower=True, check_finite=False)
+        z = linalg.solve_triangular(L, self.z, lower=True, check_finite=False)
+        log_det = 2 * float(np.log(np.diag(L)).sum()) - float(np.log(precision).sum())
+        return L, z, -0.5 * (self.alone + log_det - float(z @ z))
+
+    def marginal(self, precision: Array) -> float:
+        """The log marginal likelihood ℓ alone, for a prior of precision Λ (p,)."""
+        return self.factored(precision)[2]
+
+    def projection(self, precision: Array) -> Projection:
+        L, z, marginal = self.factored(precision)
+        H = linalg.solve_triangular(L, self.X.T, lower=True, check_finite=False).T
+        H = H.reshape(*self.r.shape, -1)
+        beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
+        return Projection(self.inverse, H, self.r - H @ z, beta, marginal, L)
+
+
 def project(data: NoisyData, noise: NoiseValues) -> Projection:
-    V = covariance(data, noise)
-    X, r = data.masked(data.X), data.masked(data.r)
-    C, m, p = X.shape
-    L = np.linalg.cholesky(V)
-    log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
-    inverse: Array = np.asarray(np.linalg.inv(V))
-    VX = inverse @ X
-    M = X.reshape(-1, p).T @ VX.reshape(-1, p)
-    # What no reading shows and the prior leaves wide must not drown in rounding.
-    M += np.diag(data.precision + ROUNDING * np.diag(M).max(initial=0.0))
-    factor: Array = linalg.cholesky(M, lower=True)
-    log_det += 2 * float(np.log(np.diag(factor)).sum()) - float(np.log(data.precision).sum())
-    H: Array = linalg.solve_triangular(factor, VX.reshape(-1, p).T, lower=True).T.reshape(C, m, p)
-    Vr = (inverse @ r[..., None])[..., 0]
-    z = H.reshape(-1, p).T @ r.ravel()
-    squares = float(r.ravel() @ Vr.ravel() - z @ z)
-    minus_two = log_det + squares + data.n_rows * float(np.log(2 * np.pi))
-    beta = linalg.solve_triangular(factor, z, lower=True, trans="T")
-    return Projection(inverse, H, Vr - H @ z, beta, -0.5 * minus_two, factor)
+    return Weighted.of(data, noise).projection(data.precision)
+
+
+def posterior(data: NoisyData, noise: NoiseValues) -> float:
+    """−2 log of marginal likelihood times prior of the noise."""
+    marginal = Weighted.of(data, noise).marginal(data.precision)
+    return -2 * marginal + log_prior(data.stated, noise)[0]
 
 
 def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
     """−2 log of marginal likelihood times prior, and its slope in the logarithms (2 + joints,)."""
-    at = project(data, noise)
-    Q = at.inverse - at.H @ at.H.transpose(0, 2, 1) - at.u[:, :, None] * at.u[:, None, :]
-    keep = ~data.left_out
-    Q = Q * (keep[:, :, None] & keep[:, None, :])
-    slope = np.empty(2 + data.G.shape[2])
-    slope[0] = 2 * noise.factor**2 * float((Q * data.covariance).sum())
-    G = data.G
-    by_visit = ((Q * data.same_visit) @ G * G).sum(axis=(0, 1))
-    by_block = (Q @ G * G).sum(axis=(0, 1))
+    at, of = project(data, noise), data.counting
+    # Rows that do not count have zeros in whatever Q meets.
+    Q = at.inverse - at.H @ at.H.transpose(0, 2, 1)
+    Q -= at.u[:, :, None] * at.u[:, None, :]
+    slope = np.empty(2 + of.G.shape[2])
+    slope[0] = 2 * noise.factor**2 * float(np.vdot(Q, of.covariance))
+    by_block = np.einsum("cmj,cmj->j", Q @ of.G, of.G)
+    by_visit = np.einsum("cmj,cmj->j", (Q * data.same_visit) @ of.G, of.G)
     slope[1] = 2 * noise.shared**2 * float(by_block @ noise.joint**2)
     slope[2:] = 2 * noise.joint**2 * (by_visit + noise.shared**2 * by_block)
     prior, prior_slope = log_prior(data.stated, noise)
@@ -214,55 +268,3 @@ def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
     away = joints - np.log(REPEATABILITY)
     slope[2:] = 2 * inverse @ away
     return float(z @ z + away @ inverse @ away), slope
-
-
-def fit_noise(data: NoisyData, start: NoiseValues | None = None) -> NoiseValues:
-    """The most probable noise values, by a quasi-Newton search in their logarithms.
-
-    Where nothing is stated it starts from two ends, unless a start is given.
-    """
-    if start is not None:
-        return _climbed(data, start)
-    starts = [NoiseValues.usual(data.G.shape[2])]
-    if not data.stated:
-        starts.append(_balanced(data))
-    ends = [_climbed(data, s) for s in starts]
-    return min(ends, key=lambda end: likelihood(data, end)[0])
-
-
-def _balanced(data: NoisyData) -> NoiseValues:
-    """Instrument and joints share the scatter of the data equally.
-
-    From far below it the likelihood is flat in a joint's logarithm, and no climb leaves.
-    """
-    used = ~data.left_out
-    whole = float((data.r[used] ** 2).mean())
-    shape = float(np.diagonal(data.covariance, axis1=1, axis2=2)[used].mean())
-    moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)
-    joint = np.clip(np.sqrt(0.5 * whole / (len(moved) * moved)), SMALLEST, LARGEST)
-    return NoiseValues(float(np.sqrt(0.5 * whole / shape)), joint, SHARED)
-
-
-def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
-    n = data.G.shape[2]
-
-    def cost(theta: Array) -> tuple[float, Array]:
-        return likelihood(data, NoiseValues.of_logs(theta))
-
-    spread = STATED_SPREAD if data.stated else UNSTATED_SPREAD
-    lower = np.array([-4 * spread, -5.0] + [np.log(SMALLEST)] * n)
-    upper = np.array([4 * spread, 2.0] + [np.log(LARGEST)] * n)
-    theta = np.clip(start.logs(), lower, upper)
-    ftol = ENOUGH / max(abs(cost(theta)[0]), 1.0)
-    # Step by step: one long stride of the line search ends where V is singular to rounding.
-    for _ in range(STRIDES):
-        low, high = np.maximum(lower, theta - STRIDE), np.minimum(upper, theta + STRIDE)
-        found = optimize.minimize(
-            cost, theta, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-            options={"maxiter": 60, "ftol": ftol, "gtol": 3e-2},
-        )  # fmt: skip
-        theta = found.x
-        inside = (theta > low) & (theta < high) | (theta == lower) | (theta == upper)
-        if inside.all():
-            break
-    return NoiseValues.of_logs(theta)
