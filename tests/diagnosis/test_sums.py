@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from support.diagnosis_data import random_blocks, random_data
 
+from elastocal.diagnosis.blocks import VisitPlaces
 from elastocal.diagnosis.noise import NoiseValues, project
-from elastocal.diagnosis.sums import EntrySums, VisitPlaces, direct
+from elastocal.diagnosis.sums import EntrySums, direct
 
 NOISE = NoiseValues(1.1, np.array([4e-6, 9e-6, 1e-5]), 0.5)
 SEEDS = range(4)

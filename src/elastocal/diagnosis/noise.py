@@ -111,21 +111,26 @@ class NoisyData:
     @cached_property
     def counting(self) -> Counting:
         """What is evaluated at many noises, rows that do not count set to zero once."""
-        keep = ~self.left_out
+        G, keep = self.masked(self.G), ~self.left_out
         both = keep[:, :, None] & keep[:, None, :]
+        visit = self.blocks.places.one_hot
+        by_visit = (visit[..., None] * G[:, :, None, :]).reshape(*G.shape[:2], -1)
+        by_visit = np.ascontiguousarray(by_visit.transpose(0, 2, 1))
         return Counting(
-            self.masked(self.r), self.masked(self.X), self.masked(self.G),
+            self.masked(self.r), self.masked(self.X), G, by_visit,
             self.covariance if keep.all() else self.covariance * both,
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Counting:
-    """Residual, columns, joint columns and stated covariance with zeros where nothing counts."""
+    """Residual, columns, joint columns, those of each visit by itself (C, visits·joints, m), and
+    stated covariance, with zeros where nothing counts."""
 
     r: Array
     X: Array
     G: Array
+    by_visit: Array
     covariance: Array
 
 
@@ -181,11 +186,11 @@ def _power(blocks: Array, exponent: float) -> Array:
 
 @dataclass(frozen=True)
 class Weighted:
-    """The data weighted by one noise, whatever the prior of the coefficients: V⁻¹ (C, m, m),
-    V⁻¹X (C·m, p), V⁻¹r (C, m), M = XᵀV⁻¹X (p, p), z = XᵀV⁻¹r (p,), and the part of −2ℓ that
-    stands without X, log|V| + rᵀV⁻¹r + n log 2π."""
+    """The data whitened by one noise V = KKᵀ, whatever the prior of the coefficients: K⁻¹
+    (C, m, m), K⁻¹X (C, m, p), K⁻¹r (C, m), M = XᵀV⁻¹X (p, p), z = XᵀV⁻¹r (p,), and the part of
+    −2ℓ that stands without X, log|V| + rᵀV⁻¹r + n log 2π."""
 
-    inverse: Array
+    root: Array
     X: Array
     r: Array
     M: Array
@@ -194,22 +199,23 @@ class Weighted:
 
     @classmethod
     def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
-        V = covariance(data, noise)
-        X, r = data.counting.X, data.counting.r
-        p = X.shape[2]
-        L = np.linalg.cholesky(V)
-        log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
-        inverse: Array = np.asarray(np.linalg.inv(V))
-        VX = (inverse @ X).reshape(-1, p)
-        Vr = (inverse @ r[..., None])[..., 0]
-        alone = log_det + float(r.ravel() @ Vr.ravel()) + data.n_rows * float(np.log(2 * np.pi))
-        return cls(inverse, VX, Vr, X.reshape(-1, p).T @ VX, VX.T @ r.ravel(), alone)
+        K = np.linalg.cholesky(covariance(data, noise))
+        log_det = 2 * float(np.log(np.diagonal(K, axis1=1, axis2=2)).sum())
+        root = _inverse(K)
+        X, r = root @ data.counting.X, (root @ data.counting.r[..., None])[..., 0]
+        flat = X.reshape(-1, X.shape[2])
+        alone = log_det + float(np.vdot(r, r)) + data.n_rows * float(np.log(2 * np.pi))
+        return cls(root, X, r, flat.T @ flat, flat.T @ r.ravel(), alone)
+
+    def prior(self, precision: Array) -> Array:
+        """Λ's diagonal (p,), and a little more: what no reading shows and the prior leaves wide
+        must not drown in rounding."""
+        return precision + ROUNDING * np.diag(self.M).max(initial=0.0)
 
     def factored(self, precision: Array) -> tuple[Array, Array, float]:
         """L of LLᵀ = M + Λ, L⁻¹z, and ℓ, for a prior of precision Λ (p,)."""
-        # What no reading shows and the prior leaves wide must not drown in rounding.
-        own = precision + ROUNDING * np.diag(self.M).max(initial=0.0)
-        L: Array = linalg.cholesky(self.M + np.diag(own), lower=True, check_finite=False)
+        M = self.M + np.diag(self.prior(precision))
+        L: Array = linalg.cholesky(M, lower=True, check_finite=False)
         z = linalg.solve_triangular(L, self.z, lower=True, check_finite=False)
         log_det = 2 * float(np.log(np.diag(L)).sum()) - float(np.log(precision).sum())
         return L, z, -0.5 * (self.alone + log_det - float(z @ z))
@@ -220,10 +226,30 @@ class Weighted:
 
     def projection(self, precision: Array) -> Projection:
         L, z, marginal = self.factored(precision)
-        H = linalg.solve_triangular(L, self.X.T, lower=True, check_finite=False).T
-        H = H.reshape(*self.r.shape, -1)
+        back = self.root.transpose(0, 2, 1)
+        H = back @ _divided(self.X, L)
+        u = (back @ self.r[..., None])[..., 0] - H @ z
         beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
-        return Projection(self.inverse, H, self.r - H @ z, beta, marginal, L)
+        return Projection(back @ self.root, H, u, beta, marginal, L)
+
+
+def _inverse(K: Array) -> Array:
+    """K⁻¹ of lower triangles K (C, m, m), by halves: a general inverse takes twice as long."""
+    if K.shape[1] == 1:
+        return 1 / K
+    h = K.shape[1] // 2
+    out = np.zeros_like(K)
+    out[:, :h, :h] = upper = _inverse(K[:, :h, :h])
+    out[:, h:, h:] = lower = _inverse(K[:, h:, h:])
+    out[:, h:, :h] = -lower @ (K[:, h:, :h] @ upper)
+    return out
+
+
+def _divided(rows: Array, L: Array) -> Array:
+    """rows L⁻ᵀ (…, p) of rows (…, p) and a lower triangle L (p, p)."""
+    flat = rows.reshape(-1, rows.shape[-1])
+    divided = linalg.solve_triangular(L, flat.T, lower=True, check_finite=False).T
+    return np.asarray(divided.reshape(rows.shape))
 
 
 def project(data: NoisyData, noise: NoiseValues) -> Projection:
@@ -237,19 +263,35 @@ def posterior(data: NoisyData, noise: NoiseValues) -> float:
 
 
 def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
-    """−2 log of marginal likelihood times prior, and its slope in the logarithms (2 + joints,)."""
-    at, of = project(data, noise), data.counting
-    # Rows that do not count have zeros in whatever Q meets.
-    Q = at.inverse - at.H @ at.H.transpose(0, 2, 1)
-    Q -= at.u[:, :, None] * at.u[:, None, :]
-    slope = np.empty(2 + of.G.shape[2])
-    slope[0] = 2 * noise.factor**2 * float(np.vdot(Q, of.covariance))
-    by_block = np.einsum("cmj,cmj->j", Q @ of.G, of.G)
-    by_visit = np.einsum("cmj,cmj->j", (Q * data.same_visit) @ of.G, of.G)
+    """−2 log of marginal likelihood times prior, and its slope in the logarithms (2 + joints,).
+
+    The slope wants gᵀQg, Q = P − uuᵀ, of the joints' columns g in every visit and configuration:
+    with g̃ = K⁻¹g and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀg̃ − |L⁻¹X̃ᵀg̃|² − (g̃ᵀẽ)².  What is left of V is
+    the instrument's, and tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ.
+    """
+    of, at = data.counting, Weighted.of(data, noise)
+    L, z, marginal = at.factored(data.precision)
+    beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
+    e = at.r - at.X @ beta
+    g = of.by_visit @ at.root.transpose(0, 2, 1)
+    # Few rows are divided by L rather than many.
+    many = g.shape[1] >= g.shape[2]
+    Xg = g @ _divided(at.X, L) if many else _divided(g @ at.X, L)
+    J = data.G.shape[2]
+    by_visit, by_block = np.zeros(J), np.zeros(J)
+    for sign, part in ((1, g), (-1, Xg), (-1, g @ e[..., None])):
+        each = part.reshape(len(part), -1, J, part.shape[2])
+        together = each.sum(axis=1)
+        by_visit += sign * np.einsum("cvjk,cvjk->j", each, each)
+        by_block += sign * np.einsum("cjk,cjk->j", together, together)
+    inverse = linalg.solve_triangular(L, np.eye(len(L)), lower=True, check_finite=False)
+    fitted = len(L) - float((inverse**2 @ at.prior(data.precision)).sum())
+    slope = np.empty(2 + J)
     slope[1] = 2 * noise.shared**2 * float(by_block @ noise.joint**2)
     slope[2:] = 2 * noise.joint**2 * (by_visit + noise.shared**2 * by_block)
+    slope[0] = 2 * (data.n_rows - fitted - float(np.vdot(e, e))) - slope[2:].sum()
     prior, prior_slope = log_prior(data.stated, noise)
-    return -2 * at.marginal + prior, slope + prior_slope
+    return -2 * marginal + prior, slope + prior_slope
 
 
 def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.diagnosis.blocks import Blocks
+from elastocal.diagnosis.blocks import Blocks, VisitPlaces
 from elastocal.diagnosis.columns import (
     Columns,
     Drive,
@@ -22,7 +22,6 @@ from elastocal.diagnosis.columns import (
 from elastocal.diagnosis.hypotheses import Hypothesis, recorded
 from elastocal.diagnosis.noise import NoisyData
 from elastocal.diagnosis.settings_grid import Grid, grid_of, moments_between
-from elastocal.diagnosis.sums import VisitPlaces
 from elastocal.identification.solve import is_placed
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
@@ -219,9 +218,7 @@ def scene_of(
         stated=base.stated is not None,
     )
     fitted = FittedColumns(tuple(e for e, u in zip(effects, used, strict=True) if u), width[used])
-    return Scene(
-        base, columns, tuple(hypotheses), blocks, VisitPlaces.of(blocks), data, fitted, load_point
-    )
+    return Scene(base, columns, tuple(hypotheses), blocks, blocks.places, data, fitted, load_point)
 
 
 def away(base: Baseline) -> Array:
