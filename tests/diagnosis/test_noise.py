@@ -10,15 +10,9 @@ from scipy import linalg, optimize, stats
 from support.diagnosis_data import dense_noise, kept_only, random_data, used_rows
 
 from elastocal.diagnosis.blocks import Blocks
-from elastocal.diagnosis.noise import (
-    NoiseValues,
-    NoisyData,
-    covariance,
-    likelihood,
-    log_prior,
-    project,
-)
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, covariance, log_prior
 from elastocal.diagnosis.noise_fit import fit_noise
+from elastocal.diagnosis.projection import likelihood, project
 
 NOISE = NoiseValues(1.3, np.array([4e-6, 9e-6, 2e-5]), 0.4)
 SEEDS = range(4)

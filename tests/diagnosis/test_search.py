@@ -14,8 +14,9 @@ from elastocal.diagnosis.found import Found, Slot
 from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.model_set import Item, fit_set, packed_columns
-from elastocal.diagnosis.noise import NoiseValues, covariance, project
+from elastocal.diagnosis.noise import NoiseValues, covariance
 from elastocal.diagnosis.prior import Prior
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scan import scan
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.search import Search, base_score

@@ -7,7 +7,8 @@ import pytest
 from support.diagnosis_data import random_blocks, random_data
 
 from elastocal.diagnosis.blocks import VisitPlaces
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.sums import EntrySums, direct
 
 NOISE = NoiseValues(1.1, np.array([4e-6, 9e-6, 1e-5]), 0.5)

@@ -11,7 +11,8 @@ from elastocal.diagnosis.columns import EntryKey, entry_key, is_driven
 from elastocal.diagnosis.evidence import SCALES, UNSIZED_SCALES, Spectrum
 from elastocal.diagnosis.generic import Generic
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.noise import NoisyData, Projection
+from elastocal.diagnosis.noise import NoisyData
+from elastocal.diagnosis.projection import Projection
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.sums import EntrySums, direct
 

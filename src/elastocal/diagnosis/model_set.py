@@ -14,15 +14,9 @@ from elastocal.diagnosis.evidence import SCALES
 from elastocal.diagnosis.generic import Generic
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.noise import (
-    NoiseValues,
-    NoisyData,
-    Projection,
-    Weighted,
-    log_prior,
-    project,
-)
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, log_prior
 from elastocal.diagnosis.noise_fit import fit_noise
+from elastocal.diagnosis.projection import Projection, Weighted, project
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]

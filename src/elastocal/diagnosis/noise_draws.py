@@ -5,14 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.noise import (
-    LARGEST,
-    SMALLEST,
-    NoiseValues,
-    NoisyData,
-    likelihood,
-    posterior,
-)
+from elastocal.diagnosis.noise import LARGEST, SMALLEST, NoiseValues, NoisyData
+from elastocal.diagnosis.projection import likelihood, posterior
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,8 @@ from elastocal.diagnosis.noise import (
     UNSTATED_SPREAD,
     NoiseValues,
     NoisyData,
-    likelihood,
-    posterior,
 )
+from elastocal.diagnosis.projection import likelihood, posterior
 
 Array = NDArray[np.float64]
 

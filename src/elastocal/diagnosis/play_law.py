@@ -14,8 +14,9 @@ import numpy as np
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.model_set import Item, fit_set
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
 from elastocal.diagnosis.noise_fit import fit_noise
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.manipulator.model import Model
 

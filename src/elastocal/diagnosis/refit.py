@@ -12,7 +12,8 @@ from scipy import linalg
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.result import FittedParameter
 from elastocal.diagnosis.scene import Scene, away, widths
 from elastocal.manipulator.model import Regression

@@ -11,8 +11,9 @@ from scipy.special import logsumexp
 from elastocal.diagnosis.columns import is_driven
 from elastocal.diagnosis.generic import Generic
 from elastocal.diagnosis.gram import Grams, scales_of
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, Projection, project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
 from elastocal.diagnosis.prior import Prior
+from elastocal.diagnosis.projection import Projection, project
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.blocks import VisitPlaces
 from elastocal.diagnosis.evidence import Spectrum, spectrum
-from elastocal.diagnosis.noise import Projection
+from elastocal.diagnosis.projection import Projection
 
 Array = NDArray[np.float64]
 

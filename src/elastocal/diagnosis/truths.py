@@ -18,8 +18,9 @@ from elastocal.diagnosis.fresh import fresh_table
 from elastocal.diagnosis.heldout import left_out_residual, squared_lengths
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, beside, fit_set
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
 from elastocal.diagnosis.noise_draws import noise_draws
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.refit import Linear, Posterior
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.uncertain_settings import other_settings
