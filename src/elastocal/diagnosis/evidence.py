@@ -81,6 +81,12 @@ def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:
     return np.asarray(top + np.log(np.exp(each, out=each).mean(axis=0)))
 
 
+def log_sum(values: Array, axis: int = -1) -> Array:
+    """log Σ exp of finite values along an axis."""
+    top = values.max(axis=axis, keepdims=True)
+    return np.asarray(np.log(np.exp(values - top).sum(axis=axis)) + top.squeeze(axis))
+
+
 def spectrum(A: Array, b: Array, flips: Array) -> Spectrum:
     """Of Gram matrices A (V, K, K), b (V, K) and those of flipped residuals (F, V, K)."""
     lam, U = np.linalg.eigh(A)

@@ -66,6 +66,10 @@ class Scene:
     load_point: Array | None = None
 
     @cached_property
+    def _packed(self) -> dict[EntryKey | tuple[str, str], Array]:
+        return {}
+
+    @cached_property
     def _kept(self) -> dict[tuple[str, str, bytes], Array]:
         return {}
 
@@ -86,7 +90,10 @@ class Scene:
         return self.blocks.pack(self.columns.observed(rows))
 
     def entry(self, key: EntryKey) -> Array:
-        return self.pack(self.columns.entry(key))
+        """Packed columns (C, m, d) of an entry; not to be written to."""
+        if key not in self._packed:
+            self._packed[key] = self.pack(self.columns.entry(key))
+        return self._packed[key]
 
     @cached_property
     def sizes(self) -> dict[tuple[str, str], Array]:
@@ -151,10 +158,13 @@ class Scene:
         return out
 
     def packed(self, h: Hypothesis, settings: Array) -> Array:
-        """Columns (C, m, k) of a hypothesis at one value of its `settings` (…,), scaled."""
+        """Columns (C, m, k) of a hypothesis at one value of its `settings` (…,), scaled; not to be
+        written to."""
         size = self.sizes[h.name, h.where]
         if not is_driven(h):
-            return self.pack(self.columns.of(h)) * size
+            if (h.name, h.where) not in self._packed:
+                self._packed[h.name, h.where] = self.pack(self.columns.of(h)) * size
+            return self._packed[h.name, h.where]
         D = self.drives[h.name, h.where](self.base.seen.table, settings[None])[:, 0]
         rows = self.columns.entry(entry_key(h, self.base.model)) @ D
         return self.pack(rows) * size
