@@ -20,7 +20,8 @@ from elastocal.diagnosis.columns import (
     typical_sizes,
 )
 from elastocal.diagnosis.hypotheses import Hypothesis, recorded
-from elastocal.diagnosis.noise import NoisyData
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.noise_fit import fit_noise
 from elastocal.diagnosis.settings_grid import Grid, grid_of, moments_between
 from elastocal.identification.solve import is_placed
 from elastocal.manipulator.effects import CATALOGUE
@@ -72,6 +73,11 @@ class Scene:
     @cached_property
     def _kept(self) -> dict[tuple[str, str, bytes], Array]:
         return {}
+
+    @cached_property
+    def noise(self) -> NoiseValues:
+        """The most probable noise beside the fitted parameters alone."""
+        return fit_noise(self.data)
 
     @cached_property
     def visit_table(self) -> Measurements:
@@ -171,6 +177,8 @@ class Scene:
 
     def without(self, faulty: Mask) -> Scene:
         """The same with the observations where `faulty` (N,) holds left out."""
+        if (faulty == self.data.faulty).all():
+            return self
         return replace(self, data=self.data.without(faulty))
 
 
