@@ -1,0 +1,61 @@
+"""elastocal's side of fits_peers.py: one fit, timed.
+
+    python benchmarks/fits_elastocal.py auto|ols|plain FOLDER OUT.npz
+
+`auto`: what `elastocal identify` does without options.  `ols`: the same with `--method ols`.
+`plain`: only placing, choosing parameters, fitting and covariance, by the API; no held-out
+residuals, faulty readings, noise models or diagnostics.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from fits_clock import Clock
+
+clock = Clock()
+with clock.step("import"):
+    import numpy as np
+
+    from elastocal.cli.identify import load_inputs
+    from elastocal.identification.identify import identify
+    from elastocal.identification.noise import Weights
+    from elastocal.identification.options import Options
+    from elastocal.identification.solve import Problem, settle, sizes_and_check
+    from elastocal.identification.start import start_values
+    from elastocal.manipulator.model import Model
+    from elastocal.manipulator.observation import observe
+    from elastocal.measurements import Measurements
+
+
+def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
+    """Values (parameters,) of least squares in a minimal complete set, and the size of that set."""
+    seen = observe(table, model.observe)
+    every = np.arange(len(model.parameters))
+    weights = Weights("none", None, False, "")
+    problem = Problem(model, seen, weights, start_values(model, table), every)
+    settled = settle(problem, sizes_and_check(problem))
+    settled.fit.cofactor()
+    return settled.fit.x, len(settled.reduction.kept)
+
+
+def main(method: str, folder: Path, out: Path) -> None:
+    given = np.load(folder / "given.npz")
+    with clock.step("read"):
+        model, (table,) = load_inputs(folder / "cell.toml", [folder / "data.csv"])
+    with clock.step("fit"):
+        if method == "plain":
+            x, p = plain(model, table)
+        else:
+            result = identify(model, table, Options(method=method))
+            x, p = result.x, len(result.determined)
+    from dataclasses import replace
+    n = len(given["fresh_q"])
+    fresh = table.take(np.zeros(n, dtype=np.int64))
+    fresh = replace(fresh, q=given["fresh_q"])
+    np.savez(out, predicted=model.predict(fresh, x).reshape(n, 3), parameters=p, **clock.seconds)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))
