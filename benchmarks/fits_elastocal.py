@@ -16,8 +16,15 @@ from fits_clock import Clock
 
 clock = Clock()
 with clock.step("import"):
+    from dataclasses import replace
+
     import numpy as np
 
+    # What reading would import when first called.
+    import elastocal.cell_reader
+    import elastocal.manipulator.effects
+    import elastocal.manipulator.urdf
+    import elastocal.measurement_reader  # noqa: F401
     from elastocal.cli.identify import load_inputs
     from elastocal.identification.identify import identify
     from elastocal.identification.noise import Weights
@@ -50,10 +57,8 @@ def main(method: str, folder: Path, out: Path) -> None:
         else:
             result = identify(model, table, Options(method=method))
             x, p = result.x, len(result.determined)
-    from dataclasses import replace
     n = len(given["fresh_q"])
-    fresh = table.take(np.zeros(n, dtype=np.int64))
-    fresh = replace(fresh, q=given["fresh_q"])
+    fresh = replace(table.take(np.zeros(n, dtype=np.int64)), q=given["fresh_q"])
     np.savez(out, predicted=model.predict(fresh, x).reshape(n, 3), parameters=p, **clock.seconds)
 
 

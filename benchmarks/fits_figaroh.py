@@ -1,6 +1,6 @@
 """FIGAROH's side of fits_peers.py: one calibration, timed.
 
-    OPENBLAS_NUM_THREADS=1 PEERS_PYTHON benchmarks/fits_figaroh.py METHOD FOLDER OUT.npz
+    PEERS_PYTHON benchmarks/fits_figaroh.py METHOD FOLDER OUT.npz
 
 METHOD is one of FIGAROH's own ways to choose what is estimated: structural (its default),
 excitation, map, map_cv, cv_subset.  Runs in the peers' environment, imports nothing of elastocal.

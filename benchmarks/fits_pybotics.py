@@ -1,6 +1,6 @@
 """pybotics' side of fits_peers.py: one calibration, timed.
 
-    OPENBLAS_NUM_THREADS=1 PEERS_PYTHON benchmarks/fits_pybotics.py lengths|components FOLDER OUT.npz
+    PEERS_PYTHON benchmarks/fits_pybotics.py lengths|components FOLDER OUT.npz
 
 `lengths`: as its calibration example does it, the length of each reading's error handed to scipy's
 least_squares with its defaults.  `components`: its x, y and z instead, which its `Robot.fk` allows
