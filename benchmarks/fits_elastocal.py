@@ -1,10 +1,11 @@
 """elastocal's side of fits_peers.py: one fit, timed.
 
-    python benchmarks/fits_elastocal.py auto|ols|plain FOLDER OUT.npz
+    python benchmarks/fits_elastocal.py auto|ols|plain[+compiled] FOLDER OUT.npz
 
 `auto`: what `elastocal identify` does without options.  `ols`: the same with `--method ols`.
 `plain`: only placing, choosing parameters, fitting and covariance, by the API; no held-out
-residuals, faulty readings, noise models or diagnostics.
+residuals, faulty readings, noise models or diagnostics.  `+compiled`: with the backend "compiled",
+which the user chooses by ELASTOCAL_BACKEND and which finds what it has compiled before in its cache.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ with clock.step("import"):
     from elastocal.identification.options import Options
     from elastocal.identification.solve import Problem, settle, sizes_and_check
     from elastocal.identification.start import start_values
+    from elastocal.manipulator.backend import set_default_backend
     from elastocal.manipulator.model import Model
     from elastocal.manipulator.observation import observe
     from elastocal.measurements import Measurements
@@ -47,8 +49,10 @@ def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
     return settled.fit.x, len(settled.reduction.kept)
 
 
-def main(method: str, folder: Path, out: Path) -> None:
+def main(how: str, folder: Path, out: Path) -> None:
     given = np.load(folder / "given.npz")
+    method, _, backend = how.partition("+")
+    set_default_backend(backend or None)
     with clock.step("read"):
         model, (table,) = load_inputs(folder / "cell.toml", [folder / "data.csv"])
     with clock.step("fit"):
