@@ -5,7 +5,7 @@
 `auto`: what `elastocal identify` does without options.  `ols`: the same with `--method ols`.
 `plain`: only placing, choosing parameters, fitting and covariance, by the API; no held-out
 residuals, faulty readings, noise models or diagnostics.  `+compiled`: with the backend "compiled",
-which the user chooses by ELASTOCAL_BACKEND and which finds what it has compiled before in its cache.
+which ELASTOCAL_BACKEND chooses and which finds in its cache what it has compiled before.
 """
 
 from __future__ import annotations
