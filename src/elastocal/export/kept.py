@@ -95,15 +95,13 @@ class Kept:
     """`full`: the calibrated arm; `exported`: what the file holds of it; `omissions` between.
 
     `of_the_measurement`: effects of the instrument, which are no part of the arm; neither model
-    has them.  `warnings`: sentences on values that the file holds otherwise than identified.
-    """
+    has them."""
 
     full: Valued
     exported: Valued
     conditions: Conditions
     omissions: tuple[Omission, ...]
     of_the_measurement: tuple[str, ...]
-    warnings: tuple[str, ...]
 
 
 def keep(calibrated: Calibrated, elastic: bool, conditions: Conditions) -> Kept:
@@ -136,14 +134,12 @@ def keep(calibrated: Calibrated, elastic: bool, conditions: Conditions) -> Kept:
         if needs
     ]
     exported = full if len(kept_names) == len(whole) else _part(calibrated, kept_names)
-    warnings: list[str] = []
     if elastic:
         exported, changed = _as_springs(exported)
-        warnings += [sentence for _, sentence in changed]
         omissions += [
             Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
         ]
-    return Kept(full, exported, conditions, tuple(omissions), instrument, tuple(warnings))
+    return Kept(full, exported, conditions, tuple(omissions), instrument)
 
 
 def _of_the_measurement(name: str) -> bool:

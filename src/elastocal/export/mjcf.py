@@ -3,8 +3,8 @@
 Each joint is a hinge or slide that a position actuator drives: its control is the commanded
 joint value, its gain kp = 1/k the identified stiffness, so that at rest q − q_commanded = k τ.
 Springs that no motor holds (bearings across the axis, links, pedestal) are passive joints of
-stiffness 1/k in series, where the model has them, and so is a drive's with such bearings.  Geometry, masses, load point and the spring of
-a gravity compensator are those of the model; the tracker's z points up.
+stiffness 1/k in series, where the model has them, and so is a drive's with such bearings.
+Geometry, masses, load point and the spring of a gravity compensator are those of the model.
 """
 
 from __future__ import annotations
@@ -222,4 +222,3 @@ def _tendon(root: ET.Element, values: dict[str, float]) -> None:
     )  # fmt: skip
     for site in ("compensator_anchor", "compensator_arm"):
         ET.SubElement(spring, "site", site=site)
-

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
+from elastocal.export.kept import Conditions, Valued
 from elastocal.manipulator import rigid
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Array, Chain, LinkMass
 from elastocal.manipulator.symbolic import SymbolicArm
-from elastocal.export.kept import Conditions, Valued
 
 PAYLOAD = ("load.payload_scale", *(f"load.load_point_{k}" for k in "xyz"))
 

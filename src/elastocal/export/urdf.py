@@ -137,9 +137,7 @@ def _nothing(T: Array) -> bool:
     return bool(np.max(np.abs(T - np.eye(4))) < 4 * np.finfo(float).eps)
 
 
-def _fixed(
-    tree: Tree, text: UrdfText, new: str, parent: str, child: str, T: Array
-) -> list[str]:
+def _fixed(tree: Tree, text: UrdfText, new: str, parent: str, child: str, T: Array) -> list[str]:
     """The lines of link `new` and the fixed joint parent → child, one of which is `new`.
 
     A frame of an earlier export is moved instead.
@@ -173,4 +171,3 @@ def _placed(tree: Tree, root: str, link: str) -> Array:
     for joint in tree.joints_between(root, link) or ():
         T = T @ _origin(joint)
     return T
-

@@ -70,8 +70,8 @@ class UrdfText:
         for name, value in attributes.items():
             given = re.compile(rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""")
             new = quoteattr(value)
-            if given.search(tag):
-                tag = given.sub(lambda m, new=new: m.group(1) + new, tag, count=1)
+            if (found := given.search(tag)) is not None:
+                tag = tag[: found.start(2)] + new + tag[found.end(2) :]
             else:
                 body = tag[:-1].rstrip().removesuffix("/").rstrip()
                 closing = "/>" if tag.endswith("/>") else ">"

@@ -71,6 +71,11 @@ def _joint(joint: Joint, parent: str, child: str) -> list[str]:
     ]
     if kind != "continuous":
         lower, upper = max(joint.lower, -NO_LIMIT), min(joint.upper, NO_LIMIT)
-        limit = {"lower": repr(float(lower)), "upper": repr(float(upper)), "effort": "0", "velocity": "0"}
+        limit = {
+            "lower": repr(float(lower)),
+            "upper": repr(float(upper)),
+            "effort": "0",
+            "velocity": "0",
+        }
         lines += [f"  {element('limit', limit)}"]
     return [*lines, "</joint>"]
