@@ -117,7 +117,7 @@ def _decompose(
         near = like[i]
         if last and keep_last and near is not None:
             row = _along_axis(T, near)
-            carried = np.linalg.solve(row.transform(), T)
+            carried = np.asarray(np.linalg.solve(row.transform(), T), dtype=np.float64)
         else:
             row, carried = split(T, near, height=float(T[2, 3]) if last else 0.0)
         rows.append(row)
@@ -154,10 +154,8 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Ro
         return [Row(), *own]
     after = [*own[1:], Row()]
     first = replace(own[0], theta=0.0, d=0.0)
-    return [
-        first,
-        *(replace(a, theta=row.theta, d=row.d) for row, a in zip(own, after, strict=True)),
-    ]
+    pairs = zip(own, after, strict=True)
+    return [first, *(replace(a, theta=row.theta, d=row.d) for row, a in pairs)]
 
 
 def _limits(joint: Joint) -> dict[str, float]:

@@ -5,8 +5,9 @@ Every rigid transform between two frames whose z are joint axes is
     T = Rz(θ) Tz(d) Tx(a) Rx(α) · Rz(γ) Tz(h)                 axes not parallel
     T = Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β) · Rz(γ) Tz(h)     nearly parallel, d chosen (Hayati)
 
-(Hayati, IEEE CDC 1983.)  Rz(γ) Tz(h) commutes with the motion of the next joint and goes into its θ and d.  So n links are
-n rows and one remainder at the flange, exactly.
+Rz(γ) Tz(h) commutes with the motion of the next joint and goes into its θ and d.  So n links are
+n rows and one remainder at the flange, exactly.  (Denavit and Hartenberg, J. Appl. Mech. 1955;
+Hayati, IEEE Conference on Decision and Control 1983.)
 """
 
 from __future__ import annotations

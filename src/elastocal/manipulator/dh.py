@@ -72,8 +72,9 @@ def read_dh(
 
     Columns theta0_rad|deg, d_m|mm, a_m|mm, alpha_rad|deg; optional: beta_rad|deg, joint (name),
     type (revolute|prismatic|fixed), limits lower_/upper_rad|deg for revolute and
-    lower_/upper_m|mm for prismatic joints (blank: none).  masses_path: CSV with link (1…n, linkN or the joint's name),
-    mass_kg, com_x_m, com_y_m, com_z_m, the centre of mass in DH frame i; every link once.
+    lower_/upper_m|mm for prismatic joints (blank: none).  masses_path: CSV with link (1…n, linkN or
+    the joint's name), mass_kg, com_x_m, com_y_m, com_z_m, the centre of mass in DH frame i; every
+    link once.
 
     Raises InputError, naming file, row and column.
     """
