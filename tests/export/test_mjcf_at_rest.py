@@ -148,7 +148,9 @@ def test_limits_bound_what_is_commanded(tmp_path: Path) -> None:
 
 def test_a_joint_without_compliance_is_rigid_and_said_so(tmp_path: Path) -> None:
     written = write_result(
-        tmp_path, f'urdf = "{KR270}"', value=lambda p: 0.0 if p.name == "joint1.compliance" else None
+        tmp_path,
+        f'urdf = "{KR270}"',
+        value=lambda p: 0.0 if p.name == "joint1.compliance" else None,
     )
     _, done = exported(*written, "mjcf", LOAD)
     assert any("joint1: rigid" in warning for warning in done.warnings)
@@ -161,7 +163,7 @@ def test_what_no_spring_does_is_left_out_with_its_cost(tmp_path: Path) -> None:
         f'urdf = "{KR270}"',
         value=lambda p: -1e-6 if p.name == "joint2.compliance" else None,
     )
-    calibrated, done = exported(*written, "mjcf", LOAD)
+    _, done = exported(*written, "mjcf", LOAD)
     (entry,) = done.cost.effects
     assert entry.effect == "negative compliance" and "joint2.compliance" in entry.note
     assert entry.difference is not None and entry.difference == done.cost.total

@@ -47,7 +47,10 @@ def dh_lines(robot: Robot, pieces: Pieces, convention: Convention) -> list[Line]
     """The rows of the calibrated table; `robot` says which nominal table, if any, to keep to."""
     nominal = pieces.chain
     like = _nominal_rows(robot, nominal, convention)
-    ideal, _ = _decompose(nominal, like)
+    ideal = [
+        row if own is None else row.near(own)
+        for row, own in zip(_decompose(nominal, like)[0], like, strict=True)
+    ]
     rows, F = _decompose(pieces.calibrated_chain(), ideal, keep_last=True)
     first, *joints = [row.near(old) for row, old in zip(rows, ideal, strict=True)]
     end, last = split(F)

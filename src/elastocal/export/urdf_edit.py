@@ -54,8 +54,7 @@ class UrdfText:
 
     def append(self, text: str) -> None:
         """Add elements at the end of the robot."""
-        # References instead of other characters: the same in every encoding built on ASCII.
-        self.edits.append((self.end, self.end, text.encode("ascii", "xmlcharrefreplace")))
+        self.edits.append((self.end, self.end, text.encode("utf-8")))
 
     def result(self) -> str:
         """The text with all edits made."""
@@ -125,7 +124,7 @@ def _as_utf8(path: Path) -> bytes:
     else:
         declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
         name = declared.group(2).strip("\"'") if declared else "utf-8"
-    if name.lower() in ("utf-8", "utf8", "us-ascii", "ascii"):
+    if name.lower() in ("utf-8", "utf8"):
         return data
     try:
         text = data.decode(name)

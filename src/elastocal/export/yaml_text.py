@@ -54,8 +54,10 @@ def _scalar(value: Any) -> str:
         return text if not e or "." in mantissa else f"{mantissa}.0e{exponent}"
     if isinstance(value, str) and _is_plain(value):
         return value
-    # A JSON text, number or null is one in YAML too; it escapes all that is not ASCII.
-    return json.dumps(value, allow_nan=False)
+    # A JSON text, number or null is one in YAML too, except that YAML knows no surrogate pairs
+    # and wants more characters escaped.
+    text = json.dumps(value, allow_nan=False, ensure_ascii=False)
+    return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in text)
 
 
 def _is_plain(text: str) -> bool:
