@@ -136,6 +136,30 @@ def test_a_run_of_mujoco_settles_where_newton_does(tmp_path: Path) -> None:
     assert np.linalg.norm(data.site("flange").xpos - T[:3, 3]) < MICROMETRE
 
 
+def test_the_nominal_arm_has_the_inertia_of_its_urdf(tmp_path: Path) -> None:
+    """Mass matrix and weights as pinocchio finds them in the URDF."""
+    import pinocchio as pin
+
+    written = write_result(
+        tmp_path,
+        f'urdf = "{KR270}"',
+        ["joint_compliance"],
+        "link_gravity = true",
+        value=lambda p: 1e-6,
+    )
+    calibrated, done = exported(*written, "mjcf")
+    model = mujoco.MjModel.from_xml_string(done.text)
+    data = mujoco.MjData(model)
+    own = pin.buildModelFromUrdf(str(KR270))
+    for q in poses_of(calibrated, 5, seed=1):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        found = np.zeros((6, 6))
+        mujoco.mj_fullM(model, data, found)
+        expected = pin.crba(own, own.createData(), q) + np.diag(model.dof_armature)
+        assert np.abs(found - expected).max() < 1e-6 * np.abs(expected).max()
+
+
 def test_limits_bound_what_is_commanded(tmp_path: Path) -> None:
     written = write_result(tmp_path, f'urdf = "{KR270}"')
     calibrated, done = exported(*written, "mjcf")

@@ -21,6 +21,9 @@ from elastocal.cli.app import (
 from elastocal.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
+    from elastocal.export.cost import Cost
     from elastocal.export.export import Exported
 
 
@@ -119,62 +122,72 @@ def _keep_inputs(output: Path, *inputs: object) -> None:
 
 
 def _tell(done: Exported) -> None:
-    from elastocal.report.console_table import titled
+    """What the file holds and what not, for people."""
     from elastocal.report.units import length
     from elastocal.report.words import printable
 
     screen = console()
-
-    def say(text: str) -> None:
-        screen.print(printable(text), markup=False)
-
-    cost = done.cost
+    cost, (name, in_title) = done.cost, NAMES[done.format]
     if cost.effects:
-        table = titled(f"What {NAMES[done.format]} cannot hold")
-        for head in ("effect", "markers rms", "max", "flange rms", "max", ""):
-            table.add_column(head, justify="left" if head in ("effect", "") else "right")
-        for e in cost.effects:
-            d = e.difference
-            cells = [""] * 4 if d is None else [length(v) for v in (
-                d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)]  # fmt: skip
-            table.add_row(printable(e.effect.replace("_", " ")), *cells, printable(e.note))
-        t = cost.total
-        total = [length(v) for v in (t.marker_rms, t.marker_max, t.flange_rms, t.flange_max)]
-        table.add_section()
-        table.add_row("all of it", *total, "")
-        screen.print(table)
-    else:
-        say(f"{NAMES[done.format].capitalize()} holds all of the calibrated model.")
+        screen.print(_cost_table(f"What {in_title} cannot hold", cost))
     force = ", ".join(f"{v:g}" for v in cost.force)
-    say(
-        f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
-        f"joint limits under a load of ({force}) N, each effect left out alone."
-    )
-    if done.checked is not None:
-        say(f"Read back with {done.checked_with}: {length(done.checked)} at most.")
-    if done.without_beta is not None:
-        say(f"Without the column beta_rad: {length(done.without_beta)} at most.")
-    if done.held:
-        names = list(done.held)
-        shown = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-        say(
-            f"Held, as the data do not determine them on their own, at the values that the "
-            f"identification predicts with: {shown}."
-        )
-    if done.of_the_measurement:
-        say(
-            f"Not of the arm and left out: {', '.join(done.of_the_measurement)} "
-            "(of the measurement)."
-        )
-    for warning in done.warnings:
-        say(f"Note: {warning}.")
+    held = list(done.held)
+    more = f" and {len(held) - 8} more" if len(held) > 8 else ""
+    for wanted, sentence in (
+        (not cost.effects, f"{name} holds all of the calibrated model."),
+        (
+            cost.effects,
+            f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
+            f"joint limits under a load of ({force}) N, each effect left out alone.",
+        ),
+        (
+            done.checked is not None,
+            f"Read back with {done.checked_with}: {length(done.checked or 0.0)} at most.",
+        ),
+        (
+            done.without_beta is not None,
+            f"Without the column beta_rad: {length(done.without_beta or 0.0)} at most.",
+        ),
+        (
+            held,
+            "Held, as the data do not determine them on their own, at the values that the "
+            f"identification predicts with: {', '.join(held[:8])}{more}.",
+        ),
+        (
+            done.of_the_measurement,
+            f"Of the measurement, not of the arm, and left out: "
+            f"{', '.join(done.of_the_measurement)}.",
+        ),
+        *((True, f"Note: {warning}.") for warning in done.warnings),
+    ):
+        if wanted:
+            screen.print(printable(sentence), markup=False)
 
 
+def _cost_table(title: str, cost: Cost) -> Table:
+    from elastocal.report.console_table import titled
+    from elastocal.report.units import length
+    from elastocal.report.words import printable
+
+    table = titled(title)
+    for head in ("effect", "markers rms", "max", "flange rms", "max", ""):
+        table.add_column(head, justify="left" if head in ("effect", "") else "right")
+    rows = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
+    for name, d, note in [*rows, ("all of it", cost.total, "")]:
+        cells = [""] * 4
+        if d is not None:
+            sizes = (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
+            cells = [length(size) for size in sizes]
+        table.add_row(printable(name), *cells, printable(note))
+    return table
+
+
+# At the start of a sentence and in a title.
 NAMES = {
-    "urdf": "a URDF",
-    "mjcf": "this MJCF",
-    "dh": "a DH table",
-    "mdh": "a DH table",
-    "yaml": "geometry alone",
-    "json": "geometry alone",
+    "urdf": ("The URDF", "a URDF"),
+    "mjcf": ("The MJCF", "this MJCF"),
+    "dh": ("The DH table", "a DH table"),
+    "mdh": ("The DH table", "a DH table"),
+    "yaml": ("Geometry alone", "geometry alone"),
+    "json": ("Geometry alone", "geometry alone"),
 }
