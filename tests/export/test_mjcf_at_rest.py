@@ -121,14 +121,23 @@ def test_in_the_trackers_frame_the_arm_stands_where_it_was_identified(tmp_path: 
     assert np.abs(in_world - moved).max() < 1e-9
 
 
-def test_a_run_of_mujoco_settles_where_newton_does(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("weights", "rigid"), [(True, ""), (False, "joint1.compliance"), (True, "joint2.compliance")]
+)
+def test_a_run_of_mujoco_settles_where_newton_does(
+    tmp_path: Path, weights: bool, rigid: str
+) -> None:
     """The actuators hold the arm by themselves: no other program than mj_step is needed."""
-    written = write_result(tmp_path, f'urdf = "{KR270}"', model="link_gravity = true")
+
+    def value(p: Parameter) -> float | None:
+        return 0.0 if p.name == rigid else None
+
+    gravity = "link_gravity = true" if weights else ""
+    written = write_result(tmp_path, f'urdf = "{KR270}"', model=gravity, value=value)
     calibrated, done = exported(*written, "mjcf", LOAD)
     q = poses_of(calibrated, 1, seed=1)[0]
     model = mujoco.MjModel.from_xml_string(done.text)
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
+    data = mujoco.MjData(model)  # at zero, from where the command is a step
     data.ctrl[:6], data.ctrl[6:] = q, LOAD
     for _ in range(4000):
         mujoco.mj_step(model, data)

@@ -26,7 +26,9 @@ RIGID = 1e12  # N m/rad or N/m
 # Damping over stiffness, s.  It only settles the motion: nothing of the rest depends on it, and
 # an implicit integrator keeps even the rigid drives stable with it.
 SETTLING = 0.02
-ARMATURE = 0.1  # kg m²: keeps the mass matrix regular where links weigh nothing
+# Keeps the mass matrix regular where links weigh nothing, and the accelerations of a stiff drive
+# after a step of its command below the 1e10 rad/s² beyond which MuJoCo gives up.
+ARMATURE, ARMATURE_PER_STIFFNESS = 0.1, 1e-8  # kg m² (kg), s²
 SHORTEST = 1e-3  # m; a shorter link is not drawn
 
 
@@ -142,8 +144,12 @@ def _passive(body: ET.Element, spring: SpringValue, offset: Array) -> None:
         axis=numbers(back[:3, :3] @ spring.axis),
         stiffness=repr(stiffness),
         damping=repr(SETTLING * stiffness),
-        armature=repr(ARMATURE),
+        armature=_armature(stiffness),
     )
+
+
+def _armature(stiffness: float) -> str:
+    return repr(max(ARMATURE, ARMATURE_PER_STIFFNESS * stiffness))
 
 
 def _motor(
@@ -151,15 +157,15 @@ def _motor(
 ) -> None:
     joint = pieces.chain.joints[i]
     name = f"joint{i + 1}"
+    kp = 1.0 / compliance if compliance > 0 else RIGID
     ET.SubElement(
         body,
         "joint",
         name=name,
         type="slide" if joint.kind == "prismatic" else "hinge",
         axis=numbers(joint.axis),
-        armature=repr(ARMATURE),
+        armature=_armature(kp),
     )
-    kp = 1.0 / compliance if compliance > 0 else RIGID
     drive = {"name": name, "joint": name, "kp": repr(kp), "kv": repr(SETTLING * kp)}
     # Limits are stated for what is commanded; the joint itself may yield past them.
     if math.isfinite(joint.lower) and math.isfinite(joint.upper):
