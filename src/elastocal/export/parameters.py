@@ -97,4 +97,6 @@ def _finite(value: Any) -> Any:
         return None
     if isinstance(value, list):
         return [_finite(v) for v in value]
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
     return value
