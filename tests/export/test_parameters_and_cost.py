@@ -19,7 +19,6 @@ from elastocal.manipulator.calibrated import read_calibrated
 from elastocal.manipulator.urdf import read_urdf
 
 ROBOT = f'urdf = "{KR270}"'
-yaml = pytest.importorskip("yaml")
 
 FINITE = st.none() | st.booleans() | st.integers() | st.floats(
     allow_nan=False, allow_infinity=False
@@ -37,10 +36,12 @@ FINITE = st.none() | st.booleans() | st.integers() | st.floats(
     )
 )
 def test_a_yaml_reader_finds_what_was_written(data: object) -> None:
+    yaml = pytest.importorskip("yaml")
     assert yaml.safe_load(to_yaml(data)) == data
 
 
 def test_yaml_and_json_say_the_same(tmp_path: Path) -> None:
+    yaml = pytest.importorskip("yaml")
     written = write_result(tmp_path, ROBOT)
     from_yaml = yaml.safe_load(exported(*written, "yaml", LOAD)[1].text)
     calibrated, done = exported(*written, "json", LOAD)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -127,3 +128,15 @@ def test_roll_pitch_yaw_are_exact_also_where_they_are_not_unique(
     R = Rotation.from_euler("xyz", [roll, pitch + near, yaw]).as_matrix()
     back = Rotation.from_euler("xyz", rpy(R)).as_matrix()
     assert np.abs(back - R).max() < 4e-16 * 10
+
+
+def test_markers_of_any_name_get_frames_of_their_own(tmp_path: Path) -> None:
+    cell, result = write_result(tmp_path, f'urdf = "{KR270}"', ["joint_offset"])
+    text = cell.read_text().replace("M1 =", '"A B" =').replace("M2 =", '"A_B" =')
+    cell.write_text(text.replace("[model]", '"<&\\"ä>" = [0, 0, 1]\n[model]'), encoding="utf-8")
+    _, done = exported(cell, result, "urdf")
+    links = [e.get("name", "") for e in ElementTree.fromstring(done.text).iter("link")]
+    markers = [name for name in links if name.startswith("elastocal_marker_")]
+    assert markers == [f"elastocal_marker_{name}" for name in ("A_B", "A_B_", '<&"ä>')]
+    _, mjcf = exported(cell, result, "mjcf")
+    assert mjcf.checked is not None

@@ -78,7 +78,12 @@ def _tracker_frame(tree: Tree, text: UrdfText, pieces: Pieces, base: str) -> lis
 
 def tool_frames(pieces: Pieces) -> dict[str, Array]:
     """Link name → placement (4, 4) in the flange frame of every marker and of the load point."""
-    frames = {f"{PREFIX}marker_{'_'.join(n.split())}": T for n, T in pieces.markers.items()}
+    frames: dict[str, Array] = {}
+    for marker, T in pieces.markers.items():
+        name = f"{PREFIX}marker_{'_'.join(marker.split())}"
+        while name in frames:  # "A B" beside "A_B"
+            name += "_"
+        frames[name] = T
     load = np.eye(4)
     load[:3, 3] = pieces.load_point
     return frames | {LOAD_POINT: load}
