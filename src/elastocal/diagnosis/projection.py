@@ -79,7 +79,7 @@ class Weighted:
 
     @classmethod
     def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
-        K: Array = np.linalg.cholesky(covariance(data, noise))
+        K = np.asarray(np.linalg.cholesky(covariance(data, noise)), dtype=np.float64)
         log_det = 2 * float(np.log(np.diagonal(K, axis1=1, axis2=2)).sum())
         root = _inverse(K)
         X, r = root @ data.counting.X, (root @ data.counting.r[..., None])[..., 0]
