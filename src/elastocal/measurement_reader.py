@@ -34,7 +34,8 @@ def read_measurements(
 
     `joint_kinds`: "revolute" or "prismatic" per joint of the robot; `marker_names`: the cell's
     markers, () if it names none; `observe`: "position", "deflection", "pose" or "distance",
-    which decides the columns that must be there, or "plan" or "targets", which ask for none.  Quaternions become rotation vectors.
+    which decides the columns that must be there, or "plan" or "targets", which ask for none.
+    Quaternions become rotation vectors.
 
     Raises InputError that names file, line, column and the offending text.
     """

@@ -7,7 +7,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Importing a command registers it.
-from elastocal.cli import demo, design, diagnose, identify, simulate, study  # noqa: F401
+from elastocal.cli import compensate, demo, design, diagnose, identify, simulate, study  # noqa: F401
 from elastocal.cli.app import app
 
 

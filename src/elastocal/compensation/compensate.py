@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.compensation.nominal import jumps, nominal_path
+from elastocal.compensation.notices import notices_of
 from elastocal.compensation.point import ToolPoint
-from elastocal.compensation.solve import Commanding, Goals
+from elastocal.compensation.solve import TOLERANCE, Commanding, Goals
 from elastocal.compensation.targets import Targets
 from elastocal.compensation.tool import CalibratedTool
 from elastocal.compensation.uncertainty import Uncertainty, position_uncertainty
-from elastocal.compensation.warnings import warnings_of
 from elastocal.identification.checks import check_limits
 from elastocal.manipulator import rigid
 from elastocal.manipulator.calibrated import Calibrated
 from elastocal.manipulator.chain import Array, Chain
+from elastocal.manipulator.inverse_kinematics import inverse_kinematics
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.reaching import Reaching
 from elastocal.manipulator.tape import Tape
@@ -37,9 +38,13 @@ class Compensation:
     tool from its target at the nominal command and at the new one (NaN: no equilibrium), `turn`
     (n, 2) rad the same for the rotation; `status` (n,) of reached, limit, no equilibrium, not
     reached; `goals` in the data's frame, `force` (n, 3) N in the data's frame;
-    `T_data_base` (n, 4, 4).  `uncertainty` is NaN where a row is not reached.
+    `T_data_base` (n, 4, 4); `place` (n, 3) m and `turned` (n, 3, 3): the point and the tool's
+    rotation in the flange frame; `nominal_miss` (n,) m: how far the nominal arm is from the
+    target at the nominal command (zero where it reaches it).  `uncertainty` is NaN where a
+    row is not reached.
     """
 
+    chain: Chain
     targets: Targets
     point: ToolPoint
     q: Array
@@ -51,6 +56,9 @@ class Compensation:
     goals: Goals
     force: Array
     T_data_base: Array
+    place: Array
+    turned: Array
+    nominal_miss: Array
     uncertainty: Uncertainty
     warnings: tuple[str, ...]
 
@@ -99,6 +107,13 @@ def compensate(
     search = Commanding(tool, rows, goals, *limits)
     every = np.arange(len(targets))
     found = search.commands(nominal)
+    lost = np.flatnonzero(~found.reached)
+    if targets.q is None and len(lost):
+        progress(f"other postures for {len(lost)} targets")
+        nominal = _other_postures(
+            search, chain, in_base, flange, place[0], limits, lost, nominal, seed
+        )
+        found = search.commands(nominal)
     before = search.misses(nominal, every)
     status = _status(found.q, found.reached, found.miss, limits)
     reached = found.reached
@@ -107,10 +122,11 @@ def compensate(
     task = Reaching(chain, in_base, flange, place[0], None, *limits)
     path = jumps(task, found.q, reached)
     result = Compensation(
-        targets, point, found.q, nominal, before[0], found.miss,
-        np.column_stack([before[1], found.turn]), status, goals, force, T, uncertainty, (),
+        chain, targets, point, found.q, nominal, before[0], found.miss,
+        np.column_stack([before[1], found.turn]), status, goals, force, T, place, turn,
+        task.errors(nominal, every)[0], uncertainty, (),
     )  # fmt: skip
-    told = warnings_of(
+    told = notices_of(
         tool.cell, chain, targets, limits, found.q, nominal, before[0], reached, path, uncertainty
     )
     return replace(result, warnings=told)
@@ -146,11 +162,35 @@ def nominal_flanges(chain: Chain, q: Array) -> Array:
     return np.asarray(Tape([symbol], [rigid.nominal_flange(chain, symbol)])(q)[0])
 
 
+def _other_postures(
+    search: Commanding, chain: Chain, position: Array, flange: Array | None, place: Array,
+    limits: tuple[Array, Array], lost: NDArray[np.int64], nominal: Array, seed: int,
+) -> Array:  # fmt: skip
+    """Nominal commands (n, joints), those of the targets `lost` in another posture where the
+    calibrated arm reaches them from one: the nearest to the old command."""
+    found = inverse_kinematics(
+        chain, position[lost], limits, rotation=None if flange is None else flange[lost],
+        point=place, seed=seed,
+    )  # fmt: skip
+    count = found.q.shape[1]
+    starts = found.q.reshape(len(lost) * count, -1)
+    target = np.repeat(lost, count)
+    q, _ = search.solve(starts, target)
+    miss, turn = search.misses(q, target)
+    good = np.asarray((miss <= TOLERANCE) & (turn <= TOLERANCE)).reshape(len(lost), count)
+    far = np.linalg.norm(found.q - nominal[lost][:, None], axis=2)
+    best = np.where(good, far, np.inf).argmin(axis=1)
+    chosen = found.q[np.arange(len(lost)), best]
+    nominal = nominal.copy()
+    nominal[lost] = np.where(good.any(axis=1, keepdims=True), chosen, nominal[lost])
+    return nominal
+
+
 def _status(
     q: Array, reached: NDArray[np.bool_], miss: Array, limits: tuple[Array, Array]
 ) -> tuple[str, ...]:
     lower, upper = limits
-    held = ((q <= lower + AT_LIMIT) | (q >= upper - AT_LIMIT)).any(axis=1)
+    held = np.any((q <= lower + AT_LIMIT) | (q >= upper - AT_LIMIT), axis=1)
     lost = ~np.isfinite(miss)
     return tuple(
         REACHED if reached[i] else NO_EQUILIBRIUM if lost[i] else LIMIT if held[i] else NOT_REACHED

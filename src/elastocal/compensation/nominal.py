@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.inverse_kinematics import Postures, inverse_kinematics, unwound
-from elastocal.manipulator.reaching import Reaching
 from elastocal.manipulator.reaching import TOLERANCE as NOMINAL_TOLERANCE
+from elastocal.manipulator.reaching import Reaching
 
 STEP = 0.1  # rad or m between neighbours that count as one smooth piece
 LARGE = np.radians(20.0)  # a step beyond which another posture may be nearer

@@ -56,7 +56,7 @@ def _marker(cell: Cell, name: str) -> ToolPoint:
 
 
 def numbers(option: str, text: str, counts: tuple[int, ...], what: str) -> Array:
-    """The numbers of an option like "1,2,3"; InputError where they are not as many or no numbers."""
+    """The numbers of an option like "1,2,3"; InputError where they are others than `what`."""
     try:
         values = np.array([float(part) for part in text.split(",")])
     except ValueError:

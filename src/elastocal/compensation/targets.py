@@ -57,7 +57,9 @@ def read_targets(
     table = read_measurements(path, joint_kinds=joint_kinds, observe="targets")
     q = table.q if table.q.shape[1] else None
     if table.position is None:
-        extra = "; a rotation alone is no target" if table.rotation is not None and q is None else ""
+        extra = (
+            "; a rotation alone is no target" if table.rotation is not None and q is None else ""
+        )
         require(
             q is not None and table.rotation is None,
             f"{path}: the columns x_mm,y_mm,z_mm are missing; a target needs its position, or the "

@@ -22,9 +22,7 @@ class Total:
     y is explicit and nothing is solved.
     """
 
-    def __init__(
-        self, arm: SymbolicArm, y: ca.SX, z: ca.SX, extra: Sequence[ca.SX] = ()
-    ) -> None:
+    def __init__(self, arm: SymbolicArm, y: ca.SX, z: ca.SX, extra: Sequence[ca.SX] = ()) -> None:
         self._arm = arm
         theta = arm.arm.theta
         inputs = [*arm.arm.inputs.values(), *extra, arm.p, theta]

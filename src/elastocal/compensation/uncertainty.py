@@ -50,7 +50,9 @@ def position_uncertainty(arm: Calibrated, A: Array) -> Uncertainty:
             off[..., names[name]] -= factor / first[1] * A[..., names[first[0]]]
     for i, p in enumerate(arm.model.parameters):
         sizes[i] = abs(p.nominal) if p.typical is None else p.typical
-    off = np.where(np.abs(off) > OUTSIDE * np.abs(A).max(axis=(0, 1), initial=0.0), off, 0.0) * sizes
+    off = (
+        np.where(np.abs(off) > OUTSIDE * np.abs(A).max(axis=(0, 1), initial=0.0), off, 0.0) * sizes
+    )
     harm = np.sqrt((off**2).sum(axis=1).mean(axis=0)) if len(A) else np.zeros(len(names))
     order = [int(i) for i in np.argsort(-harm) if harm[i] > 0]
     return Uncertainty(

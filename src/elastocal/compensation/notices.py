@@ -18,7 +18,7 @@ LEVEL_SLACK = 0.01  # rad or m
 WORTH_TELLING = 10e-6  # m
 
 
-def warnings_of(
+def notices_of(
     cell: Cell,
     chain: Chain,
     targets: Targets,
@@ -34,10 +34,10 @@ def warnings_of(
     told = []
     lower, upper = limits
     held = ((q <= lower + AT_LIMIT) | (q >= upper - AT_LIMIT)) & reached[:, None]
-    for j in np.flatnonzero(held.any(axis=0)):
+    for limited in np.flatnonzero(held.any(axis=0)):
         told.append(
-            f"{_rows(targets, held[:, j])}: joint {j + 1} stands at its limit; the target is "
-            "reached by the other joints"
+            f"{_rows(targets, held[:, limited])}: joint {limited + 1} stands at its limit; the "
+            "target is reached by the other joints"
         )
     if len(jumps):
         i = int(jumps[0])
@@ -46,10 +46,10 @@ def warnings_of(
         size = np.abs(q[i, j] - q[i - 1, j])
         by = f"{np.degrees(size):.0f}°" if revolute else f"{size * 1e3:.0f} mm"
         told.append(
-            f"{_rows(targets, jumps)}: the solution branch changes (joint {j + 1} moves by {by} from "
-            f"the row before line {targets.table.row[i]}, much more than the tool's motion asks for); "
-            "where the rows are a path, move it away from limits and singular postures, or give "
-            "q1_deg … of the posture wanted"
+            f"{_rows(targets, jumps)}: the solution branch changes (joint {j + 1} moves by {by} to "
+            f"line {targets.table.row[i]}, much more than the tool's motion asks for); where the "
+            "rows are a path, move it away from limits and singular postures, or give q1_deg … of "
+            "the posture wanted"
         )
     change = np.where([kind == "revolute" for kind in chain.kinds], np.abs(q - nominal), 0.0)
     large = reached & (change.max(axis=1) > LARGE)
@@ -64,7 +64,8 @@ def warnings_of(
         if far.any():
             told.append(
                 f"{_rows(targets, far)}: the nominal command q1_deg … puts the tool up to "
-                f"{before[far].max() * 1e3:.0f} mm from its target; check --frame, --point and units"
+                f"{before[far].max() * 1e3:.0f} mm from its target; check --frame, --point and "
+                "units"
             )
     told += _beyond_levels(cell, targets, q, reached)
     unknown = uncertainty.unknown[reached]
@@ -72,16 +73,14 @@ def warnings_of(
     if rms > WORTH_TELLING:
         told.append(
             f"The data do not determine {listed(uncertainty.blamed, 4)}, on which the place of "
-            f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm rms, "
-            "which the stated uncertainty leaves out; choose a marker that was fitted (--point), or "
-            "measure what is missing"
+            f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm "
+            "rms, which the stated uncertainty leaves out; choose a marker that was fitted "
+            "(--point), or measure what is missing"
         )
     return tuple(told)
 
 
-def _beyond_levels(
-    cell: Cell, targets: Targets, q: Array, reached: NDArray[np.bool_]
-) -> list[str]:
+def _beyond_levels(cell: Cell, targets: Targets, q: Array, reached: NDArray[np.bool_]) -> list[str]:
     told = []
     for name, values in cell.model.compliance_levels.items():
         angle = q[:, int(name.removeprefix("joint")) - 1]
