@@ -112,7 +112,7 @@ def write_table(
     from elastocal.compensation.commands_file import in_file_units, joint_columns, spread
     from elastocal.compensation.table import EXACT, FIRST_ORDER
 
-    known = np.asarray(np.isfinite(found.correction)).all(axis=1).tolist()
+    known = np.all(np.isfinite(found.correction), axis=1).tolist()
     plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
     _refuse("--table", range(1, len(plain) + 1), plain, EXACT, partial)
     kinds = arm.model.chain.kinds
