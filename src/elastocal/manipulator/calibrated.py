@@ -27,8 +27,6 @@ class Calibrated:
 
     `covariance` (determined, determined) belongs to the parameters `determined`; what the data
     did not determine is held in x at the value the identification predicted with.
-    `combinations` are the sums that the data determine although their members they do not,
-    name → factor, the determined member first.
     """
 
     model: Model
@@ -36,7 +34,6 @@ class Calibrated:
     determined: tuple[str, ...]
     covariance: Array
     source: str
-    combinations: tuple[dict[str, float], ...] = ()
 
     @cached_property
     def values(self) -> dict[str, float]:
@@ -76,7 +73,6 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
         determined,
         covariance.reshape(len(determined), len(determined)),
         str(result_path),
-        _combinations(result, set(held), result_path),
     )
 
 
@@ -116,24 +112,6 @@ def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
             raise InputError(f"{path}: parameter '{name}' is listed twice")
         held[name] = value
     return held
-
-
-def _combinations(
-    result: dict[str, Any], known: set[str], path: str | Path
-) -> tuple[dict[str, float], ...]:
-    try:
-        found = tuple(
-            {str(name): float(factor) for name, factor in entry["terms"].items()}
-            for entry in result.get("combinations", ())
-        )
-    except (TypeError, KeyError, ValueError, AttributeError):
-        found = ({"": 0.0},)
-    if not all(terms and set(terms) <= known for terms in found):
-        raise InputError(
-            f"{path}: key combinations needs terms of parameter names and factors; write the "
-            "result anew with identify -o"
-        )
-    return found
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:
