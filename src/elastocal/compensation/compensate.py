@@ -15,7 +15,7 @@ from elastocal.compensation.point import ToolPoint
 from elastocal.compensation.solve import TOLERANCE, Commanding, Goals
 from elastocal.compensation.targets import Targets
 from elastocal.compensation.tool import CalibratedTool
-from elastocal.compensation.uncertainty import Uncertainty, position_uncertainty
+from elastocal.compensation.uncertainty import Uncertainty, position_uncertainty, undetermined
 from elastocal.identification.checks import check_limits
 from elastocal.manipulator import rigid
 from elastocal.manipulator.calibrated import Calibrated
@@ -118,7 +118,7 @@ def compensate(
     status = _status(found.q, found.reached, found.miss, limits)
     reached = found.reached
     progress("uncertainty")
-    uncertainty = _uncertainty(tool, rows, found.q, reached)
+    uncertainty = _uncertainty(tool, rows, found.q, reached, seed)
     task = Reaching(chain, in_base, flange, place[0], None, *limits)
     path = jumps(task, found.q, reached)
     result = Compensation(
@@ -199,16 +199,17 @@ def _status(
 
 
 def _uncertainty(
-    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: NDArray[np.bool_]
+    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: NDArray[np.bool_], seed: int
 ) -> Uncertainty:
     n = len(q)
     covariance, unknown = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
     blamed: dict[str, None] = {}
+    left = undetermined(tool, rows, seed)
     good = np.flatnonzero(reached)
     for first in range(0, len(good), SENSITIVITIES):
         some = good[first : first + SENSITIVITIES]
         A = tool.sensitivity([values[some] for values in rows], q[some])
-        part = position_uncertainty(tool.calibrated, A)
+        part = position_uncertainty(tool.calibrated, A, left)
         covariance[some], unknown[some] = part.covariance, part.unknown
         blamed |= dict.fromkeys(part.blamed)
     return Uncertainty(covariance, unknown, tuple(blamed))

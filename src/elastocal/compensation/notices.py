@@ -70,7 +70,8 @@ def notices_of(
     told += _beyond_levels(cell, targets, q, reached)
     unknown = uncertainty.unknown[reached]
     rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
-    if rms > WORTH_TELLING:
+    stated = float(np.sqrt(np.mean(uncertainty.std[reached] ** 2))) if len(unknown) else 0.0
+    if rms > max(WORTH_TELLING, stated):
         told.append(
             f"The data do not determine {listed(uncertainty.blamed, 4)}, on which the place of "
             f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm "
