@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from elastocal.manipulator.calibrated import Calibrated
 
 REMEDIES = {
-    "limit": "a joint stands at its limit: widen [limits] or move the target",
+    "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of another "
+    "posture",
     "not reached": "out of reach, or beside a singular posture: move the target, or give q1_deg … "
     "of another posture",
     "no equilibrium": "no static equilibrium under this load: check force_*_N",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from elastocal.compensation.nominal import jumps, nominal_path
 from elastocal.compensation.notices import notices_of
 from elastocal.compensation.point import ToolPoint
-from elastocal.compensation.solve import TOLERANCE, Commanding, Goals
+from elastocal.compensation.solve import TOLERANCE, Commanding, Goals, Solved
 from elastocal.compensation.targets import Targets
 from elastocal.compensation.tool import CalibratedTool
 from elastocal.compensation.uncertainty import Uncertainty, position_uncertainty, undetermined
@@ -26,7 +26,6 @@ from elastocal.manipulator.reaching import Reaching
 from elastocal.manipulator.tape import Tape
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
-AT_LIMIT = 1e-9  # rad or m
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
 
 
@@ -115,7 +114,7 @@ def compensate(
         )
         found = search.commands(nominal)
     before = search.misses(nominal, every)
-    status = _status(found.q, found.reached, found.miss, limits)
+    status = _status(search, found, nominal)
     reached = found.reached
     progress("uncertainty")
     uncertainty = _uncertainty(tool, rows, found.q, reached, seed)
@@ -186,16 +185,19 @@ def _other_postures(
     return nominal
 
 
-def _status(
-    q: Array, reached: NDArray[np.bool_], miss: Array, limits: tuple[Array, Array]
-) -> tuple[str, ...]:
-    lower, upper = limits
-    held = np.any((q <= lower + AT_LIMIT) | (q >= upper - AT_LIMIT), axis=1)
-    lost = ~np.isfinite(miss)
-    return tuple(
-        REACHED if reached[i] else NO_EQUILIBRIUM if lost[i] else LIMIT if held[i] else NOT_REACHED
-        for i in range(len(q))
-    )
+def _status(search: Commanding, found: Solved, nominal: Array) -> tuple[str, ...]:
+    """What became of every row; LIMIT where joints without limits would reach the target."""
+    reached, lost = found.reached, ~np.isfinite(found.miss)
+    status = np.where(reached, REACHED, np.where(lost, NO_EQUILIBRIUM, NOT_REACHED)).astype(object)
+    left = np.flatnonzero(~reached & ~lost)
+    if len(left):
+        wide = np.full(nominal.shape[1], np.inf)
+        free = Commanding(search.tool, search.rows, search.goals, -wide, wide)
+        q, _ = free.solve(nominal[left], left)
+        miss, turn = free.misses(q, left)
+        within = (miss <= TOLERANCE) & (turn <= TOLERANCE)
+        status[left[within]] = LIMIT
+    return tuple(status)
 
 
 def _uncertainty(

@@ -12,7 +12,7 @@ from elastocal.manipulator.chain import Array
 from elastocal.manipulator.reaching import ARM_LENGTH, BoundedSearch, IntArray
 
 TOLERANCE = 1e-8  # m and rad within which a target counts as reached
-POLISHES = 12
+POLISHES = 20
 SETTLED = 1e-13  # rad or m
 
 
