@@ -106,7 +106,7 @@ def check_effects(effects, model, farthest_turn):
     assert found.before.min() > 1e-4
 
 
-@settings(max_examples=5, deadline=None, derandomize=True)
+@settings(max_examples=4, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 10_000),
     joints=st.integers(6, 7),
@@ -145,7 +145,6 @@ def test_a_limit_is_kept_and_named():
     cell = narrow({"joint3": (low - 0.5, high + 1e-5)})
     arm = calibrated(chain, cell)
     arm = replace(arm, x=erring(arm.model, rng))
-    T = nominal_flanges(chain, POSTURES[:1])
     # A posture further out, which needs joint 3 beyond its limit.
     wanted = nominal_flanges(chain, POSTURES[:1] + np.array([0, 0, 0.05, 0, 0, 0]))
     point = tool_point(cell, "0,0,0.001")
@@ -160,7 +159,6 @@ def test_a_limit_is_kept_and_named():
     assert free.status == ("reached",)
     assert free.q[0, 2] <= high + 1e-5
     assert any("joint 3 stands at its limit" in told for told in free.warnings)
-    assert T.shape == (1, 4, 4)
 
 
 def test_too_soft_an_arm_has_no_equilibrium():
@@ -210,7 +208,7 @@ def test_redundant_joints_move_as_little_as_possible():
     # Corrections of the size of the arm's errors; singular postures ask for larger ones.
     small = found.reached & (np.abs(found.q - found.nominal).max(axis=1) < 0.03)
     assert small.sum() >= 3
-    for i in np.flatnonzero(small):
+    for i in np.flatnonzero(small)[:3]:
         step = 1e-5
         both = []
         for sign in (1, -1):

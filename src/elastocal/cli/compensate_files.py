@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from elastocal.manipulator.calibrated import Calibrated
 
 REMEDIES = {
-    "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of another "
-    "posture",
+    "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of "
+    "another posture",
     "not reached": "out of reach, or beside a singular posture: move the target, or give q1_deg … "
     "of another posture",
     "no equilibrium": "no static equilibrium under this load: check force_*_N",
@@ -180,13 +180,19 @@ def print_summaries(screen: Console, content: dict[str, Any]) -> None:
         )
 
 
+def _length(um: float) -> str:
+    from elastocal.report.units import length
+
+    return "< 0.01 µm" if um < 0.01 else length(um * 1e-6)
+
+
 def _print_spreads(screen: Console, title: str, rows: dict[str, dict[str, Any]]) -> None:
     from elastocal.report.console_table import titled
 
     shown = titled(title)
     shown.add_column("")
-    for head in ("rms µm", "95 % µm", "max µm"):
+    for head in ("rms", "95 %", "max"):
         shown.add_column(head, justify="right")
     for name, values in rows.items():
-        shown.add_row(name, *("–" if v is None else f"{v:.3g}" for v in values.values()))
+        shown.add_row(name, *("–" if v is None else _length(v) for v in values.values()))
     screen.print(shown)

@@ -105,14 +105,14 @@ def compensate(
     progress("commands")
     search = Commanding(tool, rows, goals, *limits)
     every = np.arange(len(targets))
-    found = search.commands(nominal)
+    found = search.commands(nominal, every)
     lost = np.flatnonzero(~found.reached)
     if targets.q is None and len(lost):
         progress(f"other postures for {len(lost)} targets")
         nominal = _other_postures(
             search, chain, in_base, flange, place[0], limits, lost, nominal, seed
         )
-        found = search.commands(nominal)
+        found = found.replaced(lost, search.commands(nominal[lost], lost))
     before = search.misses(nominal, every)
     status = _status(search, found, nominal)
     reached = found.reached

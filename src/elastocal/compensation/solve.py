@@ -32,6 +32,12 @@ class Solved:
     miss: Array
     turn: Array
 
+    def replaced(self, rows: IntArray, other: Solved) -> Solved:
+        """The same with `other` in the rows named."""
+        q, miss, turn = self.q.copy(), self.miss.copy(), self.turn.copy()
+        q[rows], miss[rows], turn[rows] = other.q, other.miss, other.turn
+        return Solved(q, miss, turn)
+
     @property
     def reached(self) -> NDArray[np.bool_]:
         return (self.miss <= TOLERANCE) & (self.turn <= TOLERANCE)
@@ -60,9 +66,8 @@ class Commanding(BoundedSearch):
         r = self.residual(q, target)[0]
         return np.linalg.norm(r[:, :3], axis=1), np.linalg.norm(r[:, 3:], axis=1) / ARM_LENGTH
 
-    def commands(self, nominal: Array) -> Solved:
-        """Commands near the nominal ones (n, joints), which lie within the limits."""
-        target = np.arange(len(nominal))
+    def commands(self, nominal: Array, target: IntArray) -> Solved:
+        """Commands for the targets (R,) near nominal ones (R, joints) within the limits."""
         q, _ = self.solve(nominal, target)
         equations = 3 if self.goals.rotation is None else 6
         if self.tool.chain.n_joints > equations:
