@@ -29,6 +29,7 @@ from elastocal.errors import InputError
 from elastocal.manipulator.model import Model
 
 EVERYWHERE = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
+SOME = ("joint_offset", "link_geometry:link3", "joint_compliance")
 # Regular postures of the KR 270, well inside its limits.
 POSTURES = np.radians(
     [
@@ -118,7 +119,7 @@ def test_random_arms_reach_what_they_can(seed, joints, oriented, load):
     rng = np.random.default_rng(seed)
     chain = random_chain(seed, joints)
     nominal = Nominal(joint_compliance=(1e-5,) * joints)
-    cell = cell_of(EVERYWHERE, nominal=nominal)
+    cell = cell_of(SOME, nominal=nominal)
     arm = calibrated(chain, cell)
     arm = replace(arm, x=erring(arm.model, rng, 0.3))
     q = rng.uniform(-1.8, 1.8, (4, joints))
@@ -198,7 +199,7 @@ def test_redundant_joints_move_as_little_as_possible():
     """The correction stands at right angles to every motion that leaves the tool where it is."""
     rng = np.random.default_rng(3)
     chain = random_chain(11, 7)
-    cell = cell_of(EVERYWHERE, nominal=Nominal(joint_compliance=(2e-5,) * 7))
+    cell = cell_of(SOME, nominal=Nominal(joint_compliance=(2e-5,) * 7))
     arm = calibrated(chain, cell)
     arm = replace(arm, x=erring(arm.model, rng))
     q = rng.uniform(-1.5, 1.5, (8, 7))
@@ -308,6 +309,26 @@ def _places(model: Model, found, x):
         force=found.force,
     )  # fmt: skip
     return model.target_poses(rows, x)[1]
+
+
+@pytest.mark.parametrize("observe", ["deflection", "pose", "distance"])
+def test_what_was_observed_does_not_matter(observe):
+    cell = kr270_cell(("joint_compliance",), observe=observe)
+    arm = calibrated(kr270_chain(), cell)
+    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
+    found = compensate(arm, targets, tool_point(cell, "M1"))
+    same = kr270_cell(("joint_compliance",))
+    expected = compensate(calibrated(kr270_chain(), same), targets, tool_point(same, "M1"))
+    assert found.reached.all() and np.allclose(found.q, expected.q, atol=1e-10)
+
+
+def test_nothing_known_is_no_certainty():
+    cell = kr270_cell(("joint_compliance",))
+    arm = calibrated(kr270_chain(), cell)
+    arm = replace(arm, determined=(), covariance=np.zeros((0, 0)))
+    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
+    found = compensate(arm, targets, tool_point(cell, "M1"))
+    assert found.reached.all() and np.isnan(found.uncertainty.std).all()
 
 
 def test_what_no_marker_showed_is_told():

@@ -94,11 +94,14 @@ def _sizes(arm: Calibrated, kept: NDArray[np.int64]) -> Array:
 def position_uncertainty(arm: Calibrated, A: Array, left: Undetermined) -> Uncertainty:
     """Σ_p = A_K Σ A_Kᵀ for A (n, 3, parameters) in m per unit, Σ of the determined parameters K.
 
-    A typical deviation of an open parameter moves the tool in an unknown way by
-    A_D − A_K · mixing, which vanishes where the tool's point moves as the measured ones do.
+    NaN where the result determined nothing.  A typical deviation of an open parameter moves the
+    tool in an unknown way by A_D − A_K · mixing, which vanishes where the tool's point moves as
+    the measured ones do.
     """
     known = A[..., left.kept]
     covariance = known @ arm.covariance @ known.transpose(0, 2, 1)
+    if not len(left.kept):  # nothing known is no certainty
+        covariance = np.full((len(A), 3, 3), np.nan)
     move = A[..., left.open] * left.sizes
     off = move - known @ (left.mixing * left.sizes)
     off[np.abs(off) <= OUTSIDE * np.abs(move).max(initial=0.0)] = 0.0
