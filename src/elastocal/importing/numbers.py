@@ -23,8 +23,13 @@ class NumberCells:
         self.decimal = decimal
         if decimal == "auto":
             bare = [self._bare(cell) for cell in sample]
+            # Where a cell has both, the last is the decimal mark and the other is told as wrong.
+            both = next((cell for cell in bare if "." in cell and "," in cell), None)
             points = any("." in cell for cell in bare)
-            self.decimal = "," if not points and any("," in cell for cell in bare) else "."
+            commas = any("," in cell for cell in bare)
+            self.decimal = "," if commas and not points else "."
+            if both is not None:
+                self.decimal = max(".,", key=both.rfind)
 
     def _bare(self, cell: str) -> str:
         text = cell.strip()

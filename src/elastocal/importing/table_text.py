@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from elastocal.csv_cells import NUMBER
@@ -62,10 +63,10 @@ def table_rows(
         raise InputError(f"{text.source}: only comments and blank lines; export the points again")
     delimiter: str = settings.delimiter or "auto"
     if delimiter == "auto":
-        delimiter = _sniffed([line for _, line in content[:SAMPLE]])
+        delimiter = _sniffed(content[:SAMPLE], comments[:SAMPLE], marks, is_header)
     split = _Splitter(text.source, delimiter)
     if is_header is not None:
-        header_line, header = _named_header(text, split, content, comments, marks, is_header)
+        header_line, header = _named_header(split, content, comments, marks, is_header)
     else:
         header_line, header = _unnamed_header(text, split, content, is_data)
     rows: list[tuple[int, list[str]]] = []
@@ -86,21 +87,34 @@ def table_rows(
     return Table(found, header_line, delimiter, tuple(line for _, line in comments))
 
 
-def _sniffed(lines: Sequence[str]) -> str:
-    """The delimiter that leaves the most cells that are numbers; commas may be decimal marks."""
+def _sniffed(
+    content: list[tuple[int, str]],
+    comments: list[tuple[int, str]],
+    marks: tuple[str, ...],
+    is_header: IsHeader | None,
+) -> str:
+    """The delimiter that leaves the most cells that are numbers; commas may be decimal marks.
+
+    Where a header is looked for, it must show with that delimiter.
+    """
 
     def numbers(delimiter: str) -> int:
         split = _Splitter("", delimiter)
-        total = 0
-        for line in lines:
-            try:
+        counts = []
+        for _, line in content:
+            with suppress(InputError):
                 cells = split.one(0, line)
-            except InputError:
-                continue
-            total += sum(bool(NUMBER.fullmatch(cell.strip())) for cell in cells)
-        return total
+                counts.append(sum(bool(NUMBER.fullmatch(cell.strip())) for cell in cells))
+        return sorted(counts)[len(counts) // 2] if counts else 0
 
-    return max(DELIMITERS, key=numbers)
+    best = sorted(DELIMITERS, key=numbers, reverse=True)
+    if is_header is not None:
+        for delimiter in best:
+            with suppress(InputError):
+                split = _Splitter("", delimiter)
+                if _named_header(split, content, comments, marks, is_header)[0]:
+                    return delimiter
+    return best[0]
 
 
 class _Splitter:
@@ -133,7 +147,7 @@ class _Splitter:
 
 
 def _named_header(
-    text: Text, split: _Splitter, content: list[tuple[int, str]], comments: list[tuple[int, str]],
+    split: _Splitter, content: list[tuple[int, str]], comments: list[tuple[int, str]],
     marks: tuple[str, ...], is_header: IsHeader,
 ) -> tuple[int, tuple[str, ...]]:  # fmt: skip
     for number, line in content[:SAMPLE]:
