@@ -67,14 +67,25 @@ def wanted(where: str, required: Mapping[str, Where], optional: Mapping[str, Whe
     return Wanted(tuple(result[0]), tuple(result[1]))
 
 
-def fits_header(asked: Wanted, cells: Sequence[str]) -> bool:
-    """Whether a line names every required column that is asked for by name."""
+def lacking(asked: Wanted, cells: Sequence[str]) -> list[str]:
+    """The required columns asked for by name that a line does not name, as the mapping has them."""
+    absent = []
     for target, at in asked.required:
         first = target.numbered(1) if target.is_template else target
         for part in _parts(at):
             if isinstance(part, str) and not _find(_named(part, first), cells):
-                return False
-    return True
+                absent.append(f"{target.key} = {quoted(part)}")
+    return absent
+
+
+def no_header(source: str, asked: Wanted, rows: Sequence[tuple[int, list[str]]]) -> InputError:
+    """What to say where no line is the header: which line comes nearest, and what it lacks."""
+    number, cells = min(rows, key=lambda row: len(lacking(asked, row[1])))
+    return InputError(
+        f"{source}: no line has all the columns that the mapping names; line {number} has "
+        f"{listed(map(quoted, cells), 12)}, but not {listed(lacking(asked, cells), 8)}: correct "
+        "the names, the delimiter or the comments in [source], or give columns by number"
+    )
 
 
 def resolve(
@@ -171,12 +182,6 @@ def _find(names: Sequence[str], header: Sequence[str]) -> list[int]:
 
 def _absent(source: str, target: Target, names: Sequence[str], header: Sequence[str]) -> str:
     what = " or ".join(quoted(name) for name in names)
-    if not header:
-        return (
-            f"{source}: no line has the columns that the mapping names ({target.key} = {what}); "
-            "check the names, the delimiter and the comments in [source], or give columns by "
-            "number"
-        )
     return (
         f"{source}: no column {what} for {target.key}{did_you_mean(names[0], header)}; the file "
         f"has {listed(map(quoted, header))}"

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from elastocal.errors import InputError
 from elastocal.importing.clock import Clock
-from elastocal.importing.columns import Column, Wanted, fits_header, resolve, wanted
+from elastocal.importing.columns import Column, Wanted, lacking, no_header, resolve, wanted
 from elastocal.importing.numbers import NumberCells
 from elastocal.importing.patterns import unit_in_comments
 from elastocal.importing.robot_text import krl_rows, rapid_rows
 from elastocal.importing.schema import SourceTable, TextTable, UnitsTable
-from elastocal.importing.table_text import Table, table_rows
+from elastocal.importing.table_text import SAMPLE, Table, table_rows
 from elastocal.importing.text_file import Text, read_lines
 from elastocal.importing.units import convert
 
@@ -133,12 +133,15 @@ def _table(text: Text, settings: TextTable, asked: Wanted) -> Table:
     places = [at for t, at in asked.required if not t.is_text and isinstance(at, int)]
 
     def is_header(cells: Sequence[str]) -> bool:
-        return fits_header(asked, cells)
+        return not lacking(asked, cells)
 
     def is_data(cells: Sequence[str]) -> bool:
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
 
-    return table_rows(text, settings, is_header if asked.by_name else None, is_data)
+    table = table_rows(text, settings, is_header if asked.by_name else None, is_data)
+    if asked.by_name and not table.header_line:
+        raise no_header(text.source, asked, table.rows.rows[:SAMPLE])
+    return table
 
 
 def _layout(settings: TextTable, table: Table) -> str:
