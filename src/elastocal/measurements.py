@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -45,6 +50,19 @@ class Measurements:
 
     def __len__(self) -> int:
         return len(self.row)
+
+    def to_dataframe(self, joint_kinds: Sequence[str] | None = None) -> pd.DataFrame:
+        """The table with the columns of the canonical CSV: SI units, which stand in the names.
+
+        `joint_kinds`: "revolute" (default for all joints) or "prismatic".
+        """
+        from elastocal.measurement_frame import frame_of
+
+        return frame_of(self, joint_kinds)
+
+    def _repr_html_(self) -> str:
+        """The first and last rows, as notebooks show a data frame."""
+        return str(self.to_dataframe()._repr_html_())
 
     def take(self, index: NDArray) -> Measurements:
         """The rows `index` (integers or a mask) as a table of their own; labels are kept."""
