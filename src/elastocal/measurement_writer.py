@@ -11,7 +11,6 @@ from elastocal.errors import InputError
 from elastocal.files import atomic_writer
 from elastocal.labels import is_label
 from elastocal.measurement_columns import families
-from elastocal.measurement_frame import frame_of
 from elastocal.measurements import Measurements
 from elastocal.nearest import quoted
 
@@ -28,7 +27,7 @@ def write_measurements(
     for names in (measurements.configuration_labels, measurements.marker_names):
         _check_labels(names)
     kinds = joint_kinds or ("revolute",) * measurements.q.shape[1]
-    frame = frame_of(measurements, kinds)
+    frame = measurements.to_dataframe(kinds)
     meaning = {
         header: family.meaning
         for family in families(kinds).values()

@@ -58,6 +58,7 @@ def import_(
     Example: elastocal import points.txt poses.dat --preset spatialanalyzer --preset kuka
     --cell cell.toml --preview -o data.csv
     """
+    from elastocal.cli.import_words import left_out, summary
     from elastocal.importing.mapping import preset_text, read_mapping, with_units
 
     if show_preset is not None:
@@ -78,7 +79,7 @@ def import_(
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
     found = _import(paths, read, cell, output)
     if as_json:
-        typer.echo(json.dumps(_summary(found, output), indent=1, allow_nan=False))
+        typer.echo(json.dumps(summary(found, output), indent=1, allow_nan=False))
     elif preview:
         from elastocal.cli.import_preview import print_preview
 
@@ -103,24 +104,6 @@ def import_(
         )
 
 
-def left_out(found: Imported) -> list[str]:
-    """What is not in the table, in lines: rows passed over, and what found no partner."""
-    from elastocal.nearest import listed
-
-    lines = []
-    for seen in found.understood:
-        if seen.ignored:
-            rows = listed((f"line {line} ({reason})" for line, reason in seen.ignored), 8)
-            lines.append(f"{seen.path}: passed over {len(seen.ignored)} lines: {rows}")
-    if found.joined is not None and found.joined.left_out:
-        rows = listed(found.joined.left_out, 12)
-        lines.append(f"left out, without joint values: {len(found.joined.left_out)} points: {rows}")
-    if found.joined is not None and found.joined.unused:
-        rows = listed(found.joined.unused, 12)
-        lines.append(f"poses without a point: {len(found.joined.unused)}: {rows}")
-    return lines
-
-
 def _import(paths: list[Path], read: Any, cell: Path | None, output: Path | None) -> Imported:
     from elastocal.importing.import_files import import_files
 
@@ -139,34 +122,3 @@ def _check_apart(output: Path | None, inputs: list[Path | None]) -> None:
     for path in inputs:
         if path is not None and path.resolve() == output.resolve():
             raise InputError(f"{output}: is read as well as written; name another file to write")
-
-
-def _summary(found: Imported, output: Path | None) -> dict[str, Any]:
-    """The preview as JSON."""
-    table, joined = found.table, found.joined
-    return {
-        "schema": "elastocal/import/1",
-        "output": None if output is None else str(output),
-        "readings": len(table),
-        "configurations": len(table.configuration_labels),
-        "markers": list(table.marker_names),
-        "columns": list(found.assembled.columns),
-        "joined_by": None if joined is None else joined.how,
-        "left_out": [] if joined is None else list(joined.left_out),
-        "poses_without_point": [] if joined is None else list(joined.unused),
-        "nominal_fit_um": None if found.fit is None else found.fit.error * 1e6,
-        "files": [
-            {
-                "file": seen.path, "preset": seen.preset, "role": seen.role,
-                "encoding": seen.encoding, "layout": seen.layout, "decimal": seen.decimal,
-                "rows": seen.rows, "unused": list(seen.unused),
-                "columns": [
-                    {"from": name, "to": to, "unit": unit} for name, to, unit in seen.columns
-                ],
-                "ignored": [{"line": line, "reason": why} for line, why in seen.ignored],
-            }
-            for seen in found.understood
-        ],
-        "warnings": list(found.warnings),
-        "refused": found.refused or None,
-    }  # fmt: skip

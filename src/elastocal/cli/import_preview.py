@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from elastocal.cli.import_ import left_out
+from elastocal.cli.import_words import left_out
 from elastocal.importing.import_files import Imported
 from elastocal.importing.records import Understood
 from elastocal.nearest import listed
