@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+CHUNK = 1024
 
 
 @dataclass(frozen=True)
@@ -28,20 +29,38 @@ def standstills(time: Array, q: Array, still: Array, shortest: float) -> list[St
     """
     found: list[Standstill] = []
     start, m = 0, len(time)
-    while start < m:
-        low, high = q[start].copy(), q[start].copy()
-        end = start
-        while end + 1 < m:
-            low, high = np.minimum(low, q[end + 1]), np.maximum(high, q[end + 1])
-            if np.any(high - low > still):
-                break
-            end += 1
-        if end > start and time[end] - time[start] >= shortest:
-            found.append(Standstill(start, end, np.median(q[start : end + 1], axis=0)))
-            start = end + 1
-        else:
-            start += 1
+    while start + 1 < m:
+        # The first row with which the run is long enough.
+        end = max(int(np.searchsorted(time, time[start] + shortest)), start + 1)
+        if end >= m:
+            break
+        spread = _spread(q[start : end + 1][::-1])[::-1]
+        moved = np.flatnonzero((spread > still).any(axis=1))
+        if len(moved):
+            # From there to `end` is too much, and every run that starts before holds both.
+            start += int(moved[-1]) + 1
+            continue
+        end = _last(q, start, still)
+        found.append(Standstill(start, end, np.median(q[start : end + 1], axis=0)))
+        start = end + 1
     return found
+
+
+def _spread(q: Array) -> Array:
+    """(rows, n) max - min of each joint over the rows so far."""
+    return np.maximum.accumulate(q) - np.minimum.accumulate(q)
+
+
+def _last(q: Array, start: int, still: Array) -> int:
+    """The last row of the run from `start` in which no joint moves by more than `still`."""
+    size = CHUNK
+    while True:
+        over = np.flatnonzero((_spread(q[start : start + size]) > still).any(axis=1))
+        if len(over):
+            return start + int(over[0]) - 1
+        if start + size >= len(q):
+            return len(q) - 1
+        size *= 2
 
 
 def groups_alike(q: Array, tolerance: Array) -> NDArray[np.int64]:
