@@ -45,6 +45,7 @@ def test_the_mapping_itself_is_right(tmp_path):
         ('x_mm = "x"', 'x_mm = "xx"',
          r"data.csv: no line.*line 1 has 'name', 'x'.*not x_mm = 'xx'"),
         ('x_mm = "x"', 'x_mm = true', r"x_mm.*takes places in the file.*found true"),
+        ('name = "name"', "name = []", r"name.*takes places in the file"),
         ('x_mm = "x"', 'x_mm = ["x", "y"]', "x_mm takes one column"),
         ('x_mm = "x"', 'x_mm = "x"\nx_m = "y"', "x_mm and x_m fill the same column"),
         ('z_mm = "z"\n', "", r"x_mm, y_mm without z"),
@@ -64,6 +65,7 @@ def test_the_mapping_itself_is_right(tmp_path):
         ("[[source]]", '[[source]]\nload = "full"', r"line 2: load 'full' is not in \[loads\]"),
         ("[[source]]", "[joints]\nsign = [1, 1]\n[[source]]", "sign has 2 numbers.*1 joints"),
         ("[[source]]", "[joints]\nsign = [2]\n[[source]]", "1 or -1"),
+        ("[[source]]", "[joints]\norder = []\n[[source]]", r"joints.order takes"),
         ("[[source]]", "[joints]\norder = [2]\n[[source]]", r"order = \[2\]"),
         (
             "[[source]]",
@@ -229,3 +231,19 @@ def test_deflections_need_both_states(tmp_path, readings):
     assert len(found.table) == len(MARKERS) * (2 * len(degrees) - 2)
     (warning,) = found.warnings
     assert "2 of 10 configurations" in warning and "P09, P10" in warning
+
+
+def test_numbers_of_any_size_are_told_as_implausible(tmp_path, readings):
+    points = readings[2].copy()
+    points[3] = 1e250
+    found = with_cell(tmp_path, readings, points=points)
+    assert found.fit is None
+    assert any("from the tracker" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("text", ["²", "1.5", "x", "9" * 40])
+def test_repeats_are_whole_numbers(tmp_path, text):
+    mapping = GOOD.replace('name = "name"', 'name = "name"\nrepeat = "r"')
+    data = DATA.replace("name,x,y,z,a", "name,x,y,z,a,r").replace("\n", f",{text}\n")
+    refused(tmp_path, r"line 2: repeat '.*' is no whole number", mapping,
+            **{"data.csv": data.replace(f"r,{text}", "r", 1)})  # fmt: skip

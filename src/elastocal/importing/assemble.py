@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,7 @@ from elastocal.nearest import listed, quoted
 
 SAME_DEG, SAME_MM = 0.05, 0.05
 OWN_DEFAULT = {"sigma_cartesian": "um", "sigma_polar": "um"}
+WHOLE = re.compile(r"-?[0-9]{1,15}")
 LABELS = ("configuration", "repeat", "marker")
 
 
@@ -156,7 +158,7 @@ def _repeats(points: Pool, rows: NDArray[np.int64], keys: list[tuple]) -> NDArra
             count[key] = int(repeats[k]) + 1
             continue
         text = stated[i]
-        if not text.lstrip("-").isdigit():
+        if not WHOLE.fullmatch(text):
             raise InputError(f"{points.where(int(i))}: repeat {quoted(text)} is no whole number; "
                              "correct the pattern or the column")  # fmt: skip
         repeats[k] = int(text)

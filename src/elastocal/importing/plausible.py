@@ -18,8 +18,9 @@ LARGEST_SIGMA_M = 5e-3
 
 def plausibility(made: Assembled, table: Measurements, observe: str | None) -> list[str]:
     """Sentences about columns that are likely in another unit, and about pairs that are missing."""
-    warnings = [*_joints(made, table), *_positions(table)]
-    force = np.linalg.norm(table.force, axis=1)
+    with np.errstate(over="ignore"):  # numbers of 1e300 are told as implausible, too
+        warnings = [*_joints(made, table), *_positions(table)]
+        force = np.linalg.norm(table.force, axis=1)
     if force.max() > LARGEST_FORCE_N:
         warnings.append(
             f"forces reach {force.max():.3g} N, more than any arm carries; check [loads]"

@@ -8,7 +8,8 @@ from pydantic import Field
 
 from elastocal.cell_table import NonNegative, Positive, Table, Text, Vector3, key
 
-Where = Annotated[int, Field(ge=1)] | Text | list[Text | Annotated[int, Field(ge=1)]]
+Place = Annotated[int, Field(ge=1)] | Text
+Where = Place | Annotated[list[Place], Field(min_length=1)]
 Texts = Annotated[list[Text], Field(min_length=1)]
 COLUMNS = (
     'places in the file by column of the measurement table, as in x_mm = "X [mm]", q1_deg = 5, '
@@ -71,7 +72,7 @@ class JointsTable(Table):
     """From the controller's joint values to those of the robot model."""
 
     names: Texts | None = key("the joint names of the file in the order of the robot's joints")
-    order: list[Annotated[int, Field(ge=1)]] | None = key(
+    order: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] | None = key(
         "the number of the file's joint for each joint of the robot, as in [1, 2, 4, 3, 5, 6]"
     )
     sign: list[float] | None = key("1 or -1 per joint")

@@ -19,6 +19,7 @@ FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
 POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
 BETTER = 5.0  # a correction must reduce the error by this factor to be named
 SLACK = 1e-6  # rad or m beyond a limit that rounding explains
+FARTHEST = 1e5  # m; beyond it no fit is worth its overflows, and plausibility speaks
 SAMPLE = 80
 CONFIRMED = 2  # corrections that are tried in earnest
 
@@ -52,7 +53,7 @@ def against_cell(cell: Cell, table: Measurements, made: Assembled) -> tuple[Fit 
             "the limits of the cell"
         )
     poses = len(np.unique(table.q, axis=0))
-    if table.position is None or poses < FEWEST_POSES:
+    if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
         return None, refused
     return _fit(cell, table), refused
 
