@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.manipulator.backend_instructions import BINARY_OP, CONSTANT, READ, WRITE
+from elastocal.manipulator.backend_instructions import BINARY_OP, CONSTANT, READ, UNARY_OP
 from elastocal.manipulator.backend_operations import BINARY, ON_NUMBERS, UNARY
 
 # A function, the slots of its first and second operand (−1: none) and of its result.
@@ -32,46 +32,46 @@ class Plan:
         self.once: list[Step] = []
         self.constants: list[tuple[int, int]] = []
         self.first_common = free = ends[-1]
-        steps: list[Step] = []  # every result under a number of its own, from `unplaced` on
+        steps: list[Step] = []  # the k-th result of all rows is value `unplaced` + k
         unplaced = free + len(table)
-        value: dict[int, int] = {}  # what a register of the table holds at this instruction
+        varies = [False] * unplaced  # of inputs and of values in common; results all do
+        for k, rows in enumerate(by_row):
+            varies[ends[k] : ends[k + 1]] = [rows] * (ends[k + 1] - ends[k])
+        value = [0] * (1 + max(table[:, 2], default=0))  # what a register of the table holds now
         home: dict[int, int] = {}  # the output's slot where a result is put out
+        copies: list[Step] = []
         for kind, code, out, a, b in table.tolist():
-            if kind == READ:
-                value[out] = ends[a] + b
-            elif kind == WRITE:
-                source, place = value[out], ends[len(by_row) + a] + b
-                if source >= unplaced and source not in home:
-                    home[source] = place
+            if kind >= UNARY_OP:
+                first, second = value[a], -1
+                per_row = first >= unplaced or varies[first]
+                if kind == BINARY_OP:
+                    second, operation = value[b], BINARY[code]
+                    per_row = per_row or second >= unplaced or varies[second]
                 else:
-                    steps.append((np.positive, source, -1, place))
-            elif kind == CONSTANT:
-                self.constants.append((free, code))
-                value[out], free = free, free + 1
-            else:
-                binary = kind == BINARY_OP
-                operation = BINARY[code] if binary else UNARY[code]
-                first, second = value[a], value[b] if binary else -1
-                if _varies(first, ends, by_row, unplaced) or (
-                    binary and _varies(second, ends, by_row, unplaced)
-                ):
+                    operation = UNARY[code]
+                if per_row:
                     value[out] = unplaced + len(steps)
                     steps.append((operation, first, second, value[out]))
                 else:
                     operation = ON_NUMBERS.get(operation, operation)
                     self.once.append((operation, first, second, free))
                     value[out], free = free, free + 1
+            elif kind == READ:
+                value[out] = ends[a] + b
+            elif kind == CONSTANT:
+                self.constants.append((free, code))
+                value[out], free = free, free + 1
+            else:
+                source, place = value[out], ends[len(by_row) + a] + b
+                if source >= unplaced and source not in home:
+                    home[source] = place
+                else:
+                    copies.append((np.positive, home.get(source, source), -1, place))
         self.n_common = free - self.first_common
-        self.steps, self.n_registers = _placed(steps, home, unplaced, free)
-        read = {slot for _, first, second, _ in steps for slot in (first, second)}
+        placed, self.n_registers = _placed(steps, home, unplaced, free)
+        self.steps = placed + copies
+        read = {slot for _, first, second, _ in self.steps for slot in (first, second)}
         self.shared = sorted(slot for slot in read if self.first_common <= slot < free)
-
-
-def _varies(source: int, ends: Sequence[int], by_row: Sequence[bool], unplaced: int) -> bool:
-    """Whether a value differs from row to row: results of steps, and some of the inputs."""
-    if source >= unplaced:
-        return True
-    return any(ends[k] <= source < ends[k + 1] for k, varies in enumerate(by_row) if varies)
 
 
 def _placed(
@@ -84,16 +84,23 @@ def _placed(
     """
     last = {slot: k for k, step in enumerate(steps) for slot in step[1:3]}
     slot_of = dict(home)
-    placed, unused, count = [], [], 0
+    placed: list[Step] = []
+    unused: list[int] = []
+    count = 0
     for k, (operation, a, b, out) in enumerate(steps):
-        operands = [slot_of.get(v, v) for v in (a, b)]
-        for v in {a, b}:
-            if v >= unplaced and v not in home and last[v] == k:
-                unused.append(slot_of[v])
-        if out >= unplaced and out not in home:
+        x, y = a, b
+        if a >= unplaced:
+            x = slot_of[a]
+            if x >= first and last[a] == k:
+                unused.append(x)
+        if b >= unplaced:
+            y = slot_of[b]
+            if y >= first and last[b] == k and b != a:
+                unused.append(y)
+        if out not in slot_of:
             if not unused:
                 unused.append(first + count)
                 count += 1
             slot_of[out] = unused.pop()
-        placed.append((operation, *operands, slot_of.get(out, out)))
+        placed.append((operation, x, y, slot_of[out]))
     return placed, count
