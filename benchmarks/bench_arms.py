@@ -1,4 +1,4 @@
-"""Arms of the benchmarks: the demo's KR 270 with chosen effects, and chains of six to nine joints."""
+"""Arms of the benchmarks: the demo's KR 270 with chosen effects, chains of six to nine joints."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ def serial(folder: Path, joints: int, effects: Sequence[str]) -> Model:
 
 
 def _tool(markers: int) -> str:
-    places = np.random.default_rng(0).uniform(-0.3, 0.3, (markers, 3)) + [0.25, 0.0, 0.1]
+    spread = np.random.default_rng(0).uniform(-0.3, 0.3, (markers, 3))
+    places = spread + np.array([0.25, 0.0, 0.1])
     lines = [f"M{k + 1} = {[round(float(v), 3) for v in p]}" for k, p in enumerate(places)]
     return "[tool]\nload_point_m = [0.20, 0.0, 0.25]\n[tool.markers_m]\n" + "\n".join(lines) + "\n"
 

@@ -1,4 +1,4 @@
-"""What one benchmark hands to run.py: tables, goals, where and when it ran; as JSON, as Markdown."""
+"""What one benchmark hands to run.py: tables, goals, where and when it ran; JSON and Markdown."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def number(value: Any) -> str:
     """Three digits, no exponent between 0.001 and a million; – for None; text as it is."""
     if value is None:
         return "–"
-    if isinstance(value, str) or isinstance(value, int):
+    if isinstance(value, str | int):
         return str(value)
     if value != 0 and not 1e-3 <= abs(value) < 1e6:
         return f"{value:.2e}"

@@ -15,6 +15,7 @@ import resource
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -108,7 +109,7 @@ def timed(model: Model, rows: int, size: str) -> dict[str, tuple[float, float]]:
     return {name: (t.wall / rows * 1e6, t.cpu / rows * 1e6) for name, t in took.items()}
 
 
-def whole_calls(folder: Path, part: Part) -> None:
+def whole_calls(folder: Path, part: Part, sizes: tuple[int, ...]) -> None:
     """`Model.regressor` itself, from table to B: what a user's call costs."""
     table = Table(
         "`Model.regressor`, table checks and derivatives through the equilibrium included",
@@ -118,12 +119,12 @@ def whole_calls(folder: Path, part: Part) -> None:
     for what, effects, load in (("rigid", GEOMETRY, False), ("under load", loaded, True)):
         model = kr270(folder, effects)
         x = truth(model)
-        for n in (300, 10_000):
+        for n in sizes:
             readings = poses(model, n, load)
             engines = {}
             for backend in ("numpy", "compiled"):
                 own_engine = Model(model.chain, model.cell, backend=backend)
-                engines[backend] = lambda m=own_engine: m.regressor(readings, x)
+                engines[backend] = partial(own_engine.regressor, readings, x)
             for backend, t in race(engines, 5, 1.0).items():
                 what_now = f"{what}, {len(model.parameters)} parameters"
                 micro = t.cpu / n * 1e6
@@ -196,7 +197,7 @@ def measure(size: str) -> Part:
                 times = [micro[rows][way][k] if way in micro[rows] else None for rows in rows_of]
                 table.rows.append([way, *times, differences.get(way)])
             part.tables.append(table)
-        whole_calls(folder, part)
+        whole_calls(folder, part, rows_of[:2])
     os.environ.pop("OMP_NUM_THREADS")
     threads(model, part, largest)
     memory(part, size, largest)
