@@ -71,7 +71,7 @@ def number(value: Any) -> str:
 def markdown(part: Part) -> str:
     """The part as a section of result.md."""
     w = part.where
-    lines = [f"## {part.title}", "", _ran(w), ""]
+    lines = [f"## {part.title}", "", ran(w), ""]
     for table in part.tables:
         lines += [f"### {table.title}", "", "| " + " | ".join(table.columns) + " |"]
         lines.append("|" + "---|" * len(table.columns))
@@ -82,7 +82,8 @@ def markdown(part: Part) -> str:
     return "\n".join([*lines, ""])
 
 
-def _ran(w: dict[str, Any]) -> str:
+def ran(w: dict[str, Any]) -> str:
+    """When, at which commit and on which machine it was measured."""
     return (
         f"{w['date']}, commit {w['commit']}, {w['machine']}; load average {w['load_before']:.1f} "
         f"before and {w['load_after']:.1f} after; {w['size']} sizes, {w['seconds']:.0f} s."

@@ -189,7 +189,9 @@ def campaign(kind: str, n: int, loaded: bool) -> None:
 
 def _own_process(*arguments: Any) -> None:
     sys.stdout.flush()
-    subprocess.run([sys.executable, __file__, "--process", *map(str, arguments)], check=True)
+    command = [sys.executable, __file__, "--process", *map(str, arguments)]
+    # With a thread for each core linear algebra waits for itself more than it works.
+    subprocess.run(command, check=True, env=os.environ | {"OPENBLAS_NUM_THREADS": "1"})
 
 
 def main() -> None:

@@ -16,13 +16,15 @@ import sys
 import time
 from pathlib import Path
 
-from bench_part import HERE, ONE_THREAD, Part, commit, machine, markdown, read_part
+from bench_part import HERE, ONE_THREAD, Part, commit, machine, markdown, ran, read_part
 
 PARTS = ("evaluation", "scaling", "startup", "diagnosis")
 FITS = "fits"  # prints its own Markdown
 KEPT = HERE / "parts"
 RESULT = HERE / "result.md"
-FIGURE = HERE.parent / "docs" / "images" / "performance.png"
+DOCS = HERE.parent / "docs"
+PAGE, FIGURE = DOCS / "performance.md", DOCS / "images" / "performance.png"
+BEGIN, END = "<!-- numbers: written by benchmarks/run.py -->", "<!-- end of numbers -->"
 PEERS = "ELASTOCAL_PEERS_PYTHON"
 
 
@@ -60,18 +62,39 @@ def result() -> str:
     """Every part that has been measured, one after the other, the goals first."""
     parts = [read_part(p) for name in PARTS if (p := KEPT / f"{name}.json").exists()]
     lines = ["# Benchmarks: result", "", "Written by `make bench`; how: README.md.", ""]
-    lines += ["| goal | measured | |", "|---|---|---|"]
-    for part in parts:
-        lines += [f"| {g.what} | {g.found} | {_word(g.met)} |" for g in part.goals]
-    lines += ["", *[markdown(part) for part in parts]]
+    lines += [*goals(parts), "", *[markdown(part) for part in parts]]
     fits = KEPT / "fits.md"
     if fits.exists():
         lines += ["## Whole fits beside their peers", "", fits.read_text()]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _word(met: bool) -> str:
-    return "met" if met else "**not met**"
+def goals(parts: list[Part]) -> list[str]:
+    """One table of all goals."""
+    lines = ["| goal | measured | |", "|---|---|---|"]
+    for part in parts:
+        words = ["met" if g.met else "**not met**" for g in part.goals]
+        lines += [f"| {g.what} | {g.found} | {w} |" for g, w in zip(part.goals, words, strict=True)]
+    return lines
+
+
+def page() -> None:
+    """The table of goals and the figure in docs/performance.md, between its two marks."""
+    text = PAGE.read_text(encoding="utf-8")
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        print(f"{PAGE.name} has lost its marks; left as it is")
+        return
+    parts = [read_part(p) for name in PARTS if (p := KEPT / f"{name}.json").exists()]
+    lines = [BEGIN, "", *goals(parts), ""]
+    lines += [f"{part.title}: {ran(part.where)}" for part in parts]
+    if FIGURE.exists():
+        lines += ["", f"![Time against rows and parameters](images/{FIGURE.name})"]
+    new = PAGE.with_suffix(".tmp")
+    new.write_text(before + "\n".join([*lines, "", END]) + after, encoding="utf-8")
+    os.replace(new, PAGE)
+    print(f"wrote the numbers of {PAGE}")
 
 
 def figure(path: Path) -> None:
@@ -139,6 +162,7 @@ def main() -> None:
         os.replace(temporary, RESULT)
         print(f"wrote {RESULT}")
         figure(FIGURE)
+        page()
     parts = [read_part(p) for name in PARTS if (p := KEPT / f"{name}.json").exists()]
     missed = [g.what for part in parts for g in part.goals if not g.met]
     for what in missed:
