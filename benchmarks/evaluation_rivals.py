@@ -41,7 +41,7 @@ def python_loop(f: ca.Function, arrays: Sequence[Array], n: int) -> list[Array]:
     """One call per row from Python, results written into arrays (n, rows, columns)."""
     results = [np.empty((n, *f.size_out(k))) for k in range(f.n_out())]
     for i in range(n):
-        found = f(*[a[i] if a.ndim == 2 else a for a in arrays])
+        found = f.call([a[i] if a.ndim == 2 else a for a in arrays])
         for result, value in zip(results, found, strict=True):
             result[i] = value
     return results
@@ -82,7 +82,7 @@ class Mapped:
             m = rows.stop - rows.start
             mapped = self.map if m == self.width else self.f.map(m)
             given = [a[rows].T if a.ndim == 2 else np.tile(a[:, None], (1, m)) for a in arrays]
-            for result, found in zip(results, mapped(*given), strict=True):
+            for result, found in zip(results, mapped.call(given), strict=True):
                 columns = np.asarray(found).T  # (m · columns, rows): CasADi's are side by side
                 result[rows] = columns.reshape(m, *result.shape[1:])
         return [r.transpose(0, 2, 1) for r in results]

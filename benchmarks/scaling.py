@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from bench_arms import GEOMETRY, kr270, poses, serial, truth
 from bench_clock import exponent, own
-from bench_part import Part, Table, number, run_alone
+from bench_part import Part, Table, run_alone
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.identify import identify
@@ -108,13 +108,15 @@ def child(kind: str, size: int, rows: int) -> dict[str, Any]:
 
 def against(kind: str, sizes: Sequence[int], part: Part) -> list[dict[str, Any]]:
     """One table: B and fit against `kind`, and the slopes of their logarithms."""
-    title = {"rows": "Rows, 46 parameters", "parameters": f"Parameters, {FEW} rows",
-             "joints": f"Joints, {FEW} rows, all geometric parameters"}[kind]  # fmt: skip
-    columns = [kind, "parameters", "B, wall s", "B, CPU s", "fit, wall s", "fit, CPU s", "peak, MB"]
-    table = Table(title, [*columns, "backend"])
+    few = FEW if sizes[-1] > 51 or len(sizes) > 2 else ROWS["tiny"][-1]
+    title = {"rows": "Rows, 46 parameters", "parameters": f"Parameters, {few} rows",
+             "joints": f"Joints, {few} rows, all geometric parameters"}[kind]  # fmt: skip
+    first = [kind] if kind == "parameters" else [kind, "parameters"]
+    columns = ["B, wall s", "B, CPU s", "fit, wall s", "fit, CPU s", "peak, MB", "backend"]
+    table = Table(title, [*first, *columns])
     found = []
     for size in sizes:
-        rows = size if kind == "rows" else min(FEW, max(ROWS["tiny"]) if len(sizes) == 2 else FEW)
+        rows = size if kind == "rows" else few
         print(f"{kind} {size}", file=sys.stderr, flush=True)
         one = own(__file__, kind, size, rows) | {"size": size}
         if "refused" in one:
@@ -122,20 +124,20 @@ def against(kind: str, sizes: Sequence[int], part: Part) -> list[dict[str, Any]]
         elif not one["converged"]:
             part.remarks.append(f"{kind} {size}: the fit did not converge")
         engine = one["backend"].partition(" (")[0]
-        table.rows.append(
-            [size, one["parameters"], one["B_wall"], one["B_cpu"], one["fit_wall"], one["fit_cpu"],
-             one["peak_mb"], engine]
-        )  # fmt: skip
+        seconds = [one[f"{what}_{clock}"] for what in ("B", "fit") for clock in ("wall", "cpu")]
+        what = [one["parameters"]] if kind == "parameters" else [size, one["parameters"]]
+        table.rows.append([*what, *seconds, one["peak_mb"], engine])
         found.append(one)
     part.tables.append(table)
     x = [one["parameters"] if kind == "parameters" else one["size"] for one in found]
-    slopes = []
-    for what in ("B", "fit"):
-        large = [k for k, v in enumerate(x) if kind != "rows" or v >= 10_000] or range(len(x))
-        chosen = large if len(large) > 1 else range(len(x))
-        slope = exponent([x[k] for k in chosen], [found[k][f"{what}_cpu"] for k in chosen])
-        slopes.append(f"{what} {number(slope)}")
-    lower = ", from 10 000 rows on" if kind == "rows" else ""
+    # What does not grow with the rows, the start from a sample of them, dominates below that.
+    large = [k for k, v in enumerate(x) if kind != "rows" or v >= 10_000]
+    chosen = large if len(large) > 1 else list(range(len(x)))
+    slopes = [
+        f"{what} {exponent([x[k] for k in chosen], [found[k][f'{what}_cpu'] for k in chosen]):.2f}"
+        for what in ("B", "fit")
+    ]
+    lower = f", from {x[chosen[0]]} rows on" if kind == "rows" else ""
     part.remarks.append(f"Exponents of CPU time against {kind}{lower}: {', '.join(slopes)}.")
     return found
 
