@@ -53,7 +53,20 @@ def simulated(folder: Path, rows: int) -> Path:
     data = folder / f"data{rows}.csv"
     true = [part for name, value in HIDDEN.items() for part in ("--set", f"{name}={value}")]
     ran("simulate", world, plan, "-o", data, "--load", 0, 0, -300, "--seed", 3, *true)
+    _circumstances(data, q)
     return data
+
+
+def _circumstances(data: Path, q: np.ndarray) -> None:
+    """Time and side of approach beside every reading, so that the whole catalogue is tried."""
+    header, *rows = data.read_text().splitlines()
+    side = np.where(np.diff(q, axis=0, prepend=0.0) < 0, -1, 1)
+    names = ["time_min", *[f"approach_{k + 1}" for k in range(q.shape[1])]]
+    lines = [",".join([header, *names])]
+    for k, row in enumerate(rows):
+        pose = int(row.partition(",")[0]) - 1
+        lines.append(",".join([row, f"{k / 20:.2f}", *map(str, side[pose])]))
+    data.write_text("\n".join(lines) + "\n")
 
 
 def measure(size: str) -> Part:
