@@ -34,7 +34,7 @@ ROWS = {
     "short": (1000, 10_000, 100_000, 1_000_000),
     "full": (1000, 3000, 10_000, 30_000, 100_000, 300_000, 1_000_000),
 }
-# Parameters: 9, 15 and 51 by leaving effects out, beyond that 12 for every order of gear ripple.
+# Parameters: 9, 15 and 51 by leaving effects out, beyond that 3 for every further marker.
 PARAMETERS = {
     "tiny": (9, 51),
     "short": (9, 15, 51, 99, 303),
@@ -54,8 +54,7 @@ def chosen_model(folder: Path, kind: str, size: int) -> Model:
     if size < 51:
         few = ("base_frame", "marker_position", "joint_offset")
         return kr270(folder, few[: 2 if size == 9 else 3])
-    orders = [float(2 + 3 * k) for k in range((size - 51) // 12)]
-    return kr270(folder, (*GEOMETRY, "gear_ripple"), f"gear_ripple_orders = {orders}\n")
+    return kr270(folder, GEOMETRY, markers=1 + (size - 51) // 3)
 
 
 def simulated(model: Model, n: int) -> Measurements:
