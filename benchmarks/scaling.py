@@ -34,7 +34,7 @@ ROWS = {
     "short": (1000, 10_000, 100_000, 1_000_000),
     "full": (1000, 3000, 10_000, 30_000, 100_000, 300_000, 1_000_000),
 }
-# In full up to 303.  Parameters: 9, 15 and 51 by leaving effects out, beyond that 3 for every further marker.
+# 9, 15 and 51 by leaving effects out, beyond that 3 for every further marker.
 PARAMETERS = {
     "tiny": (9, 51),
     "short": (9, 15, 51, 99),  # a fit with 303 takes minutes
