@@ -228,6 +228,7 @@ class IdentificationResult(ForNotebooks):
                 None if self.faulty_report is None else self.faulty_report.to_json()
             ),
             "converged": self.converged,
+            "backend": self.model.backend_report(),
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
             "warnings": list(self.warnings),
