@@ -83,7 +83,7 @@ def _step(
 
 def _fitted_steps(scene: Scene) -> list[tuple[str, NoisyData]]:
     """The model's own effects, stage by stage, those of the later step held at nominal."""
-    stage = np.array([_stage(effect) for effect in scene.fitted.effect])
+    stage = np.array([stage_of(effect) for effect in scene.fitted.effect])
     steps = []
     for k, name in ((1, "geometry"), (2, "compliance")):
         if not (stage == k).any():
@@ -99,7 +99,8 @@ def _fitted_steps(scene: Scene) -> list[tuple[str, NoisyData]]:
     return steps
 
 
-def _stage(effect: str) -> int:
+def stage_of(effect: str) -> int:
+    """0 for what places base and markers, 1 for geometry, 2 for what yields under load."""
     if effect in PLACED_EFFECTS:
         return 0
     return 2 if CATALOGUE[effect].stage in ("compliance", "load") else 1

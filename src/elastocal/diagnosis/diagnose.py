@@ -95,6 +95,7 @@ def diagnose(
         n_readings=scene.blocks.n,
         n_configurations=len(scene.blocks.member),
         model_keys=model_keys(base.model, findings),
+        calibrated=base,
     )
 
 

@@ -63,7 +63,14 @@ def rms_with_interval(
     data: NoisyData, packed: Array, rng: np.random.Generator
 ) -> tuple[float, tuple[float, float]]:
     """3-D rms in m of residuals (C, m) and its 95 % interval by resampling configurations."""
-    squares, count = squared_lengths(data, packed)
+    return resampled_rms(*squared_lengths(data, packed), rng)
+
+
+def resampled_rms(
+    squares: Array, count: NDArray[np.integer], rng: np.random.Generator
+) -> tuple[float, tuple[float, float]]:
+    """The rms √(Σ squares / Σ count) of configurations (C,) and its 95 % interval, by weights that
+    a Dirichlet distribution draws for them (the Bayesian bootstrap)."""
     rms = float(np.sqrt(squares.sum() / count.sum()))
     weight = rng.dirichlet(np.ones(len(squares)), DRAWS)
     drawn = np.sqrt((weight @ squares) / (weight @ count))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.separate_result import ExtraPlan
 from elastocal.manipulator.effects.base import Stage
 from elastocal.notebook import ForNotebooks
@@ -196,3 +197,5 @@ class Diagnosis(ForNotebooks):
     extra: ExtraPlan | None = field(default=None)
     # Keys of [model] that the effects found rest on, beyond their own names.
     model_keys: dict[str, str] = field(default_factory=dict)
+    # The arm as it was fitted before any effect was added, and its residuals.
+    calibrated: Baseline | None = field(default=None, repr=False, compare=False)
