@@ -4,54 +4,18 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, EXTRA, HOSTILE, TWO, VERDICTS
+from support.pages import Page
 
 from elastocal.diagnosis.result import FaultyReading, Step
 from elastocal.errors import InputError
 from elastocal.manipulator.model import Model
 from elastocal.report.diagnosis_page import diagnosis_page, write_diagnosis_report
-
-VOID = {"meta", "br", "link", "img", "hr", "input"}
-
-
-class Page(HTMLParser):
-    """Tags, text and table rows; complains where tags do not match."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: set[str] = set()
-        self.rows: list[list[str]] = []
-        self.text = ""
-        self.feed(text)
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: Any) -> None:
-        self.tags.add(tag)
-        if tag not in VOID:
-            self.open.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("td", "th"):
-            self.rows[-1].append("")
-
-    def handle_startendtag(self, tag: str, attrs: Any) -> None:
-        self.tags.add(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-        if {"td", "th"} & set(self.open):
-            self.rows[-1][-1] += data.strip()
 
 
 @pytest.fixture(scope="module")
@@ -69,13 +33,8 @@ def pages(model: Model) -> dict[str, str]:
 def test_names_from_files_are_text_and_nothing_comes_from_elsewhere(name, pages):
     text = pages[name]
     page = Page(text)
-    assert not {"script", "link", "img", "iframe", "object"} & page.tags
-    assert "\x1b" not in text
+    page.check_harmless(text)
     assert "<script>alert(1)</script>" in page.text
-    addresses = set(re.findall(r"""(?:https?:)?//[^\s"'<>)]+""", text))
-    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
-    assert "@import" not in text
-    assert all(target.startswith("#") for target in re.findall(r"url\(([^)]*)\)", text))
 
 
 @pytest.mark.parametrize("name", VERDICTS)

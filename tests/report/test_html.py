@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -12,50 +12,11 @@ from xml.etree import ElementTree
 import matplotlib as mpl
 import numpy as np
 import pytest
+from support.pages import Page
 
+from elastocal.manipulator.observation import observe
 from elastocal.report import residuals
 from elastocal.report.html import report_page, write_report
-
-VOID = {"meta", "br", "link", "img", "hr", "input"}
-SVG_LEAVES = {"line", "circle", "path", "use", "rect"}
-
-
-class Structure(HTMLParser):
-    """Open tags, ids and text; complains where tags do not match."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: set[str] = set()
-        self.rows: list[list[str]] = []
-        self.texts: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: Any) -> None:
-        self.tags.add(tag)
-        if tag not in VOID:
-            self.open.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("td", "th"):
-            self.rows[-1].append("")
-
-    def handle_startendtag(self, tag: str, attrs: Any) -> None:
-        self.tags.add(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.texts.append(data)
-        if "td" in self.open or "th" in self.open:
-            self.rows[-1][-1] += data.strip()
-
-
-def parsed(page: str) -> Structure:
-    structure = Structure()
-    structure.feed(page)
-    assert structure.open == []
-    return structure
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +27,7 @@ def page(case: Any) -> str:
 def test_every_parameter_is_on_the_page_and_no_number_where_none_is_known(
     page: str, case: Any
 ) -> None:
-    rows = {row[0]: row for row in parsed(page).rows if row}
+    rows = {row[0]: row for row in Page(page).rows if row}
     for e in case.result.estimates:
         row = rows[e.name]
         if e.identifiable:
@@ -77,28 +38,21 @@ def test_every_parameter_is_on_the_page_and_no_number_where_none_is_known(
 
 
 def test_structure(page: str) -> None:
-    structure = parsed(page)
-    assert not {"script", "link", "img", "iframe", "object"} & structure.tags
-    assert page.count("<figure>") == page.count("</figure>") == 8
-    text = "".join(structure.texts)
-    for heading in ("Parameters", "Combinations", "What is not determined", "Residuals",
-                    "Correlations over 0.9", "Outliers", "To repeat this"):  # fmt: skip
-        assert heading in text
-    assert "elastocal identify c.toml d.csv" in text
+    structure = Page(page)
+    structure.check_harmless(page)
+    assert page.count("<figure") == page.count("</figure>") == 13
+    for heading in ("Where the error goes", "Parameters", "Combinations", "What is not determined",
+                    "Residuals", "Correlations over 0.9", "Faulty readings", "To repeat this"):  # fmt: skip
+        assert heading in structure.text
+    assert "elastocal identify c.toml d.csv" in structure.text
+    assert "engine" in structure.named_rows()
     assert "prefers-color-scheme: dark" in page
     assert "@media print" in page
 
 
-def test_no_network(page: str) -> None:
-    addresses = set(re.findall(r"""(?:https?:)?//[^\s"'<>)]+""", page))
-    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
-    assert "@import" not in page
-    assert set(re.findall(r"url\(([^)]*)\)", page)) == set(re.findall(r"url\((#[^)]*)\)", page))
-
-
 def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
     figures = re.findall(r"<svg xmlns=.*?</svg>", page, re.DOTALL)
-    assert len(figures) == 8
+    assert len(figures) == 13
     for figure in figures:
         ElementTree.fromstring(figure)
         assert "var(--ink)" in figure
@@ -108,23 +62,25 @@ def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
 
 def test_names_from_files_are_text(hostile: Any) -> None:
     page = report_page(hostile.result, command="elastocal <b>", inputs={"<i>.csv": "<u>"})
-    structure = parsed(page)
-    assert not {"script", "b", "i", "u"} & structure.tags
-    assert "\x1b" not in page
+    structure = Page(page)
+    structure.check_harmless(page)
+    assert not {"b", "i", "u"} & set(structure.tags)
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
-    assert any("[red]$x^2$ & " in text for text in structure.texts)
-    assert "left out" in "".join(structure.texts).lower()
+    assert "[red]$x^2$ & " in structure.text
+    (view,) = structure.data
+    assert not set("<>&") & set(view)
+    assert json.loads(view)["poses"][0]["names"][0] == "<script>alert(1)</script>"
+    assert "left out" in structure.text.lower()
 
 
 def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:
     """40 000 readings: thinned, said so, and below 6 MB."""
     seen = case.result.observations
     times = 40000 // len(seen.lead) + 1
-    index = np.tile(np.arange(len(seen.lead)), times)
-    lead = replace(seen, lead=seen.lead[index], value=np.tile(seen.value, times))
+    rows = np.tile(np.arange(len(seen.table)), times)
     long = replace(
         case.result,
-        observations=lead,
+        observations=observe(seen.table.take(rows), seen.kind),
         residual=np.tile(case.result.residual, times),
         held_out=np.tile(case.result.held_out, times),
         noise={**case.result.noise, "kind": "none"},
@@ -143,24 +99,26 @@ def test_small_tables_are_drawn_whole(page: str, case: Any) -> None:
 def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: str) -> None:
     with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30}):
         again = report_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
-    assert again == page
+    # What evaluated the model so far is another thing the second time.
+    engine = re.compile(r"<td class=\"name\">engine</td><td>.*?</td>")
+    assert engine.sub("", again) == engine.sub("", page)
 
 
 def test_configuration_without_held_out_error(case: Any) -> None:
     held_out = case.result.held_out.copy()
     held_out[:12] = np.inf  # 2 markers × 2 loads × 3 coordinates
     page = report_page(replace(case.result, held_out=held_out, heldout_rms=float("inf")))
-    parsed(page)
+    Page(page)
     assert "1 without held-out error" in page
     assert "is not known" in page
 
 
 def test_other_observations(pose: Any, bare: Any) -> None:
     text = report_page(pose.result, pose.truth)
-    parsed(text)
+    Page(text)
     assert "rz in µrad" in text
     text = report_page(bare.result)
     assert "No noise was stated" in text
     (faulty,) = bare.result.outliers
-    (row,) = [row for row in parsed(text).rows if row[0] == str(faulty.line)]
+    (row,) = [row for row in Page(text).rows if len(row) == 5 and row[0] == str(faulty.line)]
     assert row[1:3] == [faulty.configuration, faulty.marker]

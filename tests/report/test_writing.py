@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.report import html
+from elastocal.report import identification_figures
 from elastocal.report.html import write_report
 
 
@@ -17,8 +17,10 @@ from elastocal.report.html import write_report
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Writing does not depend on what the figures show, and drawing takes its time."""
     names = ("errors", "held_out", "by_configuration", "against_joints", "histogram", "scores",
-             "groups", "histograms")  # fmt: skip
-    monkeypatch.setattr(html, "_figures", lambda *_: dict.fromkeys(names, "<svg></svg>"))
+             "groups", "histograms", "waterfall", "matrix", "space", "over_time",
+             "by_region")  # fmt: skip
+    drawn = dict.fromkeys(names, "<svg></svg>")
+    monkeypatch.setattr(identification_figures, "drawn_for", lambda *_: drawn)
 
 
 def test_inputs_are_hashed(case: Any, tmp_path: Path) -> None:
@@ -52,7 +54,7 @@ def test_failure_while_drawing_keeps_the_old_page(
     def broken(*_: object) -> dict[str, str]:
         raise RuntimeError("no figures today")
 
-    monkeypatch.setattr(html, "_figures", broken)
+    monkeypatch.setattr(identification_figures, "drawn_for", broken)
     with pytest.raises(RuntimeError):
         write_report(case.result, tmp_path / "r.html")
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("r.html", "old")]

@@ -31,7 +31,10 @@ def demo(
         done = run_demo(folder, seed, progress)
         report = folder / "report.html"
         inputs = [done.cell, done.plan, done.data]
-        write_results(done.result, folder / "result.json", report, None, inputs, done.truth, seed)
+        write_results(
+            done.result, folder / "result.json", report, None, inputs, done.truth, seed,
+            done.published,
+        )  # fmt: skip
     if as_json:
         typer.echo(json.dumps(done.result.to_json() | {"truth": done.truth}, indent=1))
         return

@@ -26,6 +26,7 @@ from elastocal.cli.plan_files import (
     check_suffixes,
     files_of,
     write_all,
+    write_page,
 )
 from elastocal.errors import ElastocalError, InputError, require
 
@@ -75,6 +76,7 @@ def design(
     picture: Annotated[
         Path | None, typer.Option(help="Picture of the poses to write (PNG, SVG).")
     ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")] = None,
     jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
     seed: Seed = 0,
     as_json: Json = False,
@@ -90,11 +92,11 @@ def design(
     from elastocal.design.checkpoint import Checkpoint, key_of
     from elastocal.design.design import design as run
 
-    report = output.with_suffix(".json")
+    summary = output.with_suffix(".json")
     require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
     programs = tuple(program or ())
     check_suffixes(programs, picture)
-    written = [p for p in (output, report, *programs, picture) if p is not None]
+    written = [p for p in (output, summary, *programs, picture, report) if p is not None]
     check_outputs(*written)
     asked = {
         "poses": poses,
@@ -128,10 +130,13 @@ def design(
                 checkpoint.drop()
             raise
         interrupts.check()
-        write_all(plan, output, report, programs, picture)
+        write_all(plan, output, summary, programs, picture)
+        if report is not None:
+            progress("writing the report")
+            write_page(plan, report, files)
         checkpoint.clear()
     if as_json:
-        typer.echo(report.read_text(encoding="utf-8"), nl=False)
+        typer.echo(summary.read_text(encoding="utf-8"), nl=False)
         return
     from elastocal.report.plan_tables import print_plan
 

@@ -96,6 +96,14 @@ def write_all(
         )  # fmt: skip
 
 
+def write_page(plan: Plan, path: Path, read: list[Path]) -> None:
+    """The report of a plan; `read` are the files it depends on."""
+    from elastocal.report.plan_page import write_plan_report
+
+    command = shlex.join(["elastocal", *sys.argv[1:]])
+    write_plan_report(plan, path, command=command, inputs=list(dict.fromkeys(read)))
+
+
 def _program(
     path: Path, execution: Execution, chain: Chain,
     configurations: tuple[str, ...] = (), forces: Array | None = None,

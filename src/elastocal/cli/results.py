@@ -5,11 +5,16 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shlex
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from elastocal.files import atomic_write_text
 from elastocal.identification.result import IdentificationResult
+
+if TYPE_CHECKING:
+    from elastocal.report.html import Published
 
 
 def write_results(
@@ -20,10 +25,12 @@ def write_results(
     inputs: list[Path],
     truth: dict[str, float] | None = None,
     seed: int | None = None,
+    published: Published | None = None,
 ) -> None:
     """Write what was asked for, each file whole or not at all.
 
-    `inputs` are named with their hashes in the report; `truth` (SI) stands beside the estimates.
+    `inputs` are named with their hashes in the report, where `truth` and `published` (SI) stand
+    beside the estimates.
     """
     if output is not None:
         atomic_write_text(output, json.dumps(result.to_json(), indent=1) + "\n")
@@ -37,5 +44,8 @@ def write_results(
     if report is not None:
         from elastocal.report.html import write_report
 
-        command = " ".join(["elastocal", *sys.argv[1:]])
-        write_report(result, report, truth=truth, command=command, inputs=inputs, seed=seed)
+        command = shlex.join(["elastocal", *sys.argv[1:]])
+        write_report(
+            result, report, truth=truth, command=command, inputs=inputs, seed=seed,
+            published=published,
+        )  # fmt: skip

@@ -11,7 +11,7 @@ from elastocal.diagnosis.result import Curve, Diagnosis
 from elastocal.report.diagnosis_rows import error_steps
 from elastocal.report.diagnosis_words import driver_name, effect_at, name_of, probability
 from elastocal.report.svg import FAINT, INK, SERIES, drawn
-from elastocal.report.units import length
+from elastocal.report.waterfall import waterfall as waterfall_of
 from elastocal.report.words import short_name
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ ROW = 0.34  # inches per bar
 MOST_BARS = 10
 LONGEST_NAME = 46
 LONGEST_ENTRY = 24  # what moves, written along the height of a small panel
-# A budget that spans more than this is drawn on a logarithmic axis.
-WIDE_RANGE = 8.0
 # Unit of a curve's axis → (factor, unit shown).
 ABSCISSA = {
     "rad": (180 / math.pi, "°"),
@@ -36,51 +34,9 @@ ORDINATE = {"m": (1e6, "µm"), "rad": (1e6, "µrad"), "1": (1e6, "ppm")}
 
 
 def waterfall(d: Diagnosis) -> str:
-    """The gap budget: what each step takes away, and what remains with its 95 % interval."""
-    steps = error_steps(d)
-    rms = np.array([step.heldout_rms for step in steps])
-    ends = np.array([step.ci95 for step in steps]).reshape(-1, 2)
-    floor = d.gap.noise_floor
-    known = [v for v in (*rms, floor) if math.isfinite(v) and v > 0]
-
-    def draw(figure: Figure) -> None:
-        from matplotlib.ticker import LogLocator
-
-        axes = figure.subplots()
-        for k, (value, (low, high)) in enumerate(zip(rms * 1e6, ends * 1e6, strict=True)):
-            if k:
-                label = "taken away" if k == 1 else None
-                axes.plot([rms[k - 1] * 1e6, value], [k, k], color=SERIES[5], linewidth=7,
-                          solid_capstyle="butt", label=label)  # fmt: skip
-            axes.plot([low, high], [k, k], color=SERIES[0], linewidth=1.6,
-                      label="95 % interval" if k == 0 else None)  # fmt: skip
-            axes.plot([value], [k], "o", color=SERIES[0], markersize=7,
-                      label="remaining error" if k == 0 else None)  # fmt: skip
-            axes.annotate(length(rms[k]), (value, k), (0, 7), textcoords="offset points",
-                          ha="center", fontsize=8)  # fmt: skip
-        if math.isfinite(floor):
-            axes.axvline(floor * 1e6, color=SERIES[1], linestyle="--", linewidth=1.2,
-                         label=f"noise alone ({length(floor)})")  # fmt: skip
-        axes.set_yticks(range(len(rms)), [_name(name_of(s.step)) for s in steps])
-        axes.set_ylim(len(rms) - 0.4, -0.75)
-        if known and max(known) > WIDE_RANGE * min(known):
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.margins(x=0.1)
-        else:
-            axes.set_xlim(0, 1.15e6 * max(known, default=1.0))
-        axes.xaxis.set_major_formatter(lambda x, _: _tick(x))
-        axes.xaxis.set_minor_formatter(lambda x, _: "")
-        axes.set_xlabel("3-D rms error on held-out poses")
-        axes.grid(axis="y", visible=False)
-        figure.legend(loc="outside upper right", ncols=4, fontsize=8)
-
-    return drawn(draw, WIDTH, 1.1 + 1.25 * ROW * len(rms), "Gap budget from nominal to explained")
-
-
-def _tick(micrometres: float) -> str:
-    """ "50 µm", "2 mm"."""
-    return f"{micrometres:g} µm" if micrometres < 1e3 else f"{micrometres / 1e3:g} mm"
+    """The gap budget of a diagnosis as a waterfall."""
+    steps = [(name_of(s.step), s.heldout_rms, s.ci95) for s in error_steps(d)]
+    return waterfall_of(steps, d.gap.noise_floor, "noise alone")
 
 
 def candidates(d: Diagnosis) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from elastocal import __version__
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.files import atomic_write_text
 from elastocal.manipulator.model import Model
@@ -22,7 +20,11 @@ from elastocal.report.diagnosis_words import (
     probability,
     together,
 )
-from elastocal.report.html import digests, resource, software
+from elastocal.report.page import Inputs, Repeat, Table, render, title_of
+from elastocal.report.residual_rows import residual_table
+from elastocal.report.residual_space import marker_positions, residual_space, view_caption
+from elastocal.report.residuals import residuals_by
+from elastocal.report.space import space_json
 from elastocal.report.units import significant
 from elastocal.report.verdict import counted
 from elastocal.report.words import printable
@@ -51,7 +53,7 @@ def write_diagnosis_report(
     path: str | Path,
     data: str,
     command: str | None = None,
-    inputs: Mapping[str, str] | Iterable[str | Path] | None = None,
+    inputs: Inputs = None,
     seed: int | None = None,
 ) -> None:
     """Write the page to `path`, whole or not at all; arguments as for `diagnosis_page`.
@@ -66,7 +68,7 @@ def diagnosis_page(
     model: Model,
     data: str,
     command: str | None = None,
-    inputs: Mapping[str, str] | Iterable[str | Path] | None = None,
+    inputs: Inputs = None,
     seed: int | None = None,
 ) -> str:
     """The page as text.
@@ -74,19 +76,13 @@ def diagnosis_page(
     `model` is the arm that was diagnosed, `data` names its measurements; `inputs` are the files
     read, or a map from their names to their SHA-256; `command` and `seed` tell how to repeat it.
     """
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(resource("diagnosis.html.j2"))
-    return template.render(
+    return render(
+        "diagnosis.html.j2",
+        title_of(model),
+        Repeat(command, inputs, seed, model.backend_report()),
         **_contents(diagnosis, model),
+        **_residuals(diagnosis),
         data=printable(data),
-        command=None if command is None else printable(command),
-        inputs={printable(k): printable(v) for k, v in digests(inputs).items()},
-        seed=seed,
-        backend=printable(model.backend_report()),
     )
 
 
@@ -94,15 +90,11 @@ def _contents(d: Diagnosis, model: Model) -> dict[str, Any]:
     from markupsafe import Markup
 
     kinds = model.chain.kinds
-    names = dict.fromkeys([model.chain.name, model.cell.name])
     lines = [(label, capital(text)) for label, text in verdict_lines(d)[1:]]
     alike = [together([effect_at(e) for e in rivals]) for rivals in d.indistinguishable]
     return {
-        "title": printable(" – ".join(name for name in names if name)),
-        "css": Markup(resource("style.css") + resource("diagnosis.css")),
-        "version": __version__,
-        "environment": software(),
         "headline": headline(d),
+        "tone": "good" if d.verdict in ("explained", "nothing_significant") else "care",
         "verdict": lines,
         "steps": next_steps(d),
         "warnings": [printable(w) for w in d.warnings],
@@ -112,25 +104,35 @@ def _contents(d: Diagnosis, model: Model) -> dict[str, Any]:
         "box": BOX,
         "places": _places(d),
         "figures": {name: Markup(svg) for name, svg in _figures(d).items()},
-        "budget": rows.budget_rows(d),
-        "parameters": rows.parameter_rows(d.effects),
-        "candidates": rows.candidate_rows(d, MOST_CANDIDATES),
+        "budget": Table(rows.BUDGET, rows.budget_rows(d)),
+        "parameters": Table(rows.PARAMETERS, rows.parameter_rows(d.effects), (0, 3)),
+        "candidates": Table(rows.CANDIDATES, rows.candidate_rows(d, MOST_CANDIDATES), (0, 5)),
         "n_candidates": len(d.candidates),
         "alike": [capital(text) for text in alike],
-        "structure": rows.structure_rows(d, MOST_TESTS),
+        "structure": Table(rows.STRUCTURE, rows.structure_rows(d, MOST_TESTS)),
         "n_structure": len(d.structure),
         "noise": noise_lines(d.noise, kinds),
-        "faulty": rows.faulty_rows(d, MOST_FAULTY),
+        "faulty": Table(rows.FAULTY, rows.faulty_rows(d, MOST_FAULTY), (1, 2)),
         "more_faulty": max(0, len(d.noise.faulty) - MOST_FAULTY),
-        "untested": rows.untested_rows(d),
-        "heads": {name: getattr(rows, name.upper()) for name in HEADS},
+        "untested": Table(rows.UNTESTED, rows.untested_rows(d), (0, 1, 2)),
         "extra": [] if d.extra is None else extra_lines(d.extra),
-        "pairs": [] if d.extra is None else rows.pair_rows(d.extra),
+        "pairs": Table(rows.PAIRS, [] if d.extra is None else rows.pair_rows(d.extra)),
         "visits": _visits(d, kinds),
     }
 
 
-HEADS = ("budget", "candidates", "parameters", "structure", "faulty", "pairs", "untested")
+def _residuals(d: Diagnosis) -> dict[str, Any]:
+    """The residuals of the calibrated arm; no view where they are not known."""
+    base = d.calibrated
+    if base is None:
+        return {"view": None, "residual_table": None, "view_caption": ""}
+    residuals = residuals_by(base.seen, base.residual)
+    space = residual_space(base.model, base.seen, base.x, base.residual)
+    return {
+        "view": space_json(space),
+        "view_caption": view_caption(space, len(residuals.labels)),
+        "residual_table": residual_table(base.seen, residuals),
+    }
 
 
 def _boxes(d: Diagnosis) -> list[Box]:
@@ -160,6 +162,23 @@ def _figures(d: Diagnosis) -> dict[str, str]:
         "waterfall": figures.waterfall(d) if d.budget else "",
         "candidates": figures.candidates(d),
         "curves": figures.curves(d) if d.curves else "",
+        **_residual_figures(d),
+    }
+
+
+def _residual_figures(d: Diagnosis) -> dict[str, str]:
+    from elastocal.report.place_figures import by_region
+    from elastocal.report.space_picture import space_picture
+
+    base = d.calibrated
+    if base is None:
+        return {}
+    residuals = residuals_by(base.seen, base.residual)
+    positions = marker_positions(base.model, base.seen, base.x)
+    space = residual_space(base.model, base.seen, base.x, base.residual)
+    return {
+        "by_region": by_region(positions, residuals.value[:, : residuals.positions]),
+        "space": space_picture(space, "Residuals of the calibrated arm as arrows"),
     }
 
 
@@ -176,7 +195,7 @@ def _visits(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any] | None:
     heads += ["approach"] if plan.approach is not None else []
     heads += ["time min"] if plan.time is not None else []
     shown = np.where(np.array(kinds) == "revolute", np.degrees(plan.q), plan.q * 1e3)
-    table = []
+    table: list[tuple[str, ...]] = []
     for i in range(min(len(plan), MOST_VISITS)):
         row = [str(i + 1), printable(plan.configuration_labels[plan.configuration[i]])]
         row += [f"{v + 0.0:.2f}" for v in shown[i]]
@@ -185,5 +204,5 @@ def _visits(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any] | None:
             row.append(" ".join("+" if a > 0 else "−" if a < 0 else "0" for a in plan.approach[i]))
         if plan.time is not None:
             row.append(f"{plan.time[i] / 60:.1f}")
-        table.append(row)
-    return {"heads": heads, "rows": table, "more": len(plan) - len(table)}
+        table.append(tuple(row))
+    return {"table": Table(tuple(heads), table, ()), "more": len(plan) - len(table)}

@@ -17,6 +17,7 @@ from elastocal.report.diagnosis_words import (
     probability,
     settings_text,
 )
+from elastocal.report.rows import signed_change
 from elastocal.report.units import estimate, length, significant
 from elastocal.report.words import printable
 
@@ -41,14 +42,10 @@ def budget_rows(d: Diagnosis) -> Rows:
     rows: Rows = []
     before: float | None = None
     for step in error_steps(d):
-        change = "" if before is None else _signed(step.heldout_rms - before)
+        change = "" if before is None else signed_change(step.heldout_rms - before)
         rows.append((name_of(step.step), length(step.heldout_rms), _ends(step.ci95), change))
         before = step.heldout_rms
     return [*rows, ("noise alone", length(d.gap.noise_floor), "", "")]
-
-
-def _signed(change: float) -> str:
-    return f"{'−' if change < 0 else '+'}{length(abs(change))}"
 
 
 def _ends(ci95: Interval) -> str:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import platform
-from collections.abc import Iterable, Mapping
-from importlib import metadata, resources
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from elastocal import __version__
-from elastocal.files import atomic_write_text, open_input
+from elastocal.files import atomic_write_text
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.result import IdentificationResult, Outlier
+from elastocal.report import identification_figures
 from elastocal.report.faults import false_alarm_line, fault_lines
+from elastocal.report.gap_budget import Budget, gap_budget
 from elastocal.report.method import intervals_line, method_and_weights
 from elastocal.report.noise import (
     candidate_rows,
@@ -24,8 +22,13 @@ from elastocal.report.noise import (
     shape_line,
     size_rows,
 )
+from elastocal.report.page import Inputs, Repeat, render, title_of
+from elastocal.report.residual_rows import residual_table
+from elastocal.report.residual_space import residual_space, view_caption
 from elastocal.report.residuals import Residuals, residuals_of, summary_of
-from elastocal.report.rows import any_lopsided, combination_rows, parameter_rows
+from elastocal.report.rows import any_lopsided, budget_table, combination_rows, parameter_rows
+from elastocal.report.space import space_json
+from elastocal.report.trust import judgement
 from elastocal.report.units import length, significant
 from elastocal.report.verdict import (
     correlation_lines,
@@ -41,7 +44,7 @@ from elastocal.report.words import Truth, printable, undetermined_lines
 
 MOST_CORRELATIONS = 30
 MOST_FAULTY = 100
-LIBRARIES = ("numpy", "scipy", "casadi")
+Published = Mapping[str, tuple[float, float]]
 
 
 def write_report(
@@ -49,60 +52,45 @@ def write_report(
     path: str | Path,
     truth: Truth | None = None,
     command: str | None = None,
-    inputs: Mapping[str, str] | Iterable[str | Path] | None = None,
+    inputs: Inputs = None,
     seed: int | None = None,
+    published: Published | None = None,
 ) -> None:
     """Write the page to `path`, whole or not at all.
 
-    `truth` (SI) adds true values; `inputs` are the files read, or a map from their names to
-    their SHA-256; `command` and `seed` tell how to repeat the run.
+    `truth` (SI) adds true values, `published` values (SI) and half widths that others found;
+    `inputs` are the files read, or a map from their names to their SHA-256; `command` and `seed`
+    tell how to repeat the run.
 
     Raises InputError where an input cannot be read or `path` cannot be written.
     """
-    atomic_write_text(path, report_page(result, truth, command, inputs, seed))
+    atomic_write_text(path, report_page(result, truth, command, inputs, seed, published))
 
 
 def report_page(
     result: IdentificationResult,
     truth: Truth | None = None,
     command: str | None = None,
-    inputs: Mapping[str, str] | Iterable[str | Path] | None = None,
+    inputs: Inputs = None,
     seed: int | None = None,
+    published: Published | None = None,
 ) -> str:
     """The page as text; arguments as for `write_report`."""
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(resource("identification.html.j2"))
-    return template.render(
-        **_contents(result, truth),
-        command=None if command is None else printable(command),
-        inputs={printable(k): printable(v) for k, v in digests(inputs).items()},
-        seed=seed,
-        backend=printable(result.model.backend_report()),
+    return render(
+        "identification.html.j2",
+        title_of(result.model),
+        Repeat(command, inputs, seed, result.model.backend_report()),
+        **_contents(result, truth, published or {}),
     )
 
 
-def digests(inputs: Mapping[str, str] | Iterable[str | Path] | None) -> dict[str, str]:
-    """File name → SHA-256; a map is taken as it is."""
-    if inputs is None or isinstance(inputs, Mapping):
-        return dict(inputs or {})
-    found = {}
-    for path in inputs:
-        with open_input(path, "input file") as handle:
-            digest = hashlib.sha256()
-            while block := handle.read(1 << 20):
-                digest.update(block)
-        found[str(path)] = digest.hexdigest()
-    return found
-
-
-def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, Any]:
+def _contents(
+    result: IdentificationResult, truth: Truth | None, published: Published
+) -> dict[str, Any]:
     from markupsafe import Markup
 
-    residuals, summary = residuals_of(result), summary_of(result)
+    residuals, summary, budget = residuals_of(result), summary_of(result), gap_budget(result)
+    space = residual_space(result.model, result.observations, result.x, result.residual)
     verdict = [
         ("Identified", what_was_identified(result)),
         ("Prediction", how_well_it_predicts(result)),
@@ -111,13 +99,11 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
     ]
     if truth:
         verdict.append(("Truth", coverage_line(result, truth)))
-    names = dict.fromkeys([result.model.chain.name, result.model.cell.name])
+    figures = identification_figures.drawn_for(result, residuals, summary, budget, space)
     return {
-        "title": printable(" – ".join(name for name in names if name)),
-        "css": Markup(resource("style.css")),
-        "version": __version__,
-        "environment": software(),
+        "judgement": judgement(result),
         "compared": truth is not None,
+        "published": bool(published),
         "lopsided": any_lopsided((*result.estimates, *result.combinations)),
         "verdict": verdict,
         "readings": readings(result),
@@ -127,7 +113,9 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
         **_noise(result, summary),
         "error_line": _sentence(error_line(result)),
         "warnings": [printable(w) for w in result.warnings],
-        "parameters": parameter_rows(result, truth),
+        "budget": None if budget is None else budget_table(budget),
+        "floor": _floor(budget),
+        "parameters": parameter_rows(result, truth, published),
         "combinations": combination_rows(result, truth),
         "endless": _endless(result),
         "undetermined": [_sentence(line) for line in undetermined_lines(result)],
@@ -138,11 +126,29 @@ def _contents(result: IdentificationResult, truth: Truth | None) -> dict[str, An
         "excluded": [_faulty(o) for o in result.excluded],
         "most_faulty": MOST_FAULTY,
         "n_markers": len(residuals.markers),
-        "figures": {
-            name: Markup(svg) for name, svg in _figures(result, residuals, summary).items()
-        },
-        **_thinning(residuals),
+        "residual_table": residual_table(result.observations, residuals),
+        "view": space_json(space),
+        "view_caption": view_caption(space, len(residuals.labels)),
+        "time_caption": _time_caption(result),
+        "figures": {name: Markup(svg) for name, svg in figures.items()},
+        **_thinning(result, residuals),
     }
+
+
+def _floor(budget: Budget | None) -> str:
+    if budget is None or budget.floor is None:
+        return "Nothing says how large the noise alone is."
+    return f"The dashed line is what noise alone gives ({budget.floor_name})."
+
+
+def _time_caption(result: IdentificationResult) -> str:
+    text = (
+        "{}; lines are means with twice their standard error. A slope is a drift, a step something "
+        "that moved."
+    )
+    if result.observations.table.time is None:
+        return text.format("In the order of the table, which has no column time_s or time_min")
+    return text.format("Over time")
 
 
 def _endless(result: IdentificationResult) -> str:
@@ -174,29 +180,10 @@ def _held_out_scatter(summary: ResidualSummary | None) -> str:
     return f"In held-out configurations the scatter is {size} times that of the noise model."
 
 
-def _figures(
-    result: IdentificationResult, residuals: Residuals, summary: ResidualSummary | None
-) -> dict[str, str]:
-    from elastocal.report import figures, noise_figures
-
-    distribution = {} if summary is None else {
-        "histogram": noise_figures.histogram(summary),
-        "scores": noise_figures.scores(summary),
-        "groups": noise_figures.scatter_by_group(summary),
-        "histograms": noise_figures.histograms_by_group(summary),
-    }  # fmt: skip
-    return {
-        **distribution,
-        "errors": figures.errors(result),
-        "held_out": figures.held_out(result, residuals),
-        "by_configuration": figures.by_configuration(residuals),
-        "against_joints": figures.against_joints(result, residuals),
-    }
-
-
-def _thinning(residuals: Residuals) -> dict[str, str]:
+def _thinning(result: IdentificationResult, residuals: Residuals) -> dict[str, str]:
     """Sentences on how many readings the scatter plots show, empty where it is all."""
     from elastocal.report.figures import MOST_JOINT_DOTS
+    from elastocal.report.place_figures import MOST_PARAMETERS
 
     total = len(residuals.value)
     shown = len(residuals.shown)
@@ -204,6 +191,11 @@ def _thinning(residuals: Residuals) -> dict[str, str]:
     text = " Dots are a random choice of {} of {} readings; everything else uses all of them."
     return {
         "thinned": text.format(shown, total) if shown < total else "",
+        "thinned_matrix": (
+            f" The {MOST_PARAMETERS} of {len(result.determined)} that correlate most."
+            if len(result.determined) > MOST_PARAMETERS
+            else ""
+        ),
         "thinned_joints": text.format(in_joints, total) if in_joints < total else "",
     }
 
@@ -220,12 +212,3 @@ def _faulty(o: Outlier) -> dict[str, str]:
 
 def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}."
-
-
-def software() -> str:
-    versions = [f"{name} {metadata.version(name)}" for name in LIBRARIES]
-    return ", ".join([f"Python {platform.python_version()}", *versions])
-
-
-def resource(name: str) -> str:
-    return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")

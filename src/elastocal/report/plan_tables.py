@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from elastocal.design.plan import Plan
-from elastocal.design.reasons import Predicted, Reason
 from elastocal.report.console_table import titled
-from elastocal.report.units import display, significant
+from elastocal.report.page import Table
+from elastocal.report.plan_rows import curve_rows, interval_rows, pose_rows, reason_rows
 from elastocal.report.words import printable
 
-TOLD = 2  # parameters that a pose serves, in the table
 WIDE = 110  # columns, from which on the reasons stand beside the poses
-SERVES = "serves (standard deviation without it)"
 
 
 def print_plan(console: Console, plan: Plan) -> None:
@@ -35,7 +30,7 @@ def print_plan(console: Console, plan: Plan) -> None:
         console.print(Text.assemble((f"{label}: ", style), text))
 
 
-def _narrow_poses(console: Console, plan: Plan) -> Table:
+def _narrow_poses(console: Console, plan: Plan) -> RichTable:
     """The poses with as many decimals as there is room for; plan.csv has all of them."""
     room = console.options.update(max_width=WIDE)
     for decimals in (2, 1):
@@ -45,82 +40,36 @@ def _narrow_poses(console: Console, plan: Plan) -> Table:
     return pose_table(plan, reasons=False, decimals=0)
 
 
-def pose_table(plan: Plan, reasons: bool = True, decimals: int = 2) -> Table:
+def pose_table(plan: Plan, reasons: bool = True, decimals: int = 2) -> RichTable:
     """Joint values, load, place in the order of execution, and what the pose is there for."""
-    table = titled("Poses")
-    table.add_column("pose", justify="right")
-    for i, kind in enumerate(plan.model.chain.kinds):
-        unit = "°" if kind == "revolute" else "mm"
-        table.add_column(f"q{i + 1} {unit}", justify="right", overflow="fold")
-    if len(plan.forces) > 1 and (plan.load >= 0).any():
-        table.add_column("load N", justify="right")
-    table.add_column("order", justify="right")
-    if reasons:
-        table.add_column(SERVES, overflow="fold")
-    order = {stop.pose: k + 1 for k, stop in reversed(list(enumerate(plan.execution.stops)))}
-    for k, reason in enumerate(plan.reasons):
-        row = [str(k + 1)]
-        for value, kind in zip(plan.q[k], plan.model.chain.kinds, strict=True):
-            shown = np.degrees(value) if kind == "revolute" else value * 1e3
-            row.append(f"{shown:.{decimals}f}")
-        if len(plan.forces) > 1 and (plan.load >= 0).any():
-            row.append(" ".join(f"{f:g}" for f in plan.forces[plan.load[k]]))
-        row += [str(order[k]), *([served(reason)] if reasons else [])]
-        table.add_row(*map(Text, row))
-    return table
+    return _printed("Poses", pose_rows(plan, reasons, decimals))
 
 
-def reason_table(plan: Plan) -> Table:
+def reason_table(plan: Plan) -> RichTable:
     """What each pose is there for."""
-    table = titled("Why each pose")
-    table.add_column("pose", justify="right")
-    table.add_column(SERVES, overflow="fold")
-    for k, reason in enumerate(plan.reasons):
-        table.add_row(str(k + 1), Text(served(reason)))
-    return table
+    return _printed("Why each pose", reason_rows(plan))
 
 
-def served(reason: Reason) -> str:
-    """The parameters that a pose serves most: "joint3.compliance +38 %"."""
-    parts = [
-        f"{printable(name)} {'lost' if math.isinf(growth) else f'+{100 * (growth - 1):.0f} %'}"
-        for name, growth in reason.serves[:TOLD]
-    ]
-    return ", ".join(parts) or "all a little"
-
-
-def interval_table(plan: Plan) -> Table:
+def interval_table(plan: Plan) -> RichTable:
     """Predicted half widths of the 95 % intervals."""
-    table = titled("Predicted intervals")
-    table.add_column("parameter", overflow="fold")
-    table.add_column("± 95 %", justify="right")
-    table.add_column("unit")
-    if any(p.combined_with for p in plan.predicted):
-        table.add_column("together with", overflow="fold")
-    for p in plan.predicted:
-        shown, unit = display(p.half_width, p.unit)
-        row = [printable(p.name), significant(shown, 2), unit]
-        if len(table.columns) > 3:
-            row.append(_partners(p))
-        table.add_row(*map(Text, row))
-    return table
+    return _printed("Predicted intervals", interval_rows(plan))
 
 
-def _partners(p: Predicted) -> str:
-    names = [printable(name) for name in p.combined_with]
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-def curve_table(plan: Plan) -> Table:
+def curve_table(plan: Plan) -> RichTable:
     """The criterion against the number of poses."""
-    table = titled("Number of poses")
-    table.add_column("poses", justify="right")
-    table.add_column(f"{plan.criterion} {plan.unit}".strip(), justify="right")
-    table.add_column("best possible on the pool", justify="right")
-    for point in plan.curve:
-        bound = "–" if point.bound is None else f"{point.bound:.4g}"
-        table.add_row(str(point.poses), f"{point.value:.4g}", bound)
-    return table
+    return _printed("Number of poses", curve_rows(plan))
+
+
+def _printed(title: str, table: Table) -> RichTable:
+    """For the terminal: joints and words may wrap, other numbers may not."""
+    shown = titled(title)
+    for k, head in enumerate(table.heads):
+        wraps = (k in table.words and head != "unit") or head.startswith("q")
+        shown.add_column(head, justify="left" if k in table.words else "right",
+                         overflow="fold" if wraps else "ellipsis")  # fmt: skip
+    for row in table.rows:
+        shown.add_row(*map(Text, row))
+    return shown
 
 
 def plan_lines(plan: Plan) -> list[tuple[str, str]]:

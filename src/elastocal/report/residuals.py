@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from elastocal.identification.noise import weights_for
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
 from elastocal.identification.result import IdentificationResult
-from elastocal.manipulator.observation import COMPONENTS
+from elastocal.manipulator.observation import COMPONENTS, Observations
 
 Array = NDArray[np.float64]
 
@@ -43,9 +43,13 @@ class Residuals:
 
 
 def residuals_of(result: IdentificationResult) -> Residuals:
-    seen = result.observations
+    return residuals_by(result.observations, result.residual)
+
+
+def residuals_by(seen: Observations, residual: Array) -> Residuals:
+    """Residuals (rows,) in m (rad) by observation."""
     table = seen.table
-    value = result.residual.reshape(-1, seen.size) * 1e6
+    value = residual.reshape(-1, seen.size) * 1e6
     names = COMPONENTS[seen.kind]
     codes, first, pose = np.unique(seen.configuration, return_index=True, return_inverse=True)
     order = np.argsort(first)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from elastocal.identification.result import (
@@ -12,9 +12,12 @@ from elastocal.identification.result import (
     Estimate,
     IdentificationResult,
 )
+from elastocal.report.gap_budget import Budget
+from elastocal.report.page import Table
 from elastocal.report.units import (
     display,
     estimate,
+    length,
     plain,
     resolution,
     rounded_alike,
@@ -60,6 +63,8 @@ class Row:
     note: str = ""
     whole: str = ""
     bar: Bar | None = None
+    effect: str = ""
+    published: str = ""
 
     @property
     def interval(self) -> str:
@@ -67,9 +72,17 @@ class Row:
         return signed_half(self.half)
 
 
-def parameter_rows(result: IdentificationResult, truth: Truth | None) -> list[Row]:
-    """One row per parameter, all of them, in the model's order."""
+def parameter_rows(
+    result: IdentificationResult,
+    truth: Truth | None,
+    published: Mapping[str, tuple[float, float]] | None = None,
+) -> list[Row]:
+    """One row per parameter, all of them, in the model's order.
+
+    `published`: values and half widths (SI) that others found, by name.
+    """
     rows = []
+    effects = {p.name: p.effect.replace("_", " ") for p in result.model.parameters}
     for e in result.estimates:
         true = None if truth is None else truth.get(e.name)
         value, half, unit, known = texts(e, true)
@@ -79,10 +92,36 @@ def parameter_rows(result: IdentificationResult, truth: Truth | None) -> list[Ro
             Row(
                 printable(e.name), e.identifiable, minus(value), minus(half), unit, minus(known),
                 inside(true, e.ci95), shown, minus(short_note(result, e)),
-                bar=_bar(e, true, nominal, truth is not None),
+                bar=_bar(e, true, nominal, truth is not None), effect=effects[e.name],
+                published=_published((published or {}).get(e.name), e.unit),
             )
         )  # fmt: skip
     return rows
+
+
+def _published(found: tuple[float, float] | None, unit: str) -> str:
+    """ "0.287 ± 0.003", in the unit of the row."""
+    if found is None:
+        return "–"
+    value, half, _ = estimate(*found, unit)
+    return f"{minus(value)} ± {half}"
+
+
+def budget_table(budget: Budget) -> Table:
+    """The steps with their intervals and what each changes; noise alone last."""
+    rows: list[tuple[str, ...]] = []
+    before: float | None = None
+    for step in budget.steps:
+        change = "" if before is None else signed_change(step.rms - before)
+        rows.append((step.name, length(step.rms), " to ".join(map(length, step.ci95)), change))
+        before = step.rms
+    if budget.floor is not None:
+        rows.append((budget.floor_name, length(budget.floor), "", ""))
+    return Table(("model", "held-out rms", "95 %", "change"), rows)
+
+
+def signed_change(change: float) -> str:
+    return f"{'−' if change < 0 else '+'}{length(abs(change))}"
 
 
 def combination_rows(result: IdentificationResult, truth: Truth | None) -> list[Row]:

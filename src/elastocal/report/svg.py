@@ -19,10 +19,12 @@ if TYPE_CHECKING:
 # Stand-ins that the page's style sheet replaces by colours for light and dark, screen and print.
 INK, GRID, FAINT = "#010203", "#010204", "#010205"
 SERIES = ("#010206", "#010207", "#010208", "#010209", "#01020a", "#01020b")
+ARM = "#01020c"
 _VARIABLES = {
     INK: "var(--ink)",
     GRID: "var(--grid)",
     FAINT: "var(--faint)",
+    ARM: "var(--arm)",
     **{colour: f"var(--series{k + 1})" for k, colour in enumerate(SERIES)},
 }
 _STYLE: dict[str, Any] = {

@@ -1,0 +1,126 @@
+"""Can this calibration be trusted?  A judgement in one sentence, and what to do next."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from scipy import stats
+
+from elastocal.identification.result import IdentificationResult
+from elastocal.report.noise import LACK_OF_FIT
+from elastocal.report.units import length, significant
+from elastocal.report.verdict import FLATTERS, counted
+from elastocal.report.words import ABSORBED, INVISIBLE, names_of
+
+Tone = Literal["good", "care", "poor"]
+WORSE = 1.5  # test data this much worse than held-out poses lie where the calibration was not made
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """`tone`: good (use it), care (use it knowing what is wrong), poor (do not use it)."""
+
+    tone: Tone
+    headline: str
+    steps: tuple[str, ...]
+
+
+def judgement(result: IdentificationResult) -> Judgement:
+    """How good the calibration is and what follows from it."""
+    if (why := _spoilt(result)) is not None:
+        return Judgement("poor", f"Do not use this calibration: {why}.", _steps(result, False))
+    told = _accuracy(result)
+    if doubts := _doubts(result):
+        text = f"Use this calibration with care: {told}, but {'; and '.join(doubts)}."
+        return Judgement("care", text, _steps(result, False))
+    noise = ", and the residual is noise" if result.noise.get("ratio_to_stated") else ""
+    text = f"This calibration can be trusted: {told}{noise}."
+    return Judgement("good", text, _steps(result, True))
+
+
+def _spoilt(result: IdentificationResult) -> str | None:
+    """What makes the result worthless; None where nothing does."""
+    if not result.converged:
+        return f"the fit did not converge ({result.reason})"
+    held, nominal = result.heldout_rms, result.nominal_rms
+    if math.isfinite(held) and math.isfinite(nominal) and held >= nominal:
+        return (
+            f"unseen poses are predicted to {length(held)} rms, and the nominal arm does as well "
+            f"({length(nominal)})"
+        )
+    return None
+
+
+def _accuracy(result: IdentificationResult) -> str:
+    what = {"deflection": "deflections", "distance": "distances"}.get(
+        result.observations.kind, "positions"
+    )
+    if not math.isfinite(result.heldout_rms):
+        return f"it reproduces the {what} that were fitted to {length(result.residual_rms)} rms"
+    text = f"{what} in poses that were not fitted are predicted to {length(result.heldout_rms)} rms"
+    gain = result.nominal_rms / result.heldout_rms if result.heldout_rms > 0 else math.inf
+    if math.isfinite(gain):
+        text += f", {significant(gain, 2)} times better than by the nominal arm"
+    return text
+
+
+def larger_than_noise(result: IdentificationResult) -> float | None:
+    """Residual over stated noise where chance does not explain the excess; else None."""
+    ratio = result.noise.get("ratio_to_stated")
+    if ratio is None or ratio <= math.sqrt(stats.chi2.ppf(0.975, result.dof) / result.dof):
+        return None
+    return float(ratio)
+
+
+def lacks_fit(result: IdentificationResult) -> bool:
+    """Whether configurations scatter more than the repeats of one explain."""
+    found = result.noise.get("lack_of_fit")
+    return found is not None and float(found["p"]) < LACK_OF_FIT
+
+
+def _doubts(result: IdentificationResult) -> list[str]:
+    doubts = []
+    held = result.heldout_rms
+    if not math.isfinite(held) and result.test is None:
+        doubts.append(
+            "how well it predicts other poses is not known: some pose alone determines a parameter"
+        )
+    if (ratio := larger_than_noise(result)) is not None:
+        doubts.append(f"the residual is {significant(ratio)} times the stated noise")
+    if lacks_fit(result):
+        doubts.append("configurations scatter more than repeats of one explain")
+    if math.isfinite(held) and held > FLATTERS * result.residual_rms:
+        doubts.append(f"unseen poses are worse than fitted ones ({length(result.residual_rms)})")
+    if result.test is not None and result.test.rms > WORSE * held:
+        doubts.append(f"test data are off by {length(result.test.rms)} rms")
+    return doubts
+
+
+def _steps(result: IdentificationResult, fine: bool) -> tuple[str, ...]:
+    steps = []
+    if larger_than_noise(result) is not None or lacks_fit(result):
+        steps.append("Ask what the model lacks: elastocal diagnose with the same cell and data.")
+    held, few = result.heldout_rms, result.heldout_rms > FLATTERS * result.residual_rms
+    if not math.isfinite(held) or few:
+        steps.append("Measure more poses: elastocal design --augment plans what these data lack.")
+    if n := len(result.faulty):
+        verb = "lies" if n == 1 else "lie"
+        steps.append(
+            f"Look at the {counted(n, 'reading')} that {verb} beyond the noise (Faulty readings)."
+        )
+    hidden = len(names_of(result, INVISIBLE)) + len(names_of(result, ABSORBED))
+    if hidden:
+        steps.append(
+            f"{counted(hidden, 'parameter')} cannot be had from these data (What is not "
+            "determined). Poses and loads like those measured are predicted all the same; for "
+            "others, measure what shows them."
+        )
+    if result.test is None:
+        steps.append(
+            "Prove it: measure some poses that take no part in the fit, and give them with --test."
+        )
+    if fine:
+        steps.append("Use it where poses and loads are like those measured.")
+    return tuple(steps)

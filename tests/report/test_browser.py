@@ -1,0 +1,254 @@
+"""The pages in a browser: drawn without a complaint or a request, sorted, saved, dark and printed.
+
+Without a Chromium (on the path, or playwright's own) there is nothing to test with.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.cells import kr270_cell, kr270_chain
+from support.diagnoses import EXPLAINED, HOSTILE
+
+from elastocal.cell import Tracker
+from elastocal.cell_design import DesignSpec
+from elastocal.design.design import design
+from elastocal.design.options import DesignOptions
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.manipulator.model import Model
+from elastocal.report.diagnosis_page import diagnosis_page
+from elastocal.report.html import report_page
+from elastocal.report.plan_page import plan_page
+from elastocal.tracker_noise import CartesianNoise
+
+playwright = pytest.importorskip("playwright.sync_api")
+
+# WebGL by software, where there is no graphics card; a container's root has no sandbox.
+ARGUMENTS = ("--no-sandbox", "--no-first-run", "--disable-background-networking",
+             "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # fmt: skip
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+PATIENCE = 120_000  # ms until a page must have drawn; software rendering may be slow
+KINDS = ("identification", "diagnosis", "plan")
+LIGHT, DARK = 0.8, 0.2  # luminance of a page's paper
+
+
+@dataclass
+class Opened:
+    """A page with all that it complained of and asked for."""
+
+    page: Any
+    file: Path
+    complaints: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
+        own = started.chromium.executable_path
+        found = next(filter(None, map(shutil.which, NAMES)), own)
+        if not Path(found).exists():
+            pytest.skip(f"no Chromium: none of {', '.join(NAMES)} on the path, nor {own}")
+        running = started.chromium.launch(executable_path=found, args=list(ARGUMENTS))
+        yield running
+        running.close()
+
+
+@pytest.fixture(scope="module")
+def texts(hostile: Any) -> dict[str, str]:
+    seen = hostile.result.observations
+    model = hostile.result.model
+    base = Baseline(model, seen, hostile.result.x, np.ones(len(model.names)),
+                    hostile.result.residual, hostile.result.residual, None)  # fmt: skip
+    arm = Model(kr270_chain(), kr270_cell(("base_frame",)))
+    spec = DesignSpec(poses=4, loads=np.array([[0, 0, 0], [0, 0, -2600.0]]), candidates=30)
+    cell = kr270_cell(["joint_compliance"], observe="deflection")
+    cell = replace(cell, tracker=Tracker(noise=CartesianNoise(np.full(3, 1e-5))), design=spec)
+    planned = design(cell, DesignOptions(effort="quick"))
+    return {
+        "identification": report_page(hostile.result, command="elastocal identify"),
+        "diagnosis": diagnosis_page(replace(EXPLAINED, calibrated=base), arm, HOSTILE),
+        "plan": plan_page(planned),
+    }
+
+
+@pytest.fixture(scope="module")
+def opened(
+    browser: Any, texts: dict[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Opened]:
+    """Every page, open and drawn."""
+    folder = tmp_path_factory.mktemp("pages")
+    return {kind: show(browser, folder / f"{kind}.html", text) for kind, text in texts.items()}
+
+
+def show(browser: Any, file: Path, text: str) -> Opened:
+    file.write_text(text, encoding="utf-8")
+    page = browser.new_page(viewport={"width": 1100, "height": 800})
+    found = Opened(page, file)
+
+    def heard(message: Any) -> None:
+        # What the graphics driver says of its speed is not the page's business.
+        if message.type in ("error", "warning") and "GL Driver Message" not in message.text:
+            found.complaints.append(message.text)
+
+    page.on("console", heard)
+    page.on("pageerror", lambda error: found.complaints.append(str(error)))
+    page.on("dialog", lambda dialog: (found.complaints.append("dialog"), dialog.dismiss()))
+    page.on("request", lambda request: found.requests.append(request.url))
+    page.goto(file.as_uri())
+    page.wait_for_selector("html.ready", state="attached", timeout=PATIENCE)
+    return found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_complaint_and_no_request(opened: dict[str, Opened], kind: str) -> None:
+    found = opened[kind]
+    mild = [text for text in found.complaints if "willReadFrequently" not in text]
+    assert mild == []
+    assert [url for url in found.requests if not url.startswith("blob:")] == [found.file.as_uri()]
+    assert found.file.stat().st_size < 6e6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_figure_is_drawn(opened: dict[str, Opened], kind: str) -> None:
+    page = opened[kind].page
+    page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+    boxes = page.evaluate(
+        """[...document.querySelectorAll('figure')].map(figure => {
+          const shown = [...figure.querySelectorAll('.still > svg, .plot, figure > svg, svg')]
+            .map(e => e.getBoundingClientRect()).filter(b => b.width > 0 && b.height > 0);
+          return shown.length ? Math.max(...shown.map(b => b.height)) : 0;
+        })"""
+    )
+    assert len(boxes) >= 3
+    assert min(boxes) > 50
+    assert page.locator("figure.view.drawn").count() == 1
+    traces = page.evaluate(
+        """(() => { const plot = document.querySelector('.plot');
+          return plot.data.map(t => [t.name, t.x.filter(Number.isFinite).length]); })()"""
+    )
+    sizes = dict(traces)
+    assert sizes["arm"] > 100 and sizes["markers"] >= 1
+    assert ("residuals" in sizes) == (kind != "plan")
+    canvas = page.locator(".plot canvas").first.bounding_box()
+    assert canvas["width"] > 300 and canvas["height"] > 200
+
+
+def test_another_pose_moves_arm_and_arrows(opened: dict[str, Opened]) -> None:
+    page = opened["identification"].page
+    before = page.evaluate("[...document.querySelector('.plot').data].map(t => t.x[0])")
+    told = page.locator(".controls output").inner_text()
+    first = page.locator("select.pose").input_value()
+    other = "0" if first != "0" else "1"
+    page.select_option("select.pose", other)
+    after = page.evaluate("[...document.querySelector('.plot').data].map(t => t.x[0])")
+    assert before != after
+    assert page.locator(".controls output").inner_text() != told
+    assert "arrows drawn" in told
+    page.select_option("select.pose", first)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_tables_are_filled_and_sorted_by_click_and_key(
+    opened: dict[str, Opened], kind: str
+) -> None:
+    page = opened[kind].page
+    counts = page.evaluate(
+        """[...document.querySelectorAll('table.data')].map(t =>
+          [t.dataset.name, t.querySelectorAll('tbody tr:not(.group) td:first-child').length])"""
+    )
+    assert counts and all(n > 0 for _, n in counts)
+    name = {"identification": "residuals", "diagnosis": "candidates", "plan": "poses"}[kind]
+    column = {"identification": 3, "diagnosis": 2, "plan": 1}[kind]
+    table = page.locator(f"table[data-name='{name}']")
+    page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+    head, button = table.locator("th[scope=col]").nth(column), table.locator("button").nth(column)
+    cells = table.locator(f"tbody tr:not(.group) td:nth-child({column + 1})")
+    initial = cells.all_inner_texts()
+    button.click()
+    assert head.get_attribute("aria-sort") == "ascending"
+    numbers = [float(t.replace("−", "-")) for t in cells.all_inner_texts() if t]
+    assert numbers == sorted(numbers) and len(set(numbers)) > 1
+    button.focus()
+    page.keyboard.press("Enter")
+    assert head.get_attribute("aria-sort") == "descending"
+    numbers = [float(t.replace("−", "-")) for t in cells.all_inner_texts() if t]
+    assert numbers == sorted(numbers, reverse=True)
+    page.keyboard.press("Enter")
+    assert head.get_attribute("aria-sort") == "none"
+    assert cells.all_inner_texts() == initial
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_table_saved_as_csv_has_its_rows(opened: dict[str, Opened], kind: str) -> None:
+    page = opened[kind].page
+    name = {"identification": "left-out", "diagnosis": "budget", "plan": "predicted"}[kind]
+    table = page.locator(f"table[data-name='{name}']")
+    shown = [
+        row.locator("td").all_inner_texts() for row in table.locator("tbody tr:not(.group)").all()
+    ]
+    with page.expect_download() as download:
+        page.get_by_label(f"Save the table {name} as CSV").click()
+    assert download.value.suggested_filename == f"{name}.csv"
+    text = Path(download.value.path()).read_text(encoding="utf-8-sig")
+    heads, *rows = csv.reader(io.StringIO(text))
+    assert heads == table.locator("th[scope=col]").all_inner_texts()
+    expected = [[" ".join(cell.split()).replace("−", "-") for cell in row] for row in shown]
+    assert [[cell.replace("−", "-") for cell in row] for row in rows] == expected
+
+
+def test_names_with_markup_stay_text(opened: dict[str, Opened]) -> None:
+    for kind in ("identification", "diagnosis"):
+        page = opened[kind].page
+        assert "<script>alert(1)</script>" in page.locator("body").inner_text()
+        traces = page.evaluate(
+            "document.querySelector('.plot').data.find(t => t.name === 'markers').text.join()"
+        )
+        assert "<" not in traces and "&lt;script>" in traces
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_dark_print_and_narrow(opened: dict[str, Opened], kind: str) -> None:
+    page = opened[kind].page
+    try:
+        assert paper(page) > LIGHT
+        light = page.evaluate("document.querySelector('.plot').layout.font.color")
+        page.emulate_media(color_scheme="dark")
+        assert paper(page) < DARK
+        page.wait_for_function(
+            "was => document.querySelector('.plot').layout.font.color !== was", arg=light
+        )
+        page.emulate_media(color_scheme="dark", media="print")
+        assert paper(page) > LIGHT
+        assert page.locator(".still").is_visible() and not page.locator(".live").is_visible()
+        page.emulate_media(color_scheme="light", media="screen")
+        assert page.locator(".live").is_visible() and not page.locator(".still").is_visible()
+        page.set_viewport_size({"width": 400, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400
+    finally:
+        page.emulate_media(color_scheme="light", media="screen")
+        page.set_viewport_size({"width": 1100, "height": 800})
+
+
+def paper(page: Any) -> float:
+    """Luminance of the page's background, 0 to 1."""
+    text = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    red, green, blue = (int(v) for v in text.strip("rgb()").split(",")[:3])
+    return (0.2126 * red + 0.7152 * green + 0.0722 * blue) / 255
+
+
+def test_without_script_everything_else_is_there(browser: Any, opened: dict[str, Opened]) -> None:
+    context = browser.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto(opened["identification"].file.as_uri())
+    assert page.locator(".still svg").is_visible()
+    assert page.locator("table[data-name='parameters'] td").first.is_visible()
+    context.close()
