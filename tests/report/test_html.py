@@ -41,8 +41,16 @@ def test_structure(page: str) -> None:
     structure = Page(page)
     structure.check_harmless(page)
     assert page.count("<figure") == page.count("</figure>") == 13
-    for heading in ("Where the error goes", "Parameters", "Combinations", "What is not determined",
-                    "Residuals", "Correlations over 0.9", "Faulty readings", "To repeat this"):  # fmt: skip
+    for heading in (
+        "Where the error goes",
+        "Parameters",
+        "Combinations",
+        "What is not determined",
+        "Correlations over 0.9",
+        "Residuals",
+        "Faulty readings",
+        "To repeat this",
+    ):
         assert heading in structure.text
     assert "elastocal identify c.toml d.csv" in structure.text
     assert "engine" in structure.named_rows()

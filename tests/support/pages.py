@@ -1,4 +1,4 @@
-"""A report page as its parts: tags, text, table rows, scripts; complains where tags do not match."""
+"""A report page as its parts: tags, text, table rows, scripts; tags have to match."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def rms_with_interval(
 
 
 def resampled_rms(
-    squares: Array, count: NDArray[np.integer], rng: np.random.Generator
+    squares: NDArray, count: NDArray, rng: np.random.Generator
 ) -> tuple[float, tuple[float, float]]:
     """The rms √(Σ squares / Σ count) of configurations (C,) and its 95 % interval, by weights that
     a Dirichlet distribution draws for them (the Bayesian bootstrap)."""

@@ -69,7 +69,9 @@ def gap_budget(result: IdentificationResult) -> Budget | None:
     return Budget(tuple(steps), *_floor(result))
 
 
-def _fitted(result: IdentificationResult, columns: NDArray[np.int64], held: Array) -> Array | None:
+def _fitted(
+    result: IdentificationResult, columns: NDArray[np.int64], held: NDArray[np.bool_]
+) -> Array | None:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
     model, seen = result.model, result.observations
     weights = weights_for(seen, model.cell.tracker, "auto")

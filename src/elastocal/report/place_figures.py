@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +122,7 @@ def correlation_matrix(result: IdentificationResult) -> str:
         for i in range(n):
             for j in range(i):
                 value = float(r[i, j])
-                look = {"hatch": "//////", "edgecolor": FAINT} if value < 0 else {}
+                look: dict[str, Any] = {"hatch": "//////", "edgecolor": FAINT} if value < 0 else {}
                 axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, linewidth=0,
                                          facecolor=SERIES[0] if value > 0 else SERIES[1],
                                          alpha=0.8 * abs(value), **look))  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from elastocal.design.plan import Plan
 from elastocal.report.svg import FAINT, SERIES, drawn
@@ -52,8 +52,9 @@ def removed(plan: Plan) -> str:
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for k, (name, n) in enumerate(rows):
-            look = {"facecolor": SERIES[2]} if name == "feasible" else {
-                "facecolor": "none", "edgecolor": FAINT, "hatch": "////"}  # fmt: skip
+            look: dict[str, Any] = {"facecolor": "none", "edgecolor": FAINT, "hatch": "////"}
+            if name == "feasible":
+                look = {"facecolor": SERIES[2]}
             axes.barh(k, n, height=0.62, **look)
             axes.annotate(f"{n}", (n, k), (5, 0), textcoords="offset points", va="center",
                           fontsize=8)  # fmt: skip
@@ -69,14 +70,14 @@ def removed(plan: Plan) -> str:
 def curve(plan: Plan) -> str:
     """The criterion of the best plan found against its number of poses, with its bound."""
     points = plan.curve
-    bounded = [s for s in points if s.bound is not None]
+    bounded = [(s.poses, s.bound) for s in points if s.bound is not None]
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot([s.poses for s in points], [s.value for s in points], "o-", color=SERIES[0],
                   markersize=6, label="best plan found")  # fmt: skip
         if bounded:
-            axes.plot([s.poses for s in bounded], [s.bound for s in bounded], "_--",
+            axes.plot([n for n, _ in bounded], [bound for _, bound in bounded], "_--",
                       color=SERIES[1], markersize=12,
                       label="no plan can be better (on the pool)")  # fmt: skip
         axes.set_xticks([s.poses for s in points])
