@@ -22,7 +22,12 @@ from elastocal.report.diagnosis_words import (
 )
 from elastocal.report.page import Inputs, Repeat, Table, render, title_of
 from elastocal.report.residual_rows import residual_table
-from elastocal.report.residual_space import marker_positions, residual_space, view_caption
+from elastocal.report.residual_space import (
+    marker_positions,
+    residual_space,
+    time_caption,
+    view_caption,
+)
 from elastocal.report.residuals import residuals_by
 from elastocal.report.space import space_json
 from elastocal.report.units import significant
@@ -125,12 +130,13 @@ def _residuals(d: Diagnosis) -> dict[str, Any]:
     """The residuals of the calibrated arm; no view where they are not known."""
     base = d.calibrated
     if base is None:
-        return {"view": None, "residual_table": None, "view_caption": ""}
+        return {"view": None, "residual_table": None, "view_caption": "", "time_caption": ""}
     residuals = residuals_by(base.seen, base.residual)
     space = residual_space(base.model, base.seen, base.x, base.residual)
     return {
         "view": space_json(space),
         "view_caption": view_caption(space, len(residuals.labels)),
+        "time_caption": time_caption(base.seen),
         "residual_table": residual_table(base.seen, residuals),
     }
 
@@ -167,7 +173,8 @@ def _figures(d: Diagnosis) -> dict[str, str]:
 
 
 def _residual_figures(d: Diagnosis) -> dict[str, str]:
-    from elastocal.report.place_figures import by_region
+    from elastocal.report.figures import against_joints
+    from elastocal.report.place_figures import by_region, over_time
     from elastocal.report.space_picture import space_picture
 
     base = d.calibrated
@@ -177,6 +184,8 @@ def _residual_figures(d: Diagnosis) -> dict[str, str]:
     positions = marker_positions(base.model, base.seen, base.x)
     space = residual_space(base.model, base.seen, base.x, base.residual)
     return {
+        "against_joints": against_joints(base.model.chain.kinds, residuals),
+        "over_time": over_time(base.seen, residuals),
         "by_region": by_region(positions, residuals.value[:, : residuals.positions]),
         "space": space_picture(space, "Residuals of the calibrated arm as arrows"),
     }

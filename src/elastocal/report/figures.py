@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -69,9 +70,8 @@ def _configuration_panel(axes: Axes, residuals: Residuals, k: int) -> None:
     _limit(axes, values, reach(residuals.value[:, alike]))
 
 
-def against_joints(result: IdentificationResult, residuals: Residuals) -> str:
-    """Residual over each joint's position, with the running mean of each direction."""
-    kinds = result.model.chain.kinds
+def against_joints(kinds: Sequence[str], residuals: Residuals) -> str:
+    """Residual over the position of each joint, of `kinds`, with the running mean by direction."""
     rows = -(-len(kinds) // 3)
     n = residuals.positions
     values = residuals.value[:, :n]

@@ -13,10 +13,11 @@ from elastocal.errors import ElastocalError
 from elastocal.identification.heldout import held_out_residual
 from elastocal.identification.noise import weights_for
 from elastocal.identification.result import IdentificationResult
+from elastocal.report.verdict import nominal_arm
 
 Array = NDArray[np.float64]
 
-STAGES = ("base frame", "geometry", "compliance")
+STAGES = ("", "geometry", "compliance")  # the first is the nominal arm
 MOST_NUMBERS = 30_000_000  # of a regressor held at once; larger tables get no budget
 STEPS, SETTLED = 4, 1e-3  # Gauss-Newton steps, and the relative gain that ends them
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
@@ -64,8 +65,8 @@ def gap_budget(result: IdentificationResult) -> Budget | None:
             continue
         residual = _fitted(result, np.flatnonzero(determined & (stage <= k)), stage > k)
         if residual is not None:
-            steps.append(_step(STAGES[k], result, residual, rng))
-    steps.append(_step(STAGES[last], result, result.held_out, rng))
+            steps.append(_step(STAGES[k] or nominal_arm(result), result, residual, rng))
+    steps.append(_step(STAGES[last] or nominal_arm(result), result, result.held_out, rng))
     return Budget(tuple(steps), *_floor(result))
 
 

@@ -24,7 +24,7 @@ from elastocal.report.noise import (
 )
 from elastocal.report.page import Inputs, Repeat, render, title_of
 from elastocal.report.residual_rows import residual_table
-from elastocal.report.residual_space import residual_space, view_caption
+from elastocal.report.residual_space import residual_space, time_caption, view_caption
 from elastocal.report.residuals import Residuals, residuals_of, summary_of
 from elastocal.report.rows import any_lopsided, budget_table, combination_rows, parameter_rows
 from elastocal.report.space import space_json
@@ -129,7 +129,7 @@ def _contents(
         "residual_table": residual_table(result.observations, residuals),
         "view": space_json(space),
         "view_caption": view_caption(space, len(residuals.labels)),
-        "time_caption": _time_caption(result),
+        "time_caption": time_caption(result.observations),
         "figures": {name: Markup(svg) for name, svg in figures.items()},
         **_thinning(result, residuals),
     }
@@ -139,16 +139,6 @@ def _floor(budget: Budget | None) -> str:
     if budget is None or budget.floor is None:
         return "Nothing says how large the noise alone is."
     return f"The dashed line is what noise alone gives ({budget.floor_name})."
-
-
-def _time_caption(result: IdentificationResult) -> str:
-    text = (
-        "{}; lines are means with twice their standard error. A slope is a drift, a step something "
-        "that moved."
-    )
-    if result.observations.table.time is None:
-        return text.format("In the order of the table, which has no column time_s or time_min")
-    return text.format("Over time")
 
 
 def _endless(result: IdentificationResult) -> str:

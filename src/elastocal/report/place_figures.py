@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.identification.result import IdentificationResult
+from elastocal.manipulator.observation import Observations
 from elastocal.report.figures import MOST_LABELS, WIDTH
 from elastocal.report.residuals import Residuals, reach, running_mean
 from elastocal.report.svg import FAINT, SERIES, dots, drawn
@@ -27,9 +28,9 @@ MOST_WRITTEN = 16  # parameters up to which the numbers are written into it
 STRONG = 0.9
 
 
-def over_time(result: IdentificationResult, residuals: Residuals) -> str:
+def over_time(seen: Observations, residuals: Residuals) -> str:
     """Residual of every reading over time, or over the table's order where no time was recorded."""
-    table, lead = result.observations.table, result.observations.lead
+    table, lead = seen.table, seen.lead
     n = residuals.positions
     if table.time is None:
         at, label = np.arange(len(lead), dtype=float), "reading, in the order of the table"

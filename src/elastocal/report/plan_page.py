@@ -90,14 +90,23 @@ def headline(plan: Plan) -> str:
     if found is None:
         return f"{text}; how far that is from the best, no bound says."
     away = 100 * (1 - found)
-    if away < 0.05:
-        return f"{text}; no plan from these candidates is better."
-    return f"{text}; no plan from these candidates is more than {away:.1f} % better (certified)."
+    text += "; no plan from these candidates is "
+    text += "better" if away < 0.05 else f"more than {away:.1f} % better"
+    if (beyond := _beyond(plan)) is not None:
+        return f"{text} (certified), but poses between them may be, by up to {beyond:.0f} %."
+    return f"{text} (certified)."
+
+
+def _beyond(plan: Plan) -> float | None:
+    """How much better (%) a plan from all of the joint space may be, where that is much."""
+    found = plan.certificate.efficiency_continuum
+    return None if found is None or found >= CLOSE else 100 * (1 - found)
 
 
 def _tone(plan: Plan) -> Tone:
     found = plan.certificate.efficiency_pool
-    return "good" if found is not None and found >= CLOSE and not plan.warnings else "care"
+    close = found is not None and found >= CLOSE and _beyond(plan) is None
+    return "good" if close and not plan.warnings else "care"
 
 
 def _steps(plan: Plan) -> list[str]:
@@ -106,6 +115,11 @@ def _steps(plan: Plan) -> list[str]:
         steps.append(
             "If ρ₀ is not small enough: --target finds the fewest poses that reach a value, "
             "--curve compares numbers of poses."
+        )
+    if _beyond(plan) is not None:
+        steps.append(
+            "For a better plan: more --candidates, or --effort thorough, which polishes poses "
+            "between them."
         )
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:

@@ -167,11 +167,17 @@ class View {
       found.push({ type: "mesh3d", name: "obstacles", ...mesh(d.things, [still]), ...flat,
         color: colour("faint"), opacity: 0.35, showlegend: true });
     }
-    const others = d.poses.filter((_, n) => n !== this.pose).map(p => p.line);
+    const others = d.poses.filter((_, n) => n !== this.pose);
     if (others.length) {
-      found.push({ type: "scatter3d", mode: "lines", name: "other poses", ...lines(others),
-        line: { color: colour("faint"), width: 1.5 }, opacity: d.arrows ? 0.25 : 0.6,
-        hoverinfo: "skip", visible: d.arrows ? "legendonly" : true });
+      found.push({ type: "scatter3d", mode: "lines", name: "other poses",
+        ...lines(others.map(p => p.line)), line: { color: colour("series1"), width: 3 },
+        opacity: 0.45, hoverinfo: "skip", visible: d.arrows ? "legendonly" : true });
+    }
+    if (!d.arrows) {
+      found.push({ type: "scatter3d", mode: "markers+text", name: "flange, by pose",
+        ...lines([d.poses.map(p => p.line.at(-1))]), text: d.poses.map(p => asText(p.name)),
+        textposition: "top center", textfont: { color: colour("ink"), size: 12 },
+        marker: { color: colour("series1"), size: 3.5 }, hoverinfo: "skip" });
     }
     found.push({ type: "scatter3d", mode: "lines", name: "markers to flange",
       ...lines(pose.markers.map(m => [pose.line.at(-1), m])), hoverinfo: "skip",
@@ -200,7 +206,7 @@ class View {
       range: this.data.range[AXES.indexOf(name)], autorange: false });
     return {
       scene: { xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "data",
-        camera: { eye: { x: 1.1, y: -1.35, z: 0.75 } }, uirevision: "kept" },
+        camera: { eye: { x: 0.85, y: -1.05, z: 0.5 }, center: { x: 0, y: 0, z: -0.12 } }, uirevision: "kept" },
       paper_bgcolor: "rgba(0,0,0,0)", font: { color: colour("ink"), size: 12 },
       margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "kept",
       legend: { orientation: "h", y: 0, x: 0, bgcolor: "rgba(0,0,0,0)" },

@@ -73,6 +73,17 @@ def view_caption(space: Space, configurations: int) -> str:
     return text
 
 
+def time_caption(seen: Observations) -> str:
+    """What the figure over time shows, and what it would mean."""
+    text = (
+        "{}; lines are means with twice their standard error. A slope is a drift, a step something "
+        "that moved."
+    )
+    if seen.table.time is None:
+        return text.format("In the order of the table, which has no column time_s or time_min")
+    return text.format("Over time")
+
+
 def _chosen(rms: Array, order: IntArray) -> IntArray:
     """The entries to show, in the table's order."""
     if len(rms) <= MOST_POSES:

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 ARROW = 0.12  # length of a long arrow over the reach of what is drawn
 LONG = 95.0  # percentile of the residuals that is drawn so long
+AROUND = 0.35  # of the arm's reach: how far obstacles are shown beyond it
 FAR = 1.2  # a tracker further off than this many extents would shrink the arm to a dot
 
 
@@ -62,10 +63,13 @@ class Space:
     @property
     def extent(self) -> Array:
         """Corners (2, 3) of the box around everything that is drawn, with room for arrows."""
-        points = [*(p.line for p in self.poses), *(p.markers for p in self.poses)]
-        points += [s.points for s in self.shells.around]
-        points += [] if self.tracker is None else [self.tracker[None]]
-        every = np.vstack(points)
+        every = np.vstack([points for p in self.poses for points in (p.line, p.markers)])
+        low, high = every.min(axis=0), every.max(axis=0)
+        room = AROUND * float((high - low).max())
+        # A hall's floor would shrink the arm to a dot.
+        near = [np.clip(s.points, low - room, high + room) for s in self.shells.around]
+        near += [] if self.tracker is None else [self.tracker[None]]
+        every = np.vstack([every, *near])
         low, high = every.min(axis=0), every.max(axis=0)
         room = 0.07 * float((high - low).max()) + 1e-3
         return np.stack([low - room, high + room])
@@ -104,10 +108,12 @@ def frames_at(
 def space_of(
     cell: Cell, chain: Chain, poses: Sequence[Posed], first: int = 0, what: str = "pose"
 ) -> Space:
-    """The poses with the bodies of the cell."""
+    """The poses with the bodies of the cell, and the tracker where it is known to stand near."""
     space = Space(tuple(poses), shells_of(cell, chain), None, first, what)
     low, high = space.extent
     at = cell.tracker.position
+    if not at.any():
+        return space  # the origin of its own data: most likely nobody said where it stands
     away = np.maximum(np.maximum(low - at, at - high), 0.0)
     near = float(np.linalg.norm(away)) < FAR * float((high - low).max())
     return Space(space.poses, space.shells, at if near else None, first, what)

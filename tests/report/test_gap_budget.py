@@ -1,0 +1,72 @@
+"""The gap budget of an identification: from the nominal arm down to what the fit leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.pages import Page
+
+from elastocal.report import gap_budget as module
+from elastocal.report.gap_budget import gap_budget
+from elastocal.report.rows import budget_table
+from elastocal.report.waterfall import waterfall
+
+SIGMA = 3e-5  # m, of the readings of `case`
+
+
+def test_budget_goes_from_the_nominal_arm_to_the_held_out_error(case: Any) -> None:
+    budget = gap_budget(case.result)
+    assert budget is not None
+    names = ["nominal arm (base and markers placed)", "geometry", "compliance"]
+    assert [step.name for step in budget.steps] == names
+    first, middle, last = (step.rms for step in budget.steps)
+    # The nominal arm of the result has base and markers placed by all readings; here the
+    # configuration in question is left out.
+    assert first == pytest.approx(case.result.nominal_rms, rel=0.5)
+    assert first > middle > last == pytest.approx(case.result.heldout_rms)
+    for step in budget.steps:
+        assert step.ci95[0] < step.rms < step.ci95[1]
+
+
+def test_floor_is_the_stated_noise_where_nothing_was_repeated(case: Any) -> None:
+    budget = gap_budget(case.result)
+    assert budget is not None and budget.floor is not None
+    assert budget.floor_name == "stated noise"
+    assert budget.floor == pytest.approx(np.sqrt(3) * SIGMA, rel=0.05)
+
+
+def test_floor_is_the_scatter_of_repeats_where_there_are_some(case: Any) -> None:
+    """Every reading twice, moved apart by ± d: the scatter of a pair is √2 d per coordinate."""
+    seen, d = case.result.observations, 7e-6
+    rows = np.repeat(np.arange(len(seen.table)), 2)
+    twice = replace(seen, table=seen.table.take(rows), lead=np.arange(len(rows)))
+    apart = np.tile([d, -d], len(rows) // 2)[:, None]
+    residual = (np.zeros((len(rows), 3)) + apart).ravel()
+    result = replace(case.result, observations=twice, residual=residual)
+    floor, name = module._floor(result)
+    assert name == "repeats alone"
+    assert floor == pytest.approx(np.sqrt(3 * 2) * d)
+
+
+def test_no_budget_where_a_configuration_cannot_be_left_out(
+    case: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held_out = case.result.held_out.copy()
+    held_out[:12] = np.inf
+    assert gap_budget(replace(case.result, held_out=held_out)) is None
+    monkeypatch.setattr(module, "MOST_NUMBERS", 10)
+    assert gap_budget(case.result) is None
+
+
+def test_table_and_figure_tell_the_same(case: Any) -> None:
+    budget = gap_budget(case.result)
+    assert budget is not None
+    rows = budget_table(budget).rows
+    assert [row[0] for row in rows] == [*(s.name for s in budget.steps), budget.floor_name]
+    steps = [(s.name, s.rms, s.ci95) for s in budget.steps]
+    text = Page(waterfall(steps, budget.floor, budget.floor_name)).text
+    for row in rows:
+        assert row[1] in text

@@ -1,0 +1,141 @@
+"""The posed arm of the 3-D views: where it stands, how long its arrows are, what a page holds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges
+
+from elastocal.cell import Tracker
+from elastocal.cell_workspace import Solid, Workspace
+from elastocal.design.feasibility.carriers import WORLD
+from elastocal.report import residual_space as residual_module
+from elastocal.report.arm_bodies import base_or_joint, shells_of, triangles_of
+from elastocal.report.residual_space import residual_space
+from elastocal.report.space import ARROW, Posed, frames_at, in_script, space_json, space_of
+
+TURNED = np.eye(4)
+TURNED[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+TURNED[:3, 3] = 1.0, -2.0, 0.5
+BALL = 4 / 3 * np.pi
+SOLIDS = {
+    "box": (np.array([0.5, 0.8, 1.2]), 0.48),
+    "sphere": (np.array([0.4]), BALL * 0.4**3),
+    "cylinder": (np.array([0.2, 3.0]), np.pi * 0.2**2 * 3.0),
+    "capsule": (np.array([0.15, 1.0]), np.pi * 0.15**2 * 1.0 + BALL * 0.15**3),
+}
+
+
+@pytest.mark.parametrize("shape", SOLIDS)
+def test_triangles_close_the_solid_from_outside(shape: Any) -> None:
+    size, volume = SOLIDS[shape]
+    points, faces = triangles_of(Solid(shape, shape, size, TURNED))
+    a, b, c = (points[faces[:, k]] - TURNED[:3, 3] for k in range(3))
+    # Divergence theorem: positive only where all triangles turn outwards.
+    enclosed = float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+    assert 0.85 * volume <= enclosed <= 1.0001 * volume
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there = {tuple(edge) for edge in edges.tolist()}
+    assert there == {(j, i) for i, j in there}
+    assert len(there) == len(edges)
+
+
+def test_arm_stands_where_the_kinematics_puts_it() -> None:
+    cell, chain = kr270_cell(), kr270_chain()
+    frames, flange = frames_at(cell, chain, TABLE_2)
+    assert flange == pytest.approx(nominal_flanges(chain, TABLE_2))
+    assert frames.shape == (len(TABLE_2), chain.n_joints + 1, 4, 4)
+    moved = TURNED @ flange
+    frames_moved, end = frames_at(cell, chain, TABLE_2, moved)
+    assert end == pytest.approx(moved)
+    assert frames_moved == pytest.approx(TURNED @ frames)
+    # A pose without equilibrium stands at its nominal place.
+    moved[3] = np.nan
+    assert frames_at(cell, chain, TABLE_2, moved)[1][3] == pytest.approx(flange[3])
+
+
+def test_bodies_reach_along_the_arm_and_obstacles_stay_outside_it() -> None:
+    cell = kr270_cell()
+    obstacle = Solid("crate", "box", np.array([0.5, 0.8, 1.2]), TURNED)
+    shells = shells_of(replace(cell, workspace=Workspace((obstacle,))), kr270_chain())
+    carriers = {base_or_joint(shell) for shell in shells.arm}
+    assert carriers >= {1, 2, 3}
+    (crate,) = shells.around
+    assert crate.carrier == WORLD
+    assert crate.points.mean(axis=0) == pytest.approx(TURNED[:3, 3])
+
+
+def posed(arrows: Any = None, at: Any = (0.5, 0.0, 1.0)) -> Posed:
+    chain = kr270_chain()
+    frames, flange = frames_at(kr270_cell(), chain, TABLE_2[:1])
+    return Posed("1", "", frames[0], flange[0], np.array([at]), ("M1",), arrows)
+
+
+@given(st.floats(1e-9, 1e-1))
+@settings(max_examples=25, deadline=None)
+def test_arrows_are_scaled_by_a_round_number_and_fit(size: float) -> None:
+    space = space_of(kr270_cell(), kr270_chain(), [posed(np.array([[size, 0.0, 0.0]]))])
+    digit = space.scale / 10.0 ** np.floor(np.log10(space.scale) + 1e-9)
+    assert round(digit, 6) in (1, 2, 5)
+    longest = ARROW * float(np.ptp(space.extent, axis=0).max())
+    assert 0.39 * longest <= size * space.scale <= 1.0001 * longest
+
+
+def test_tracker_is_shown_where_it_stands_near() -> None:
+    near, far = (replace(kr270_cell(), tracker=Tracker(np.array([x, 0.0, 1.0]))) for x in (3, 90))
+    assert space_of(near, kr270_chain(), [posed()]).tracker is not None
+    assert space_of(far, kr270_chain(), [posed()]).tracker is None
+
+
+@given(st.recursive(st.text() | st.integers(), lambda inner: st.lists(inner, max_size=3)))
+@settings(max_examples=60, deadline=None)
+def test_no_name_ends_the_script_that_holds_it(content: Any) -> None:
+    text = in_script([content, "</script><script>", "<!--", "]]>", "&amp;"])
+    assert not set("<>&") & set(text)
+    assert json.loads(text)[0] == content
+
+
+def test_arrows_are_mean_residuals_by_configuration_load_and_marker(case: Any) -> None:
+    result = case.result
+    space = residual_space(result.model, result.observations, result.x, result.residual)
+    seen = result.observations
+    table = seen.table
+    parts = result.residual.reshape(-1, 3)
+    loaded = (table.force[seen.lead] != 0).any(axis=1)
+    assert len(space.poses) == 2 * len(np.unique(seen.configuration))
+    pose = space.poses[1]
+    label, _, load = pose.name.partition(", ")
+    code = table.configuration_labels.index(label)
+    for name, marker, arrow in zip(pose.names, pose.markers, pose.arrows, strict=True):
+        own = (seen.configuration == code) & (loaded == (load != "unloaded"))
+        own &= table.marker[seen.lead] == table.marker_names.index(name)
+        assert arrow == pytest.approx(parts[own].mean(axis=0))
+        assert marker == pytest.approx(table.position[seen.lead][own].mean(axis=0))
+    # The arm ends where the model puts the flange.
+    row = seen.lead[(seen.configuration == code) & (loaded == (load != "unloaded"))][:1]
+    assert pose.flange == pytest.approx(result.model.flange_poses(table.take(row), result.x)[0])
+    sizes = [np.sqrt((p.arrows**2).sum(axis=1).mean()) for p in space.poses]
+    assert space.first == int(np.argmax(sizes))
+    content = json.loads(space_json(space))
+    assert len(content["poses"]) == len(space.poses)
+    assert content["scale"] == space.scale
+
+
+def test_of_many_poses_the_worst_are_kept(case: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = case.result
+    told = (result.model, result.observations, result.x, result.residual)
+    every = residual_space(*told)
+    monkeypatch.setattr(residual_module, "MOST_POSES", 6)
+    monkeypatch.setattr(residual_module, "WORST", 2)
+    few = residual_space(*told)
+    assert len(few.poses) == 6
+    assert few.poses[few.first].name == every.poses[every.first].name
+    assert [p.name for p in few.poses] == [
+        p.name for p in every.poses if p.name in {f.name for f in few.poses}
+    ]

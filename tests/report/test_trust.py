@@ -1,0 +1,72 @@
+"""The judgement: what spoils a calibration, what calls for care, and what to do then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from elastocal.identification.result import TestErrors
+from elastocal.report.trust import judgement
+
+
+@pytest.fixture(scope="module")
+def fine(case: Any) -> Any:
+    """A result that nothing speaks against."""
+    noise = {k: v for k, v in case.result.noise.items() if k != "lack_of_fit"}
+    return replace(
+        case.result,
+        noise=noise | {"ratio_to_stated": 1.0},
+        heldout_rms=1.05 * case.result.residual_rms,
+        converged=True,
+        excluded=(),
+        outliers=(),
+    )
+
+
+def test_what_nothing_speaks_against_can_be_trusted(fine: Any) -> None:
+    found = judgement(fine)
+    assert found.tone == "good"
+    assert found.headline.startswith("This calibration can be trusted: positions in poses that")
+    assert any("--test" in step for step in found.steps)
+    assert not any("diagnose" in step for step in found.steps)
+    tested = replace(fine, test=TestErrors(fine.heldout_rms, 0.0, 0.0, 9))
+    assert not any("--test" in step for step in judgement(tested).steps)
+
+
+def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
+    doubts = {
+        "times the stated noise": (
+            replace(fine, noise=fine.noise | {"ratio_to_stated": 2.0}), "diagnose"
+        ),
+        "scatter more than repeats": (
+            replace(fine, noise=fine.noise | {"lack_of_fit": {"p": 1e-5}}), "diagnose"
+        ),
+        "unseen poses are worse": (
+            replace(fine, heldout_rms=3 * fine.residual_rms), "--augment"
+        ),
+        "is not known": (replace(fine, heldout_rms=float("inf")), "--augment"),
+        "test data are off": (
+            replace(fine, test=TestErrors(2 * fine.heldout_rms, 0.0, 0.0, 9)), ""
+        ),
+    }  # fmt: skip
+    for text, (result, remedy) in doubts.items():
+        found = judgement(result)
+        assert found.tone == "care", text
+        assert text in found.headline
+        assert any(remedy in step for step in found.steps), text
+
+
+def test_what_is_no_better_than_nominal_must_not_be_used(fine: Any) -> None:
+    useless = judgement(replace(fine, heldout_rms=2 * fine.nominal_rms))
+    lost = judgement(replace(fine, converged=False, reason="100 steps"))
+    assert useless.tone == lost.tone == "poor"
+    assert "the nominal arm does as well" in useless.headline
+    assert "did not converge (100 steps)" in lost.headline
+
+
+def test_faulty_readings_are_pointed_at(fine: Any, hostile: Any) -> None:
+    steps = judgement(replace(fine, excluded=hostile.result.excluded)).steps
+    assert any("beyond the noise" in step for step in steps)
+    assert not any("beyond the noise" in step for step in judgement(fine).steps)
