@@ -26,7 +26,10 @@ def test_budget_goes_from_the_nominal_arm_to_the_held_out_error(case: Any) -> No
     # The nominal arm of the result has base and markers placed by all readings; here the
     # configuration in question is left out.
     assert first == pytest.approx(case.result.nominal_rms, rel=0.5)
-    assert first > middle > last == pytest.approx(case.result.heldout_rms)
+    assert first > 3 * middle
+    # The true compliances are the nominal ones: to fit them costs a little and buys nothing.
+    assert middle == pytest.approx(last, rel=0.1) and middle < last
+    assert last == pytest.approx(case.result.heldout_rms)
     for step in budget.steps:
         assert step.ci95[0] < step.rms < step.ci95[1]
 
