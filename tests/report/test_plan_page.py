@@ -1,0 +1,129 @@
+"""The report of a plan: its key figures, what removed candidates, harmless, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.cells import kr270_cell
+from support.design_commands import design as design_command
+from support.design_commands import everything_in, write_cell
+from support.pages import Page
+
+from elastocal.cell import Tracker
+from elastocal.cell_design import DesignSpec
+from elastocal.design.design import design
+from elastocal.design.options import DesignOptions
+from elastocal.design.plan import Certificate, SizePoint
+from elastocal.errors import InputError
+from elastocal.report import plan_page as module
+from elastocal.report.plan_page import headline, plan_page, plan_space, write_plan_report
+from elastocal.tracker_noise import CartesianNoise
+
+SCRIPT = "<script>alert(1)</script>"
+
+
+@pytest.fixture(scope="module")
+def plan() -> Any:
+    loads = np.array([[0, 0, 0], [0, 0, -2600.0]])
+    spec = DesignSpec(poses=4, loads=loads, candidates=30, levels={"joint2": (-0.5, -1.0)})
+    cell = kr270_cell(["joint_compliance"], observe="deflection")
+    markers = dict(zip([SCRIPT, "M2", "M3"], cell.tool.markers.values(), strict=True))
+    cell = replace(
+        cell,
+        tool=replace(cell.tool, markers=markers),
+        tracker=Tracker(np.array([3.0, 0.0, 1.0]), CartesianNoise(np.full(3, 1e-5))),
+        design=spec,
+    )
+    return design(cell, DesignOptions(effort="quick"))
+
+
+@pytest.fixture(scope="module")
+def page(plan: Any) -> Page:
+    told = {"command": f"elastocal design {SCRIPT}", "inputs": {SCRIPT: "0" * 64}}
+    text = plan_page(replace(plan, curve=(SizePoint(4, 6.5, 6.1), SizePoint(8, 4.5, None))), **told)
+    found = Page(text)
+    found.check_harmless(text)
+    assert len(text) < 6e6
+    return found
+
+
+def test_every_key_figure_is_on_the_page(page: Page, plan: Any) -> None:
+    assert f"efficiency {plan.certificate.efficiency_pool:.4f}" in page.text
+    assert f"{plan.candidates.feasible} feasible of {plan.candidates.tried} tried" in page.text
+    rows = page.named_rows()
+    for p in plan.predicted:
+        assert p.name in rows
+    for k, q in enumerate(np.degrees(plan.q)):
+        (row,) = [r for r in page.rows if r[0] == str(k + 1) and len(r) == 8]
+        assert [float(v) for v in row[1:7]] == pytest.approx(q, abs=0.005)
+    stops = [r for r in page.rows if len(r) == 12][1:]
+    assert [int(r[1]) - 1 for r in stops] == [stop.pose for stop in plan.execution.stops]
+    assert [r[0] for r in page.rows if r[0] in ("4", "8") and r[-1] in ("6.1", "–")] == ["4", "8"]
+    assert "no feasible pose shows joint1.compliance" in page.text
+    assert rows["seed"] == ["seed", str(plan.seed)]
+    assert SCRIPT in page.text  # the command, as text
+
+
+def test_view_has_the_poses_of_the_plan(page: Page, plan: Any) -> None:
+    (view,) = (json.loads(text) for text in page.data)
+    space = plan_space(plan)
+    assert [pose["name"] for pose in view["poses"]] == ["1", "2", "3", "4"]
+    assert view["poses"][0]["names"][0] == SCRIPT
+    assert not view["arrows"]
+    assert view["tracker"] == [3.0, 0.0, 1.0]
+    for pose, q in zip(space.poses, plan.q, strict=True):
+        assert f"q1 {np.degrees(q[0]):.2f} °" in pose.about
+        # Markers are as far from the flange as the cell says.
+        away = np.linalg.norm(pose.markers - pose.flange[:3, 3], axis=1)
+        local = np.array(list(plan.model.cell.tool.markers.values()))
+        assert away == pytest.approx(np.linalg.norm(local, axis=1))
+
+
+@pytest.mark.parametrize(
+    ("pool", "continuum", "warned", "text", "tone"),
+    [
+        (0.98, 0.97, False, "more than 2.0 % better (certified)", "good"),
+        (0.9999, 0.97, False, "no plan from these candidates is better (certified)", "good"),
+        (0.98, 0.97, True, "more than 2.0 % better (certified)", "care"),
+        (0.98, 0.7, False, "poses between them may be, by up to 30 %", "care"),
+        (0.7, None, False, "more than 30.0 % better (certified)", "care"),
+        (None, None, False, "no bound says", "care"),
+    ],
+)
+def test_the_verdict_says_how_far_from_the_best(
+    plan: Any, pool: Any, continuum: Any, warned: bool, text: str, tone: str
+) -> None:
+    certificate = Certificate(30, 1.0, pool, None, continuum)
+    warnings = ("something",) if warned else ()
+    told = replace(plan, certificate=certificate, warnings=warnings)
+    assert text in headline(told)
+    assert module._tone(told) == tone
+    advised = any("--effort thorough" in step for step in module._steps(told))
+    assert advised == (continuum == 0.7)
+
+
+def test_writing_is_whole_or_not_at_all(plan: Any, tmp_path: Any) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        write_plan_report(plan, tmp_path / "r.html", inputs=[tmp_path / "missing.toml"])
+    with pytest.raises(InputError, match="does not exist"):
+        write_plan_report(plan, tmp_path / "none" / "r.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_design_writes_its_report_and_checks_the_place_first(tmp_path: Any) -> None:
+    cell = write_cell(tmp_path)
+    for place, complaint in ((tmp_path, "is a directory"), (cell, "would be written over"),
+                             (tmp_path / "plan.json", "two outputs")):  # fmt: skip
+        refused = design_command(cell, "--report", place)
+        assert refused.exit_code == 2
+        assert complaint in refused.stderr
+    assert everything_in(tmp_path) == ["cell.toml"]
+    result = design_command(cell, "--report", tmp_path / "plan.html")
+    assert result.exit_code == 0, result.stderr
+    assert f"wrote {tmp_path / 'plan.html'}" in result.stdout.replace("\n", "")
+    found = Page((tmp_path / "plan.html").read_text(encoding="utf-8"))
+    assert str(cell) in found.named_rows()
