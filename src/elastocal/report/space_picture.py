@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,14 +56,15 @@ def space_picture(space: Space, title: str) -> str:
 
 
 def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
-    """`whole`: all poses as lines; else the first alone, as bodies."""
+    """`whole`: all poses as lines; else the first as bodies, and with arrows it alone."""
     shown = space.poses[space.first]
     for shell in space.shells.around:
         _fill(axes, shell.points @ view.T, FAINT, 0.25)
-    if whole:
+    if whole or not space.has_arrows:
         for pose in space.poses:
             line = pose.line @ view.T
-            axes.plot(line[:, 0], line[:, 1], color=FAINT, linewidth=0.8, alpha=0.7)
+            axes.plot(line[:, 0], line[:, 1], color=SERIES[0], linewidth=0.9, alpha=0.5)
+    if whole:
         for pose in space.poses:
             if not space.has_arrows and len(space.poses) <= MOST_NUMBERED:
                 tip = pose.line[-1] @ view.T
@@ -79,7 +81,19 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
         axes.plot([at[0]], [at[1]], "D", color=SERIES[2], markersize=6)
         axes.annotate("tracker", (at[0], at[1]), (6, 3), textcoords="offset points", fontsize=8)
     axes.set_aspect("equal")
-    axes.margins(0.06)
+    _limit(axes, space, view, space.poses if whole or not space.has_arrows else (shown,))
+
+
+def _limit(axes: Axes, space: Space, view: Array, poses: Sequence[Posed]) -> None:
+    """Limits that hold arms, arrows and tracker; of what stands around, what lies within."""
+    points = [points for p in poses for points in (p.line, p.markers)]
+    points += [p.markers + space.scale * p.arrows for p in poses if p.arrows is not None]
+    points += [] if space.tracker is None else [space.tracker[None]]
+    flat = np.vstack(points) @ view.T
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    room = 0.09 * float((high - low)[:2].max())
+    axes.set_xlim(float(low[0]) - room, float(high[0]) + room)
+    axes.set_ylim(float(low[1]) - room, float(high[1]) + room)
 
 
 def _bodies(axes: Axes, space: Space, pose: Posed, view: Array) -> None:
@@ -117,6 +131,3 @@ def _arrows(axes: Axes, pose: Posed, scale: float, view: Array) -> None:
     at, step = pose.markers @ view.T, scale * pose.arrows @ view.T
     axes.quiver(at[:, 0], at[:, 1], step[:, 0], step[:, 1], angles="xy", scale_units="xy", scale=1,
                 color=SERIES[1], width=0.004, headwidth=3.5, headlength=4, zorder=3)  # fmt: skip
-    ends = at + step
-    axes.update_datalim(ends[:, :2])
-    axes.autoscale_view()
