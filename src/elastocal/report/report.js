@@ -200,13 +200,20 @@ class View {
     return found;
   }
 
+  /** Edges of the box over its longest, so that all of it is seen from the camera's place. */
+  shape() {
+    const edges = this.data.range.map(([low, high]) => high - low);
+    const longest = Math.max(...edges);
+    return Object.fromEntries(AXES.map((axis, r) => [axis, edges[r] / longest]));
+  }
+
   layout() {
     const axis = name => ({ title: { text: `${name} in m` }, color: colour("ink"),
       gridcolor: colour("line"), zerolinecolor: colour("line"), showbackground: false,
       range: this.data.range[AXES.indexOf(name)], autorange: false });
     return {
-      scene: { xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "data",
-        camera: { eye: { x: 0.85, y: -1.05, z: 0.5 }, center: { x: 0, y: 0, z: -0.12 } }, uirevision: "kept" },
+      scene: { xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "manual",
+        aspectratio: this.shape(), camera: { eye: { x: 0.88, y: -1.1, z: 0.48 } }, uirevision: "kept" },
       paper_bgcolor: "rgba(0,0,0,0)", font: { color: colour("ink"), size: 12 },
       margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "kept",
       legend: { orientation: "h", y: 0, x: 0, bgcolor: "rgba(0,0,0,0)" },
