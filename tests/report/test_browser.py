@@ -252,3 +252,26 @@ def test_without_script_everything_else_is_there(browser: Any, opened: dict[str,
     assert page.locator(".still svg").is_visible()
     assert page.locator("table[data-name='parameters'] td").first.is_visible()
     context.close()
+
+
+def test_cells_of_a_csv_are_numbers_or_harmless_text(opened: dict[str, Opened]) -> None:
+    cells = {
+        "−0.5": "-0.5",
+        "=HYPERLINK(1)": "'=HYPERLINK(1)",
+        "@x": "'@x",
+        "+name": "'+name",
+        "+0.5": "+0.5",
+        'a "b", c': '"a ""b"", c"',
+    }
+    found = opened["plan"].page.evaluate("names => names.map(csvCell)", list(cells))
+    assert found == list(cells.values())
+
+
+def test_lengths_are_sorted_by_size_whatever_their_unit(opened: dict[str, Opened]) -> None:
+    expected = ["< 0.001 µm", "53.0 µm", "424 µm", "1.98 mm", "1.2 m", "word", "–"]
+    found = opened["plan"].page.evaluate(
+        """texts => texts.map(t => [sortKey(t), t]).sort((a, b) => compare(a[0], b[0], 1))
+          .map(pair => pair[1])""",
+        sorted(expected),
+    )
+    assert found == expected

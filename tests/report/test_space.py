@@ -11,10 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges
+from support.robots import packaged_urdf
 
-from elastocal.cell import Tracker
+from elastocal.cell import Robot, Tracker
 from elastocal.cell_workspace import Solid, Workspace
 from elastocal.design.feasibility.carriers import WORLD
+from elastocal.manipulator.choice import load_chain
 from elastocal.report import residual_space as residual_module
 from elastocal.report.arm_bodies import base_or_joint, shells_of, triangles_of
 from elastocal.report.residual_space import residual_space
@@ -139,3 +141,15 @@ def test_of_many_poses_the_worst_are_kept(case: Any, monkeypatch: pytest.MonkeyP
     assert [p.name for p in few.poses] == [
         p.name for p in every.poses if p.name in {f.name for f in few.poses}
     ]
+
+
+def test_a_urdf_with_collision_meshes_at_hand_is_drawn_from_them() -> None:
+    urdf, flange = packaged_urdf("UR5")
+    cell = replace(kr270_cell(), robot=Robot(urdf=urdf, flange=flange))
+    chain = load_chain(cell)
+    shells = shells_of(cell, chain)
+    assert "URDF" in shells.drawn_from
+    assert {base_or_joint(shell) for shell in shells.arm} == set(range(chain.n_joints + 1))
+    # Radii that the cell states come first.
+    stated = replace(cell, workspace=Workspace(link_radius=(0.05,)))
+    assert "capsules" in shells_of(stated, chain).drawn_from

@@ -61,9 +61,17 @@ class Space:
         return any(p.arrows is not None for p in self.poses)
 
     @property
+    def bodies(self) -> list[Array]:
+        """Points (k, 3) m of the arm's bodies in the first pose."""
+        frames = self.poses[self.first].frames
+        placed = [(s.points, frames[base_or_joint(s)]) for s in self.shells.arm]
+        return [points @ T[:3, :3].T + T[:3, 3] for points, T in placed]
+
+    @property
     def extent(self) -> Array:
         """Corners (2, 3) of the box around everything that is drawn, with room for arrows."""
         every = np.vstack([points for p in self.poses for points in (p.line, p.markers)])
+        every = np.vstack([every, *self.bodies])
         low, high = every.min(axis=0), every.max(axis=0)
         room = AROUND * float((high - low).max())
         # A hall's floor would shrink the arm to a dot.

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.report.arm_bodies import Shell, base_or_joint
 from elastocal.report.space import Posed, Space
 from elastocal.report.svg import ARM, FAINT, INK, SERIES, drawn
 from elastocal.report.words import short_name
@@ -71,7 +70,7 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
                 axes.annotate(short_name(pose.name, 6), (tip[0], tip[1]), (3, 2),
                               textcoords="offset points", fontsize=7)  # fmt: skip
     else:
-        _bodies(axes, space, shown, view)
+        _bodies(axes, space, view)
     for pose in space.poses if whole else (shown,):
         _markers(axes, pose, view, spokes=not whole)
         if pose.arrows is not None:
@@ -81,12 +80,16 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
         axes.plot([at[0]], [at[1]], "D", color=SERIES[2], markersize=6)
         axes.annotate("tracker", (at[0], at[1]), (6, 3), textcoords="offset points", fontsize=8)
     axes.set_aspect("equal")
-    _limit(axes, space, view, space.poses if whole or not space.has_arrows else (shown,))
+    drawn_poses = space.poses if whole or not space.has_arrows else (shown,)
+    _limit(axes, space, view, drawn_poses, [] if whole else space.bodies)
 
 
-def _limit(axes: Axes, space: Space, view: Array, poses: Sequence[Posed]) -> None:
+def _limit(
+    axes: Axes, space: Space, view: Array, poses: Sequence[Posed], bodies: list[Array]
+) -> None:
     """Limits that hold arms, arrows and tracker; of what stands around, what lies within."""
-    points = [points for p in poses for points in (p.line, p.markers)]
+    points = list(bodies)
+    points += [points for p in poses for points in (p.line, p.markers)]
     points += [p.markers + space.scale * p.arrows for p in poses if p.arrows is not None]
     points += [] if space.tracker is None else [space.tracker[None]]
     flat = np.vstack(points) @ view.T
@@ -96,14 +99,10 @@ def _limit(axes: Axes, space: Space, view: Array, poses: Sequence[Posed]) -> Non
     axes.set_ylim(float(low[1]) - room, float(high[1]) + room)
 
 
-def _bodies(axes: Axes, space: Space, pose: Posed, view: Array) -> None:
-    """Silhouettes of the bodies, the furthest first."""
-
-    def placed(shell: Shell) -> Array:
-        T = pose.frames[base_or_joint(shell)]
-        return np.asarray((shell.points @ T[:3, :3].T + T[:3, 3]) @ view.T)
-
-    for points in sorted(map(placed, space.shells.arm), key=lambda p: float(p[:, 2].mean())):
+def _bodies(axes: Axes, space: Space, view: Array) -> None:
+    """Silhouettes of the first pose's bodies, the furthest first."""
+    placed = [points @ view.T for points in space.bodies]
+    for points in sorted(placed, key=lambda p: float(p[:, 2].mean())):
         _fill(axes, points, ARM, 1.0)
 
 
