@@ -13,6 +13,7 @@ from elastocal.identification.identify import Options, identify
 from elastocal.identification.options import Method
 from elastocal.identification.result import IdentificationResult
 from elastocal.manipulator.model import Model
+from elastocal.report import identification_figures
 from elastocal.simulation.simulate import simulate, values_from
 
 EFFECTS = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
@@ -102,3 +103,13 @@ def pose() -> Case:
 def bare() -> Case:
     """Base frame only, from one marker without stated noise, one reading faulty."""
     return make_case(("M1",), ("base_frame",), sigma=None, faulty=1)
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages without figures, for what does not depend on them: drawing takes its time."""
+    names = ("errors", "held_out", "by_configuration", "against_joints", "histogram", "scores",
+             "groups", "histograms", "waterfall", "matrix", "space", "over_time",
+             "by_region")  # fmt: skip
+    drawn = dict.fromkeys(names, "<svg></svg>")
+    monkeypatch.setattr(identification_figures, "drawn_for", lambda *_: drawn)

@@ -85,10 +85,10 @@ def test_terminal_names_few_and_counts_the_rest(case: Any) -> None:
     assert fault_lines(replace(case.result, faulty_report=None)) == []
 
 
-def test_page_lists_every_group_beside_the_single_readings(case: Any) -> None:
+def test_page_lists_every_group_beside_the_single_readings(case: Any, no_figures: None) -> None:
     groups = [replace(BLOCK, level="configuration", name=f"<b>{k}\x1b") for k in range(9)]
     page = report_page(with_findings(case.result, *groups, excluded=outliers(range(142, 508))))
-    section = page[page.index("<h2>Outliers") : page.index("<h2>To repeat")]
+    section = page[page.index("<h2>Faulty readings") : page.index("<h2>To repeat")]
     assert section.count("<li>") == 9
     assert "at most 1 %" in section
     assert "and 266 more" in section
@@ -97,7 +97,7 @@ def test_page_lists_every_group_beside_the_single_readings(case: Any) -> None:
 
 
 @pytest.mark.parametrize("level", ["block", "marker", "configuration"])
-def test_group_without_a_reading_beyond_the_noise(case: Any, level: Any) -> None:
+def test_group_without_a_reading_beyond_the_noise(case: Any, level: Any, no_figures: None) -> None:
     result = with_findings(case.result, replace(BLOCK, level=level, beyond=0))
     assert ", none of them beyond the noise alone" in fault_lines(result)[0]
     page = report_page(result)

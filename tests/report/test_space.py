@@ -95,7 +95,7 @@ def test_tracker_is_shown_where_it_stands_near() -> None:
     assert space_of(far, kr270_chain(), [posed()]).tracker is None
 
 
-@given(st.recursive(st.text() | st.integers(), lambda inner: st.lists(inner, max_size=3)))
+@given(st.lists(st.text() | st.integers(), max_size=4))
 @settings(max_examples=60, deadline=None)
 def test_no_name_ends_the_script_that_holds_it(content: Any) -> None:
     text = in_script([content, "</script><script>", "<!--", "]]>", "&amp;"])

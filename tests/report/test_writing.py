@@ -12,15 +12,8 @@ from elastocal.errors import InputError
 from elastocal.report import identification_figures
 from elastocal.report.html import write_report
 
-
-@pytest.fixture(autouse=True)
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Writing does not depend on what the figures show, and drawing takes its time."""
-    names = ("errors", "held_out", "by_configuration", "against_joints", "histogram", "scores",
-             "groups", "histograms", "waterfall", "matrix", "space", "over_time",
-             "by_region")  # fmt: skip
-    drawn = dict.fromkeys(names, "<svg></svg>")
-    monkeypatch.setattr(identification_figures, "drawn_for", lambda *_: drawn)
+# Writing does not depend on what the figures show, and drawing takes its time.
+pytestmark = pytest.mark.usefixtures("no_figures")
 
 
 def test_inputs_are_hashed(case: Any, tmp_path: Path) -> None:
