@@ -53,7 +53,7 @@ def test_structure(page: str) -> None:
     ):
         assert heading in structure.text
     assert "elastocal identify c.toml d.csv" in structure.text
-    assert "engine" in structure.named_rows()
+    assert "model evaluated by" in structure.named_rows()
     assert "prefers-color-scheme: dark" in page
     assert "@media print" in page
 
@@ -108,7 +108,7 @@ def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: st
     with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30}):
         again = report_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
     # What evaluated the model so far is another thing the second time.
-    engine = re.compile(r"<td class=\"name\">engine</td><td>.*?</td>")
+    engine = re.compile(r"<td class=\"name\">model evaluated by</td><td>.*?</td>")
     assert engine.sub("", again) == engine.sub("", page)
 
 
