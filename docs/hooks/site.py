@@ -1,0 +1,28 @@
+"""mkdocs hook: pages that are made from the code at build time, so that they cannot fall behind."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cell_keys_page
+import commands_page
+import effects_page
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+
+PAGES = {
+    "reference/effects.md": effects_page.page,
+    "reference/commands.md": commands_page.page,
+    "reference/cell-keys.md": cell_keys_page.page,
+}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages to those that stand in docs/."""
+    from mkdocs.structure.files import File
+
+    for name, make in PAGES.items():
+        files.append(File.generated(config, name, content=make()))
+    return files
