@@ -110,7 +110,9 @@ def _places(places: tuple[str, ...]) -> str:
     """Runs of numbered places in short: `joint1` … `joint6`."""
     shown: list[str] = []
     kinds = {re.sub(r"\d+$", "", p) for p in places}
-    for kind in sorted(kinds, key=lambda k: min(i for i, p in enumerate(places) if p.startswith(k))):
+    for kind in sorted(
+        kinds, key=lambda k: min(i for i, p in enumerate(places) if p.startswith(k))
+    ):
         same = [p for p in places if re.sub(r"\d+$", "", p) == kind]
         run = [f"{kind}{i + 1}" for i in range(len(same))]
         if len(same) > 2 and same == run:
@@ -142,7 +144,10 @@ def _settings(settings: tuple[Setting, ...]) -> str:
 
 
 def _parameters(place: str, parameters: tuple[ParameterSpec, ...]) -> str:
-    lines = ["| parameter | unit in files | nominal | typical size | bounds |", "|---|---|---|---|---|"]
+    lines = [
+        "| parameter | unit in files | nominal | typical size | bounds |",
+        "|---|---|---|---|---|",
+    ]
     for p in parameters:
         typical = "from the readings"
         if p.typical is not None:
