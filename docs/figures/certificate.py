@@ -25,7 +25,7 @@ def figure(colours: Colours) -> Figure:
         "random, median of 1000": ("", median),
     }
     fig, axis = plt.subplots(figsize=(8.0, 2.7))
-    for i, (label, (name, value)) in enumerate(shown.items()):
+    for i, (name, value) in enumerate(shown.values()):
         tint = colours.one if i == 0 else colours.four
         axis.barh(-i, value, 0.58, color=tint)
         axis.text(value + 0.05, -i, f"{value:.2f} µm", va="center", fontsize=9.5)

@@ -25,7 +25,7 @@ BENT = np.deg2rad([22.96, 85.78, -125.42, 55.78, -74.89, 288.89])  # the pose th
 
 
 def misfit(model: Model, bent: bool) -> np.ndarray:
-    """Information (2, 2) on the compliances of joints 4 and 6, the others fitted, per (rad/(N m))²."""
+    """Information (2, 2) on the compliances of joints 4 and 6 where the others are fitted too."""
     plan = read_plan(TUTORIAL / "poses.csv", joint_kinds=model.chain.kinds)
     truth = values_from(model, TRUTH)
     found = np.zeros((len(truth), len(truth)))

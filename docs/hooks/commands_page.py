@@ -9,8 +9,8 @@ HEAD = """# Commands
 
     elastocal VERB CELL [DATA] [options]
 
-This page is made from the command line itself when the site is built; `elastocal VERB --help` prints
-the same. For what the verbs are good for see the how-to pages.
+This page is made from the command line itself when the site is built; `elastocal VERB --help`
+prints the same. For what the verbs are good for see the how-to pages.
 
 Exit codes: 0 done; 1 the data do not support an answer (the message says why and what to measure);
 2 wrong input (one message on stderr that names file, row or key; no half-written file is left); 130
