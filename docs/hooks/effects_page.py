@@ -43,8 +43,9 @@ the residual.
 
 This page is made from the code when the site is built: the texts are the effects' own. Places,
 nominal values and sizes are those of the KR 270 of the demo, with joint compliances of 0.3 to
-3.5 µrad/(N·m). The *typical size* is the deviation from nominal that one expects: it scales columns
-of B before any rank is judged, it is the prior of a diagnosis, and `simulate --draw 1` draws from it.
+3.5 µrad/(N·m). The *typical size* is the deviation from nominal that one expects: it scales
+columns of B before any rank is judged, it is the prior of a diagnosis, and `simulate --draw 1`
+draws from it.
 """
 
 
@@ -109,11 +110,9 @@ def _showing(effect: Effect, chain: Chain, base: Cell) -> tuple[Cell, str]:
 def _places(places: tuple[str, ...]) -> str:
     """Runs of numbered places in short: `joint1` … `joint6`."""
     shown: list[str] = []
-    kinds = {re.sub(r"\d+$", "", p) for p in places}
-    for kind in sorted(
-        kinds, key=lambda k: min(i for i, p in enumerate(places) if p.startswith(k))
-    ):
-        same = [p for p in places if re.sub(r"\d+$", "", p) == kind]
+    kinds = [re.sub(r"\d+$", "", p) for p in places]
+    for kind in dict.fromkeys(kinds):
+        same = [p for p, its in zip(places, kinds, strict=True) if its == kind]
         run = [f"{kind}{i + 1}" for i in range(len(same))]
         if len(same) > 2 and same == run:
             shown.append(f"`{same[0]}` … `{same[-1]}`")
@@ -145,7 +144,7 @@ def _settings(settings: tuple[Setting, ...]) -> str:
 
 def _parameters(place: str, parameters: tuple[ParameterSpec, ...]) -> str:
     lines = [
-        "| parameter | unit in files | nominal | typical size | bounds |",
+        "| parameter | unit | nominal | typical size | bounds |",
         "|---|---|---|---|---|",
     ]
     for p in parameters:

@@ -1,8 +1,8 @@
 """Commands that a page shows, run again, and what they print compared with what it shows.
 
 A page shows a command and lines of its output in a block marked `console`: lines that begin with
-"$ " are the commands (a line that ends in a backslash goes on), the others are output, "…" stands for
-lines left out.  Run as a script it writes the numbers of a fresh run into the page:
+"$ " are the commands (a line that ends in a backslash goes on), the others are output, "…" stands
+for lines left out.  Run as a script it writes the numbers of a fresh run into the page:
 
     python docs/scripts/console_blocks.py docs/tutorial/index.md
 """
@@ -57,7 +57,7 @@ def mask(line: str) -> str:
 
 
 def matched(lines: tuple[str, ...], output: str) -> list[str | None]:
-    """For each shown line the line of `output` that it stands for, in order; None: there is none."""
+    """For each shown line the line of `output` that it stands for, in order; None: none does."""
     actual = [line.rstrip() for line in output.splitlines()]
     found: list[str | None] = []
     at = 0
