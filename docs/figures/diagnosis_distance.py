@@ -30,8 +30,8 @@ def figure(colours: Colours) -> Figure:
         label="nothing significant",
     )  # fmt: skip
     middle = np.array([0.5, 1.5, 2.5, 3.5, 4.5])
-    axis.plot(
-        x[:-1], norm.cdf(middle / 2), "_", color=colours.text, markersize=30, markeredgewidth=1.8,
+    axis.hlines(
+        norm.cdf(middle / 2), x[:-1] - 0.31, x[:-1] + 0.31, color=colours.text, linewidth=1.8,
         label="Φ(d/2): the best test between two names",
     )  # fmt: skip
     axis.set_xticks(x, labels)

@@ -31,6 +31,7 @@ COLUMNS = {
     "temperature": "`temperature_C`",
     "load": "`force_x_N …`",
 }
+OBSERVED = ("position", "deflection", "pose", "distance")
 # Order of size where the parameters' own size is known only from the cell.
 COMPLIANCE = (2e-6, 3e-7, 4e-7, 3e-6, 3.5e-6, 2e-6)  # rad/(N m)
 HEAD = """# Effects
@@ -69,7 +70,7 @@ def _overview() -> str:
 
 
 def _section(effect: Effect, chain: Chain, base: Cell) -> str:
-    cell, observe = _showing(effect, chain, base)
+    cell = _observing("position", base)
     places = effect.places(chain, cell)
     parts = [
         f"### `{effect.name}` {{#{effect.name}}}\n",
@@ -78,10 +79,9 @@ def _section(effect: Effect, chain: Chain, base: Cell) -> str:
         f"- **Places**: {_places(places)}",
         f"- **Columns that it needs**: {_columns(effect, chain, cell)}",
     ]
-    if observe == "pose":
-        parts.append('- **Observations**: `observe = "pose"` only')
-    elif observe == "distance":
-        parts.append('- **Observations**: `observe = "distance"` only')
+    without = [o for o in OBSERVED if not effect.places(chain, _observing(o, base))]
+    if without:
+        parts.append("- **Not with** `observe` = " + ", ".join(f"`{o}`" for o in without))
     if settings := effect.settings(places[0], chain, cell):
         parts.append(f"- **Settings** (set or searched, not fitted): {_settings(settings)}")
     parameters = effect.parameters(places[0], chain, cell)
@@ -89,22 +89,16 @@ def _section(effect: Effect, chain: Chain, base: Cell) -> str:
     return "\n".join(parts)
 
 
-def _showing(effect: Effect, chain: Chain, base: Cell) -> tuple[Cell, str]:
-    """A cell in which the effect has places, and the observation that it takes."""
-    nominal = replace(base.model.nominal, joint_compliance=COMPLIANCE)
-    for observe in ("position", "pose", "distance"):
-        model = replace(
-            base.model,
-            observe=observe,  # type: ignore[arg-type]
-            compliance_levels={},
-            gear_ripple_orders=(121.0,),
-            nominal=nominal,
-        )
-        cell = replace(base, model=model)
-        if effect.places(chain, cell):
-            # What shows in poses as well as in positions is not special to poses.
-            return cell, observe
-    raise LookupError(f"{effect.name} has no place on the demo's arm")
+def _observing(observe: str, base: Cell) -> Cell:
+    """The demo's cell with another observation, and with all that gives effects their sizes."""
+    model = replace(
+        base.model,
+        observe=observe,  # type: ignore[arg-type]
+        compliance_levels={},
+        gear_ripple_orders=(121.0,),
+        nominal=replace(base.model.nominal, joint_compliance=COMPLIANCE),
+    )
+    return replace(base, model=model)
 
 
 def _places(places: tuple[str, ...]) -> str:
@@ -151,7 +145,8 @@ def _parameters(place: str, parameters: tuple[ParameterSpec, ...]) -> str:
         typical = "from the readings"
         if p.typical is not None:
             value, shown = display(p.typical, p.unit)
-            typical = f"{value:.2g} {shown}"
+            rounded = float(f"{value:.2g}")
+            typical = f"{rounded:g} {shown}"
         lower = "" if p.lower == float("-inf") else f"≥ {p.lower:g}"
         upper = "" if p.upper == float("inf") else f"≤ {p.upper:g}"
         bounds = " ".join(filter(None, (lower, upper))) or "–"

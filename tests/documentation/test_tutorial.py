@@ -1,18 +1,11 @@
 """The tutorial's commands run, print what its page shows, and teach what it says they teach."""
 
-import json
 import re
-import shutil
-import sys
 from pathlib import Path
 
-import pytest
+import console_blocks
 
-ROOT = Path(__file__).parents[2]
-TUTORIAL = ROOT / "docs" / "tutorial"
-sys.path.insert(0, str(ROOT / "docs" / "scripts"))
-
-import console_blocks  # noqa: E402
+TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
 
 PAGE = (TUTORIAL / "index.md").read_text(encoding="utf-8")
 PIECES = console_blocks.shown(PAGE)
@@ -22,27 +15,10 @@ TRUTH = {
 }
 
 
-@pytest.fixture(scope="module")
-def course(tmp_path_factory):
-    """Each command with what it printed, and the result file as every `identify` left it."""
-    folder = tmp_path_factory.mktemp("tutorial")
-    shutil.copytree(TUTORIAL, folder / "work")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PATH", console_blocks.os.environ["PATH"])  # put back what shim changes
-        console_blocks.shim(folder)
-        printed, results = [], []
-        for piece in PIECES:
-            printed.append(console_blocks.run(piece.command, folder / "work"))
-            if piece.command.startswith("elastocal identify"):
-                results.append(json.loads((folder / "work" / "result.json").read_text()))
-    return printed, results
-
-
 def test_the_page_shows_what_the_commands_print(course):
-    printed, _ = course
     told = [
         f"$ {piece.command}\n{difference}"
-        for piece, output in zip(PIECES, printed, strict=True)
+        for piece, output in zip(PIECES, course.printed, strict=True)
         for difference in console_blocks.differences(piece, output)
     ]
     assert not told, "\n".join(told)
@@ -53,7 +29,7 @@ def parameters(result):
 
 
 def test_with_a_stretched_wrist_only_the_sum_of_joints_4_and_6_is_known(course):
-    first = course[1][0]
+    first = course.results[0]
     found = parameters(first)
     assert found["joint4.compliance"]["value"] is None
     assert found["joint4.compliance"]["combined_with"] == ["joint6.compliance"]
@@ -63,8 +39,8 @@ def test_with_a_stretched_wrist_only_the_sum_of_joints_4_and_6_is_known(course):
 
 
 def test_one_more_pose_separates_them(course):
-    found = parameters(course[1][1])
-    assert not course[1][1]["combinations"]
+    found = parameters(course.results[1])
+    assert not course.results[1]["combinations"]
     for name in ("joint4.compliance", "joint6.compliance"):
         assert abs(found[name]["value"] - TRUTH[name]) < 4 * found[name]["std"]
         assert found[name]["std"] < 0.1 * TRUTH[name]
@@ -72,7 +48,7 @@ def test_one_more_pose_separates_them(course):
 
 
 def test_a_sideways_pull_shows_what_no_pose_does(course):
-    found = parameters(course[1][-1])
+    found = parameters(course.results[-1])
     assert {name for name, p in found.items() if p["identifiable"]} == set(TRUTH)
     for name, true in TRUTH.items():
         assert abs(found[name]["value"] - true) < 4 * found[name]["std"]

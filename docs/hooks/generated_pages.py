@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+from typing import TYPE_CHECKING, Any
 
 import cell_keys_page
 import commands_page
@@ -26,3 +27,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, make in PAGES.items():
         files.append(File.generated(config, name, content=make()))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fences whose language has a word of ours behind it (```toml workspace), as Markdown has it.
+
+    The word says to tests and readers of the file which piece of a cell it is; a site would take
+    the fence for text.
+    """
+    return re.sub(r"^```(\w+) \w+$", r"```\1", markdown, flags=re.M)
