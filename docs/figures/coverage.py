@@ -18,7 +18,7 @@ MARKS = ("o", "s", "D", "^", "v")
 
 def figure(colours: Colours) -> Figure:
     head, rows = table_of(RESULT, "Intervals at 95 %")
-    fig, axis = plt.subplots(figsize=(8.4, 4.4))
+    fig, axis = plt.subplots(figsize=(6.2, 4.4))
     tints = (colours.one, colours.three, colours.four, colours.two, colours.two)
     y = [-i for i in range(len(rows))]
     for (name, label), mark, tint in zip(SHOWN.items(), MARKS, tints, strict=True):
@@ -26,11 +26,11 @@ def figure(colours: Colours) -> Figure:
         hollow = "none" if mark == "v" else tint
         axis.plot(values, y, mark, color=tint, markerfacecolor=hollow, label=label, clip_on=False)
     axis.axvline(95, color=colours.text, linewidth=1)
-    axis.text(95, 0.75, "what they say: 95 %", ha="center", fontsize=9)
+    axis.text(95, 0.75, "what they say: 95 %", ha="center", fontsize=10)
     axis.set_yticks(y, [row[0] for row in rows])
     axis.set_xlim(0, 100)
-    axis.set_xlabel("intervals that hold the truth, %  (4000 campaigns, 36 000 intervals a row)")
-    axis.legend(loc="upper center", bbox_to_anchor=(0.4, -0.14), ncols=3, fontsize=9)
+    axis.set_xlabel("intervals that hold the truth, %")
+    axis.legend(loc="upper center", bbox_to_anchor=(0.3, -0.14), ncols=2, fontsize=10)
     return fig
 
 

@@ -48,13 +48,13 @@ def _arguments(arguments: list[Any]) -> str:
 
 
 def _options(command: Any) -> str:
-    lines = ["| option | default | |", "|---|---|---|"]
+    lines = ['<div class="options" markdown>\n', "| option | default | |", "|---|---|---|"]
     for p in command.params:
         if p.param_type_name != "option":
             continue
         names = ", ".join(f"`{n}`" for n in (*p.opts, *p.secondary_opts))
         lines.append(f"| {names} | {_default(p)} | {_cell(p.help or '')} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, "\n</div>"])
 
 
 def _default(p: Any) -> str:
