@@ -20,6 +20,19 @@ PAGES = {
 }
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Underscores are part of names and formulas (w_i), never emphasis."""
+    from markdown import Markdown
+    from markdown.extensions import Extension
+
+    class PlainUnderscores(Extension):
+        def extendMarkdown(self, md: Markdown) -> None:
+            md.inlinePatterns.deregister("em_strong2", strict=False)
+
+    config.markdown_extensions.append(PlainUnderscores())  # type: ignore[arg-type]
+    return config
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages to those that stand in docs/."""
     from mkdocs.structure.files import File
