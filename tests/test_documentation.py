@@ -88,3 +88,9 @@ def test_nothing_of_the_site_comes_from_a_network():
     assert "://" not in settings
     style = (DOCS / "assets" / "site.css").read_text(encoding="utf-8")
     assert "url(" not in style and "@import" not in style
+
+
+def test_the_site_is_built_strictly():
+    """Without --quiet, under which mkdocs counts no warning."""
+    assert "mkdocs build --strict\n" in (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert "make docs\n" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
