@@ -1,4 +1,4 @@
-"""What design_peers.py measures with: times, tables, peers in a process of their own."""
+"""What the comparisons measure with: times, tables, peers in a process of their own."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def required(what: str, met: bool) -> None:
     print(f"- {what}: {'met' if met else 'NOT MET'}", flush=True)
 
 
-def peer(python: Path, script: str, *arguments: Path) -> Any:
+def peer(python: Path, script: str, *arguments: Path | str) -> Any:
     """Run a script in the peers' environment; what it wrote to the last of its arguments."""
     command = [str(python), str(HERE / script), *map(str, arguments)]
     ran = subprocess.run(command, capture_output=True, text=True, env=os.environ | ONE_THREAD)

@@ -17,7 +17,8 @@ from elastocal.cell_reader import read_cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.manipulator.model import Model
 from elastocal.measurement_reader import read_measurements

@@ -17,7 +17,8 @@ from elastocal.diagnosis.heldout import (
 )
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.model_set import Item, fit_set
-from elastocal.diagnosis.noise import NoiseValues, covariance, project
+from elastocal.diagnosis.noise import NoiseValues, covariance
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import scene_of
 
 NOISE = NoiseValues(1.2, np.array([4e-6, 9e-6, 1e-5]), 0.4)

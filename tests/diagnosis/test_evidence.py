@@ -11,7 +11,8 @@ from scipy.special import logsumexp
 from support.diagnosis_data import dense_noise, random_data, used_rows
 
 from elastocal.diagnosis.evidence import SCALES, evidence_of
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.sums import direct
 
 NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), 0.5)
@@ -77,7 +78,7 @@ def test_flipped_configurations_are_flipped_residuals_projected_anew(seed: int) 
     data = random_data(seed)
     C, at = group(data, seed), project(data, NOISE)
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], (6, len(data.r)))
-    found = direct(C, at).flipped(signs)[:, 0]
+    found = direct(C, at, signs).flipped()[:, 0]
     rows = used_rows(data)
     X, c = (a.reshape(-1, a.shape[2])[rows] for a in (data.X, C))
     inverse = np.linalg.inv(dense_noise(data, NOISE))
@@ -86,7 +87,8 @@ def test_flipped_configurations_are_flipped_residuals_projected_anew(seed: int) 
     e = (np.linalg.inv(at.inverse) @ at.spread[0][..., None]).ravel()[rows]
     lam, U = np.linalg.eigh(c.T @ P @ c)
     each = np.repeat(signs, data.r.shape[1], axis=1)[:, rows]
-    expected = [evidence_of(lam, U.T @ c.T @ P @ (d * e), SCALES) for d in each]
+    beta = np.array([U.T @ c.T @ P @ (d * e) for d in each])
+    expected = evidence_of(lam[None], beta[:, None], SCALES)[:, 0]
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 

@@ -14,7 +14,8 @@ from elastocal.diagnosis.drivers import Drivers, monomials, waves
 from elastocal.diagnosis.generic import Generic, generic_blocks
 from elastocal.diagnosis.gram import Grams
 from elastocal.diagnosis.model_set import Item, packed_columns
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.sums import direct
 from elastocal.measurements import Measurements

@@ -10,15 +10,9 @@ from scipy import linalg, optimize, stats
 from support.diagnosis_data import dense_noise, kept_only, random_data, used_rows
 
 from elastocal.diagnosis.blocks import Blocks
-from elastocal.diagnosis.noise import (
-    NoiseValues,
-    NoisyData,
-    covariance,
-    fit_noise,
-    likelihood,
-    log_prior,
-    project,
-)
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, covariance, log_prior
+from elastocal.diagnosis.noise_fit import fit_noise
+from elastocal.diagnosis.projection import Weighted, likelihood, posterior, project
 
 NOISE = NoiseValues(1.3, np.array([4e-6, 9e-6, 2e-5]), 0.4)
 SEEDS = range(4)
@@ -53,6 +47,32 @@ def test_the_slope_is_that_of_finite_differences(seed: int, stated: bool) -> Non
     for k, step in enumerate(h * np.eye(len(at))):
         up, down = (likelihood(data, NoiseValues.of_logs(at + s * step))[0] for s in (1, -1))
         assert slope[k] == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize(("readings", "visits"), [(3, 3), (6, 1), (4, 2)])
+def test_the_slope_is_right_for_many_visits_and_for_one(readings: int, visits: int) -> None:
+    """Columns of the joints in all visits may be more than a configuration's rows, or fewer."""
+    configuration = np.repeat(np.arange(9), readings)
+    visit = np.concatenate([c * visits + np.arange(readings) % visits for c in range(9)])
+    blocks = Blocks.of(configuration, visit, 3)
+    data, h = random_data(7, blocks, p=4, joints=6), 1e-5
+    at = NoiseValues(1.2, np.geomspace(3e-6, 3e-5, 6), 0.3).logs()
+    slope = likelihood(data, NoiseValues.of_logs(at))[1]
+    for k, step in enumerate(h * np.eye(len(at))):
+        up, down = (posterior(data, NoiseValues.of_logs(at + s * step)) for s in (1, -1))
+        assert slope[k] == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_another_prior_needs_no_other_weighting(seed: int) -> None:
+    data = random_data(seed)
+    at = Weighted.of(data, NOISE)
+    for scale in (0.1, 1.0, 30.0):
+        other = replace(data, precision=data.precision * scale)
+        whole = project(other, NOISE)
+        assert at.marginal(other.precision) == pytest.approx(whole.marginal, rel=1e-12)
+        np.testing.assert_allclose(at.projection(other.precision).u, whole.u, rtol=1e-9)
+    assert posterior(data, NOISE) == likelihood(data, NOISE)[0]
 
 
 @pytest.mark.parametrize("seed", SEEDS)

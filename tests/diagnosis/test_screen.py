@@ -10,7 +10,9 @@ import pytest
 from support.diagnosis_data import SIGMA, campaign, diagnosed
 
 from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.noise import NoiseValues, fit_noise, project
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.noise_fit import fit_noise
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.screen import describe_faulty, reading_errors, screen
 from elastocal.measurements import Measurements

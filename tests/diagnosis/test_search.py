@@ -14,11 +14,12 @@ from elastocal.diagnosis.found import Found, Slot
 from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.model_set import Item, fit_set, packed_columns
-from elastocal.diagnosis.noise import NoiseValues, covariance, project
+from elastocal.diagnosis.noise import NoiseValues, covariance
 from elastocal.diagnosis.prior import Prior
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scan import scan
 from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.search import Search, base_score
+from elastocal.diagnosis.search import FLIPS, Search, base_score
 from elastocal.diagnosis.sums import direct
 
 TRIED = ("gear_eccentricity", "encoder_scale", "encoder_jump", "marker_slip", "hysteresis")
@@ -115,6 +116,20 @@ def test_scores_of_a_scan_count_from_the_set_under_its_noise() -> None:
     assert base_score(scene, nothing, seen) == pytest.approx(nothing.score, abs=1e-6)
     worse = scan(scene, [], prior, nothing.data, NOISE, np.zeros((0, 24)))
     assert base_score(scene, nothing, worse) < nothing.score + 0.5
+
+
+def test_a_set_is_scanned_once_under_one_noise() -> None:
+    """With flips holds what is asked for without them, and not the other way round."""
+    scene = noisy(5)
+    search, nothing = Search(scene, [], NOISE, 0.05, 0), fit_set(scene, ())
+    plain = search._scan(nothing, NOISE)
+    assert search._scan(nothing, NOISE) is plain and len(plain.flipped) == 0
+    flipped = search._scan(nothing, NOISE, flips=True)
+    assert len(flipped.flipped) == FLIPS and search._scan(nothing, NOISE) is flipped
+    assert [s.evidence for s in plain.scored] == [s.evidence for s in flipped.scored]
+    assert search._scan(nothing) is not flipped
+    other = fit_set(scene, (item(*BEND),), NOISE)
+    assert search._scan(other, NOISE).odds != flipped.odds
 
 
 def test_the_odds_of_all_are_the_prior_mean_of_each() -> None:

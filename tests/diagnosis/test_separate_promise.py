@@ -12,7 +12,8 @@ from support.rivals import ECCENTRIC, REPEATABILITY, SCALE, Key, campaign, diagn
 from elastocal.cell import Array
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import scene_of
 from elastocal.diagnosis.separate import plan_extra
 from elastocal.diagnosis.separate_pool import joined

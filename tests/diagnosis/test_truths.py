@@ -18,7 +18,8 @@ from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.heldout import left_out_residual, squared_lengths
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.model_set import Item, fit_set
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scan import Scan
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.truths import DRAWN, NOISES, Confirmation

@@ -85,6 +85,28 @@ def test_flange_equals_plain_product(tmp_path: Path, convention, seed: int) -> N
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_fixed_rows_beta_and_comments(tmp_path: Path, convention) -> None:
+    """A fixed row is a joint that never moves; β turns about y after α, before the next θ."""
+    rows, _, q = random_table(3)
+    beta = 0.3
+    cells = [(*row, "", "revolute") for row in rows]
+    cells[0], cells[-1] = (*rows[0], "", "fixed"), (*rows[-1], beta, "fixed")
+    path = write(tmp_path / "dh.csv", f"# a, comment\n{HEADER},beta_rad,type", cells)
+    chain = read_dh(path, convention)
+    assert chain.n_joints == len(rows) - 2
+    held = np.concatenate([[0.0], q[1:-1], [0.0]])
+    frames = dh_frames(rows, [False] * len(rows), held, convention)
+    c, s = np.cos(beta), np.sin(beta)
+    turn_y = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
+    theta, d, a, alpha = rows[-1]
+    expected = frames[-1] @ turn_y
+    if convention == "modified":
+        along = turn_z(theta) @ shift(0, d)
+        expected = frames[-2] @ turn_x(alpha) @ shift(a, 0) @ turn_y @ along
+    np.testing.assert_allclose(evaluate(chain, q[1:-1]), expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
 def test_centres_of_mass_are_given_in_dh_frames(tmp_path: Path, convention) -> None:
     rows, _, _ = random_table(3)
     n = len(rows)

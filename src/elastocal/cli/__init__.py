@@ -7,10 +7,11 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Importing a command registers it.
-from elastocal.cli import demo, design, diagnose, identify, simulate, study  # noqa: F401
+from elastocal.cli import demo, design, diagnose, export, identify, simulate, study  # noqa: F401
 from elastocal.cli.app import app
 
 
 def main() -> None:
     """Entry point of the `elastocal` command."""
-    app()
+    # The same name however it is called: completion scripts are made of it.
+    app(prog_name="elastocal")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, beside, packed_columns
-from elastocal.diagnosis.noise import project
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]

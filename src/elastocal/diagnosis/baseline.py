@@ -29,8 +29,8 @@ class Baseline:
     """The cell's own model fitted to the table, all parameters weakly tied to their start.
 
     `x` (parameters,) is the fit, `sizes` typical deviations, `nominal` (rows,) the residual of
-    the nominal arm with only base and markers placed.  `stated` (N, size, size) is the noise that
-    cell or table state, None where they state none.
+    the nominal arm with only base and markers placed, NaN where the fit began elsewhere.
+    `stated` (N, size, size) is the noise that cell or table state, None where they state none.
     """
 
     model: Model
@@ -76,12 +76,11 @@ def fit_baseline(
         problem, nominal = replace(problem, x0=base.x), base.residual
     found: Fit | None = tied_fit(problem, sizes, PLACING) if len(free) else None
     x = x0 if found is None else found.x
-    residual = residual_at(model, problem.parts, x)
-    return Baseline(
-        model, seen, x, sizes, residual,
-        residual_at(model, problem.parts, problem.x0) if nominal is None else nominal,
-        _stated(seen, model, weights),
-    )  # fmt: skip
+    residual = residual_at(model, problem.parts, x) if found is None else found.residual
+    if nominal is None:
+        unknown = np.full_like(residual, np.nan)
+        nominal = unknown if started else residual_at(model, problem.parts, problem.x0)
+    return Baseline(model, seen, x, sizes, residual, nominal, _stated(seen, model, weights))
 
 
 def _stated(seen: Observations, model: Model, weights: Weights) -> Array | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,11 @@ class Blocks:
     @property
     def n(self) -> int:
         return len(self.visit)
+
+    @cached_property
+    def places(self) -> VisitPlaces:
+        """Where visits stand in the blocks."""
+        return VisitPlaces.of(self)
 
     def pack(self, rows: Array) -> Array:
         """(N, size, k) → (C, M·size, k), zeros where there is no observation."""
@@ -79,3 +85,36 @@ class Blocks:
         visit = np.concatenate([self.visit, [-1]])[self.member]
         same = (visit[:, :, None] == visit[:, None, :]) & (visit >= 0)[:, :, None]
         return np.repeat(np.repeat(same, self.size, axis=1), self.size, axis=2).astype(float)
+
+
+@dataclass(frozen=True)
+class VisitPlaces:
+    """Where visits stand in the blocks: `one_hot` (C, m, v), and an observation of each visit,
+    `example` (C, v), −1 where a block has fewer visits."""
+
+    one_hot: Array
+    example: Labels
+
+    @classmethod
+    def of(cls, blocks: Blocks) -> VisitPlaces:
+        member = blocks.member
+        visit = np.concatenate([blocks.visit, [-1]])[member]
+        local = np.full(visit.shape, -1)
+        most = 1
+        for c, row in enumerate(visit):
+            known, first, inverse = np.unique(row, return_index=True, return_inverse=True)
+            order = np.argsort(np.argsort(np.where(known < 0, len(row), first)))
+            local[c] = np.where(row < 0, -1, order[inverse])
+            most = max(most, int(local[c].max()) + 1)
+        one_hot = (local[:, :, None] == np.arange(most)).astype(float)
+        example = np.full((len(member), most), -1, dtype=np.int64)
+        for v in range(most):
+            there = one_hot[:, :, v].any(axis=1)
+            example[there, v] = member[there, one_hot[there, :, v].argmax(axis=1)]
+        return cls(np.repeat(one_hot, blocks.size, axis=1), example)
+
+    def gather(self, values: Array) -> Array:
+        """Per observation (N, …) → per visit (C, v, …), zero where there is none."""
+        out = values[np.maximum(self.example, 0)]
+        out[self.example < 0] = 0.0
+        return out

@@ -17,7 +17,8 @@ from elastocal.diagnosis.heldout import (
 )
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet, with_items
-from elastocal.diagnosis.noise import NoisyData, project
+from elastocal.diagnosis.noise import NoisyData
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.result import Gap, Step
 from elastocal.diagnosis.scene import Scene
 from elastocal.identification.solve import PLACED_EFFECTS

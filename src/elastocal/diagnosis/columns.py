@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.model_cache import made_once
 from elastocal.diagnosis.tangent import with_tangents
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.effects.driven import DrivenEffect
@@ -121,7 +122,8 @@ def compute_columns(
         deflection_model="linear",
     )
     extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
-    whole = Model(chain, replace(cell, model=spec), extra)
+    key = "columns", spec.effects
+    whole = made_once(model, key, lambda: Model(chain, replace(cell, model=spec), extra))
     at = dict(zip(model.names, base.x, strict=True)) | (found or {})
     x = np.array([at.get(p.name, p.nominal) for p in whole.parameters])
     seen = observe(table, whole.observe)
@@ -160,12 +162,21 @@ class Drive:
         u = effect.drive(self._arm, hypothesis.where, {**fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
-        self._tape = Tape([*self._arm.inputs.values(), constants], [D])
+        # Most drives ask for one or two numbers of a row: evaluated at thousands of settings, all
+        # that the arm declared would be copied as many times.
+        declared = ca.vertcat(*self._arm.inputs.values())
+        used = [k for k in range(declared.numel()) if ca.depends_on(D, declared[k])]
+        self._used = np.array(used, dtype=np.int64)
+        asked = ca.vertcat(ca.SX.zeros(0, 1), *(declared[k] for k in used))
+        self._tape = Tape([asked, constants], [D])
+
+    def asked(self, table: Measurements) -> Array:
+        """What D depends on in each row of the table (n_rows, quantities)."""
+        return np.concatenate(row_inputs(self._arm, table), axis=1)[:, self._used]
 
     def __call__(self, table: Measurements, settings: Array) -> Array:
-        """D (G, n_rows, d, k) at each of the `settings` (G, number of settings)."""
-        inputs = row_inputs(self._arm, table)
+        """D (n_rows, G, d, k) at each of the `settings` (G, number of settings)."""
         G, n = len(settings), len(table)
-        tiled = [np.tile(a, (G, 1)) for a in inputs]
-        D = self._tape(*tiled, np.repeat(settings, n, axis=0))[0]
-        return np.broadcast_to(D, (G * n, *D.shape[1:])).reshape(G, n, *D.shape[1:])
+        asked = np.repeat(self.asked(table), G, axis=0)
+        D = self._tape(asked, np.tile(settings, (n, 1)))[0]
+        return np.asarray(D.reshape(n, G, *D.shape[1:]))

@@ -18,7 +18,6 @@ from elastocal.diagnosis.generic import generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.listing import candidates, too_small, warnings
 from elastocal.diagnosis.locate import location, structure_tests
-from elastocal.diagnosis.noise import fit_noise
 from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.diagnosis.play_law import with_likelier_play
 from elastocal.diagnosis.recorded_drivers import model_keys, with_recorded_drivers
@@ -130,8 +129,8 @@ def _searched(
 
 
 def _search(scene: Scene, options: DiagnosisOptions) -> Search:
-    noise = fit_noise(scene.data)
-    return Search(scene, generic_blocks(scene), noise, options.false_alarm, options.seed)
+    blocks = generic_blocks(scene)
+    return Search(scene, blocks, scene.noise, options.false_alarm, options.seed)
 
 
 def _check_enough(table: Measurements) -> None:

@@ -22,16 +22,18 @@ Array = NDArray[np.float64]
 SCALES = np.array([0.3, 1.0, 3.0])
 # A size that nobody has stated is known to an order of magnitude at best.
 UNSIZED_SCALES = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
+FEW = 3  # columns of a group that is turned entry by entry
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """V groups of K columns: eigenvalues `lam` (V, K) of A, `beta` (V, K) = Uᵀb, and `parts`
-    (C, V, K): what each configuration's residual brings to β when its sign is its own."""
+    """V groups of K columns: eigenvalues `lam` (V, K) of A, `beta` (V, K) = Uᵀb, and `flips`
+    (F, V, K): β of residuals whose configurations had their signs flipped, F = 0 unless asked
+    for."""
 
     lam: Array
     beta: Array
-    parts: Array
+    flips: Array
 
     @classmethod
     def joined(cls, pieces: list[Spectrum]) -> Spectrum:
@@ -40,7 +42,7 @@ class Spectrum:
             return pieces[0]
         return cls(
             np.concatenate([s.lam for s in pieces]), np.concatenate([s.beta for s in pieces]),
-            np.concatenate([s.parts for s in pieces], axis=1),
+            np.concatenate([s.flips for s in pieces], axis=1),
         )  # fmt: skip
 
     @property
@@ -57,11 +59,9 @@ class Spectrum:
         """Log evidence (V,) over the model without the group."""
         return evidence_of(self.lam, self.beta, scales)
 
-    def flipped(self, signs: Array, scales: Array = SCALES) -> Array:
-        """Log evidence (F, V) with every configuration's residual times its sign (F, C)."""
-        C, V, K = self.parts.shape
-        beta = (signs @ self.parts.reshape(C, -1)).reshape(-1, V, K)
-        return evidence_of(self.lam, beta, scales)
+    def flipped(self, scales: Array = SCALES) -> Array:
+        """Log evidence (F, V) of the residuals with flipped signs."""
+        return evidence_of(self.lam, self.flips, scales)
 
 
 def exceedance(flipped: Array, observed: float) -> float:
@@ -70,25 +70,38 @@ def exceedance(flipped: Array, observed: float) -> float:
 
 
 def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:
-    """Log evidence (…,) from eigenvalues (…, K) and β (…, K)."""
-    squared = beta**2
-    each = []
-    for s in scales:
-        log_det = np.log1p(s**2 * lam).sum(axis=-1)
-        shrunk = s**2 / (1 + s**2 * lam)
-        each.append(0.5 * ((squared * shrunk).sum(axis=-1) - log_det))
-    stacked = np.stack(each)
-    top = stacked.max(axis=0)
-    return np.asarray(top + np.log(np.exp(stacked - top).mean(axis=0)))
+    """Log evidence (…,) from eigenvalues (V, K) and β (…, V, K); mixed over `scales` (S,)."""
+    squared = scales[:, None, None] ** 2
+    log_det = np.log1p(squared * lam).sum(axis=-1)
+    each = np.einsum("...vk,svk->s...v", beta**2, squared / (1 + squared * lam))
+    each -= log_det.reshape(len(scales), *[1] * (beta.ndim - 2), -1)
+    each *= 0.5
+    top = each.max(axis=0)
+    each -= top
+    return np.asarray(top + np.log(np.exp(each, out=each).mean(axis=0)))
 
 
-def spectrum(A: Array, b: Array, parts: Array) -> Spectrum:
-    """Of Gram matrices A (V, K, K), b (V, K) and the configurations' parts (C, V, K)."""
+def log_sum(values: Array, axis: int = -1) -> Array:
+    """log Σ exp of finite values along an axis."""
+    top = values.max(axis=axis, keepdims=True)
+    return np.asarray(np.log(np.exp(values - top).sum(axis=axis)) + top.squeeze(axis))
+
+
+def spectrum(A: Array, b: Array, flips: Array) -> Spectrum:
+    """Of Gram matrices A (V, K, K), b (V, K) and those of flipped residuals (F, V, K)."""
     lam, U = np.linalg.eigh(A)
-    parts = np.einsum("vkl,cvk->cvl", U, parts, optimize=True)
-    beta = np.einsum("vkl,vk->vl", U, b)
+    beta, flips = _turned(b[None], U)[0], _turned(flips, U)
     # Rounding leaves a tiny β along directions that P removes altogether.
     gone = lam <= 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
-    return Spectrum(
-        np.where(gone, 0.0, lam), np.where(gone, 0.0, beta), np.where(gone[None], 0.0, parts)
-    )
+    return Spectrum(*(np.where(gone, 0.0, each) for each in (lam, beta, flips)))
+
+
+def _turned(b: Array, U: Array) -> Array:
+    """Σ_k b_fvk U_vkl (F, V, K)."""
+    if U.shape[1] > FEW:
+        return np.asarray((b.transpose(1, 0, 2) @ U).transpose(1, 0, 2))
+    # Thousands of tiny products: sums over their few entries are faster than a call for each.
+    out = np.empty_like(b)
+    for j in range(U.shape[1]):
+        out[..., j] = sum(b[..., k] * U[:, k, j] for k in range(U.shape[1]))
+    return out

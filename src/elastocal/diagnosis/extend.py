@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from elastocal.cell import Cell
 from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.model_cache import made_once
 from elastocal.diagnosis.model_set import Item
 from elastocal.manipulator.model import Model
 
@@ -24,7 +25,8 @@ def extended(model: Model, items: Sequence[Item]) -> Model:
             settings.setdefault(item.what.where, {})[setting.key] = float(value)
     nominal = replace(spec.nominal, settings=settings)
     cell: Cell = replace(model.cell, model=replace(spec, effects=tuple(effects), nominal=nominal))
-    return Model(model.chain, cell)
+    key = "extended", tuple(effects), repr(settings)
+    return made_once(model, key, lambda: Model(model.chain, cell))
 
 
 def settings_of(item: Item) -> dict[str, float]:

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.blocks import Blocks
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, Projection, covariance
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, covariance
+from elastocal.diagnosis.projection import Projection
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,14 +14,9 @@ from elastocal.diagnosis.evidence import SCALES
 from elastocal.diagnosis.generic import Generic
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.noise import (
-    NoiseValues,
-    NoisyData,
-    Projection,
-    fit_noise,
-    log_prior,
-    project,
-)
+from elastocal.diagnosis.noise import NoiseValues, NoisyData, log_prior
+from elastocal.diagnosis.noise_fit import fit_noise
+from elastocal.diagnosis.projection import Projection, Weighted, project
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]
@@ -119,26 +113,33 @@ def packed_columns(scene: Scene, item: Item) -> Array:
 
 def fit_set(scene: Scene, items: tuple[Item, ...], start: NoiseValues | None = None) -> ModelSet:
     """Fit the noise beside the items, twice where their best scale is not the typical one."""
-    columns = [packed_columns(scene, item) for item in items]
+    scales, noise = tuple(1.0 for _ in items), start
+    joined = with_items(scene, items, scales)
 
-    def joined(scales: tuple[float, ...]) -> NoisyData:
-        return _joined(scene.data, columns, scales)
+    def at(scales: tuple[float, ...]) -> NoisyData:
+        return replace(joined, precision=_precision(scene.data, items, scales))
 
-    scales = tuple(1.0 for _ in items)
-    noise = start
     for _ in range(2):
-        noise = fit_noise(joined(scales), noise)
-        best, mixed = _mixed_scales(joined, items, scales, noise)
+        noise = fit_noise(at(scales), noise)
+        weighted = Weighted.of(joined, noise)
+        best, mixed = _mixed_scales(scene.data, weighted, items, scales)
         if best == scales:
             break
         scales = best
     assert noise is not None
-    mixed += _within_bounds(items, joined(scales), noise)
+    data = at(scales)
+    mixed += _within_bounds(items, weighted.projection(data.precision))
     prior = sum(item.log_prior for item in items) - 0.5 * log_prior(scene.data.stated, noise)[0]
-    return ModelSet(items, noise, joined(scales), mixed + prior, scales)
+    return ModelSet(items, noise, data, mixed + prior, scales)
 
 
-def _within_bounds(items: tuple[Item, ...], data: NoisyData, noise: NoiseValues) -> float:
+def _precision(data: NoisyData, items: tuple[Item, ...], scales: tuple[float, ...]) -> Array:
+    """Of the coefficients of the data's columns and of the items'."""
+    own = [np.full(item.width, 1 / s**2) for item, s in zip(items, scales, strict=True)]
+    return np.concatenate([data.precision, *own])
+
+
+def _within_bounds(items: tuple[Item, ...], at: Projection) -> float:
     """Σ log 2Φ(mean/deviation) over parameters that cannot be below their nominal zero.
 
     A compliance's size prior is one half of the Gaussian; the evidence gains or loses by the
@@ -151,7 +152,6 @@ def _within_bounds(items: tuple[Item, ...], data: NoisyData, noise: NoiseValues)
     ]
     if not any(bounded):
         return 0.0
-    at = project(data, noise)
     z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
     total = 0.0
     for item, span in zip(items, spans_of(items, len(z)), strict=True):
@@ -162,22 +162,20 @@ def _within_bounds(items: tuple[Item, ...], data: NoisyData, noise: NoiseValues)
 
 
 def _mixed_scales(
-    joined: Callable[[tuple[float, ...]], NoisyData],
-    items: tuple[Item, ...],
-    scales: tuple[float, ...],
-    noise: NoiseValues,
+    data: NoisyData, weighted: Weighted, items: tuple[Item, ...], scales: tuple[float, ...]
 ) -> tuple[tuple[float, ...], float]:
     """The best scale of each item, the others' at theirs, and the evidence with scales mixed.
 
     Scales of different items hardly depend on each other: the log of each one's mean over its
-    scales, less its best, adds up.
+    scales, less its best, adds up.  Only the prior differs from scale to scale: `weighted`, the
+    data with the items' columns, stays.
     """
     if not items:
-        return scales, project(joined(scales), noise).marginal
+        return scales, weighted.marginal(data.precision)
     spent = 0.0
     for k, item in enumerate(items):
         trials = [(*scales[:k], float(s), *scales[k + 1 :]) for s in item.scales]
-        each = np.array([project(joined(t), noise).marginal for t in trials])
+        each = np.array([weighted.marginal(_precision(data, items, t)) for t in trials])
         scales, top = trials[int(np.argmax(each))], float(each.max())
         spent += float(logsumexp(each)) - np.log(len(each)) - top
     return scales, top + spent
@@ -215,15 +213,13 @@ def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
 
 def with_items(scene: Scene, items: tuple[Item, ...], scales: tuple[float, ...]) -> NoisyData:
     """The scene's data with the items' columns at the given scales."""
-    return _joined(scene.data, [packed_columns(scene, item) for item in items], scales)
+    if not items:
+        return scene.data
+    columns = np.concatenate([packed_columns(scene, item) for item in items], axis=2)
+    p = len(scene.data.precision)
+    return scene.data.with_columns(columns, _precision(scene.data, items, scales)[p:])
 
 
 def beside(scene: Scene, chosen: ModelSet, k: int) -> NoisyData:
     """The set's data without item k."""
     return with_items(scene, chosen.without(k), chosen.scales[:k] + chosen.scales[k + 1 :])
-
-
-def _joined(data: NoisyData, columns: list[Array], scales: tuple[float, ...]) -> NoisyData:
-    for C, s in zip(columns, scales, strict=True):
-        data = data.with_columns(C, np.full(C.shape[2], 1 / s**2))
-    return data

@@ -2,14 +2,8 @@
 
     V = a² Σ_stated + Σ_j s_j² g_j g_jᵀ ∘ (same visit + c² · same configuration)
 
-with g_j = ∂(reading)/∂q_j.  a, s_j and c maximise the likelihood of the residuals with the fitted
-parameters β ~ N(0, Λ⁻¹) integrated out,
-
-    −2 ℓ = log|V| + rᵀPr + log|XᵀV⁻¹X + Λ| − log|Λ| + n log 2π,
-    P = V⁻¹ − V⁻¹X (XᵀV⁻¹X + Λ)⁻¹ XᵀV⁻¹,
-
-(restricted likelihood where Λ → 0; Patterson and Thompson 1971), times priors that keep what the
-data do not show near its usual size.  ∂(−2ℓ)/∂θ = tr(P V_θ) − rᵀP V_θ P r.
+with g_j = ∂(reading)/∂q_j.  a, s_j and c maximise the marginal likelihood of the residuals
+(projection.py) times priors that keep what the data do not show near its usual size.
 """
 
 from __future__ import annotations
@@ -19,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize
 
 from elastocal.diagnosis.blocks import Blocks
 
@@ -33,9 +26,6 @@ STATED_SPREAD, UNSTATED_SPREAD = 0.5, 3.0
 REPEATABILITY, REPEATABILITY_SPREAD = 8e-6, 1.5
 JOINT_SPREAD = 0.7
 SHARED, SHARED_SPREAD = 0.2, 1.2
-ROUNDING = 1e-12
-STRIDE, STRIDES = 1.5, 6  # of the logarithms
-ENOUGH = 0.01  # change of −2ℓ at which a search ends
 SMALLEST, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact
 
 
@@ -105,97 +95,46 @@ class NoisyData:
 
     def masked(self, packed: Array) -> Array:
         """Rows that do not count set to zero (C, m, …)."""
+        if not self.left_out.any():
+            return packed
         keep = ~self.left_out
         return packed * keep.reshape(keep.shape + (1,) * (packed.ndim - 2))
+
+    @cached_property
+    def counting(self) -> Counting:
+        """What is evaluated at many noises, rows that do not count set to zero once."""
+        G, keep = self.masked(self.G), ~self.left_out
+        both = keep[:, :, None] & keep[:, None, :]
+        visit = self.blocks.places.one_hot
+        by_visit = (visit[..., None] * G[:, :, None, :]).reshape(*G.shape[:2], -1)
+        by_visit = np.ascontiguousarray(by_visit.transpose(0, 2, 1))
+        return Counting(
+            self.masked(self.r), self.masked(self.X), G, by_visit,
+            self.covariance if keep.all() else self.covariance * both,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Counting:
+    """Residual, columns, joint columns, those of each visit by itself (C, visits·joints, m), and
+    stated covariance, with zeros where nothing counts."""
+
+    r: Array
+    X: Array
+    G: Array
+    by_visit: Array
+    covariance: Array
 
 
 def covariance(data: NoisyData, noise: NoiseValues) -> Array:
     """V (C, m, m); rows left out have unit variance of their own."""
-    by_joint = (data.G * noise.joint**2) @ data.G.transpose(0, 2, 1)
-    V = noise.factor**2 * data.covariance + by_joint * (data.same_visit + noise.shared**2)
-    keep = ~data.left_out
-    V = V * (keep[:, :, None] & keep[:, None, :])
+    of = data.counting
+    V = (of.G * noise.joint**2) @ of.G.transpose(0, 2, 1)
+    V *= data.same_visit + noise.shared**2
+    V += noise.factor**2 * of.covariance
     m = np.arange(V.shape[1])
     V[:, m, m] += data.left_out
     return V
-
-
-@dataclass(frozen=True)
-class Projection:
-    """The data under one noise: V⁻¹ (C, m, m), H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
-
-    P = V⁻¹ − HHᵀ; `u` = P r (C, m); `beta` (p,) the posterior mean β̂; `marginal` the log marginal
-    likelihood ℓ.
-    """
-
-    inverse: Array
-    H: Array
-    u: Array
-    beta: Array
-    marginal: float
-    factor: Array
-
-    @cached_property
-    def spread(self) -> tuple[Array, Array]:
-        """V⁻¹e and Hᵀe, (C, m) and (C, p), of residuals e that scatter as the noise does.
-
-        The fit's own residuals are too small, its leverage less than V: u_c has the covariance
-        P_cc, so e_c = V_c^½ P_cc^−½ u_c has V_c (Bell and McCaffrey 2002).
-        """
-        P = self.inverse - self.H @ self.H.transpose(0, 2, 1)
-        e = _power(self.inverse, -0.5) @ (_power(P, -0.5) @ self.u[..., None])
-        return (self.inverse @ e)[..., 0], (self.H.transpose(0, 2, 1) @ e)[..., 0]
-
-    @property
-    def beta_deviation(self) -> Array:
-        """L⁻¹ (p, p): the posterior covariance of β is L⁻ᵀL⁻¹."""
-        return linalg.solve_triangular(self.factor, np.eye(len(self.factor)), lower=True)
-
-
-def _power(blocks: Array, exponent: float) -> Array:
-    """Symmetric powers of positive definite matrices (C, m, m)."""
-    values, vectors = np.linalg.eigh(blocks)
-    values = np.maximum(values, ROUNDING * values[:, -1:]) ** exponent
-    return np.asarray((vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1))
-
-
-def project(data: NoisyData, noise: NoiseValues) -> Projection:
-    V = covariance(data, noise)
-    X, r = data.masked(data.X), data.masked(data.r)
-    C, m, p = X.shape
-    L = np.linalg.cholesky(V)
-    log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
-    inverse: Array = np.asarray(np.linalg.inv(V))
-    VX = inverse @ X
-    M = X.reshape(-1, p).T @ VX.reshape(-1, p)
-    # What no reading shows and the prior leaves wide must not drown in rounding.
-    M += np.diag(data.precision + ROUNDING * np.diag(M).max(initial=0.0))
-    factor: Array = linalg.cholesky(M, lower=True)
-    log_det += 2 * float(np.log(np.diag(factor)).sum()) - float(np.log(data.precision).sum())
-    H: Array = linalg.solve_triangular(factor, VX.reshape(-1, p).T, lower=True).T.reshape(C, m, p)
-    Vr = (inverse @ r[..., None])[..., 0]
-    z = H.reshape(-1, p).T @ r.ravel()
-    squares = float(r.ravel() @ Vr.ravel() - z @ z)
-    minus_two = log_det + squares + data.n_rows * float(np.log(2 * np.pi))
-    beta = linalg.solve_triangular(factor, z, lower=True, trans="T")
-    return Projection(inverse, H, Vr - H @ z, beta, -0.5 * minus_two, factor)
-
-
-def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
-    """−2 log of marginal likelihood times prior, and its slope in the logarithms (2 + joints,)."""
-    at = project(data, noise)
-    Q = at.inverse - at.H @ at.H.transpose(0, 2, 1) - at.u[:, :, None] * at.u[:, None, :]
-    keep = ~data.left_out
-    Q = Q * (keep[:, :, None] & keep[:, None, :])
-    slope = np.empty(2 + data.G.shape[2])
-    slope[0] = 2 * noise.factor**2 * float((Q * data.covariance).sum())
-    G = data.G
-    by_visit = ((Q * data.same_visit) @ G * G).sum(axis=(0, 1))
-    by_block = (Q @ G * G).sum(axis=(0, 1))
-    slope[1] = 2 * noise.shared**2 * float(by_block @ noise.joint**2)
-    slope[2:] = 2 * noise.joint**2 * (by_visit + noise.shared**2 * by_block)
-    prior, prior_slope = log_prior(data.stated, noise)
-    return -2 * at.marginal + prior, slope + prior_slope
 
 
 def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
@@ -214,55 +153,3 @@ def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
     away = joints - np.log(REPEATABILITY)
     slope[2:] = 2 * inverse @ away
     return float(z @ z + away @ inverse @ away), slope
-
-
-def fit_noise(data: NoisyData, start: NoiseValues | None = None) -> NoiseValues:
-    """The most probable noise values, by a quasi-Newton search in their logarithms.
-
-    Where nothing is stated it starts from two ends, unless a start is given.
-    """
-    if start is not None:
-        return _climbed(data, start)
-    starts = [NoiseValues.usual(data.G.shape[2])]
-    if not data.stated:
-        starts.append(_balanced(data))
-    ends = [_climbed(data, s) for s in starts]
-    return min(ends, key=lambda end: likelihood(data, end)[0])
-
-
-def _balanced(data: NoisyData) -> NoiseValues:
-    """Instrument and joints share the scatter of the data equally.
-
-    From far below it the likelihood is flat in a joint's logarithm, and no climb leaves.
-    """
-    used = ~data.left_out
-    whole = float((data.r[used] ** 2).mean())
-    shape = float(np.diagonal(data.covariance, axis1=1, axis2=2)[used].mean())
-    moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)
-    joint = np.clip(np.sqrt(0.5 * whole / (len(moved) * moved)), SMALLEST, LARGEST)
-    return NoiseValues(float(np.sqrt(0.5 * whole / shape)), joint, SHARED)
-
-
-def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
-    n = data.G.shape[2]
-
-    def cost(theta: Array) -> tuple[float, Array]:
-        return likelihood(data, NoiseValues.of_logs(theta))
-
-    spread = STATED_SPREAD if data.stated else UNSTATED_SPREAD
-    lower = np.array([-4 * spread, -5.0] + [np.log(SMALLEST)] * n)
-    upper = np.array([4 * spread, 2.0] + [np.log(LARGEST)] * n)
-    theta = np.clip(start.logs(), lower, upper)
-    ftol = ENOUGH / max(abs(cost(theta)[0]), 1.0)
-    # Step by step: one long stride of the line search ends where V is singular to rounding.
-    for _ in range(STRIDES):
-        low, high = np.maximum(lower, theta - STRIDE), np.minimum(upper, theta + STRIDE)
-        found = optimize.minimize(
-            cost, theta, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-            options={"maxiter": 60, "ftol": ftol, "gtol": 3e-2},
-        )  # fmt: skip
-        theta = found.x
-        inside = (theta > low) & (theta < high) | (theta == lower) | (theta == upper)
-        if inside.all():
-            break
-    return NoiseValues.of_logs(theta)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.noise import LARGEST, SMALLEST, NoiseValues, NoisyData, likelihood
+from elastocal.diagnosis.noise import LARGEST, SMALLEST, NoiseValues, NoisyData
+from elastocal.diagnosis.projection import likelihood, posterior
 
 Array = NDArray[np.float64]
 
@@ -26,18 +27,19 @@ def noise_draws(
     theta = noise.logs()
     k = len(theta)
 
-    def minus_two(at: Array) -> tuple[float, Array]:
-        return likelihood(data, NoiseValues.of_logs(at))
+    def slope(at: Array) -> Array:
+        return likelihood(data, NoiseValues.of_logs(at))[1]
 
     H = np.empty((k, k))
     for i, e in enumerate(STEP * np.eye(k)):
-        H[i] = (minus_two(theta + e)[1] - minus_two(theta - e)[1]) / (2 * STEP)
+        H[i] = (slope(theta + e) - slope(theta - e)) / (2 * STEP)
     values, vectors = np.linalg.eigh((H + H.T) / 2)
     root = vectors * np.sqrt(2 / np.maximum(values, FLATTEST))
     z = rng.normal(size=(TRIED * n, k))
     drawn = theta + z @ root.T
     drawn[:, 2:] = np.clip(drawn[:, 2:], np.log(SMALLEST), np.log(LARGEST))
-    log_weight = np.array([-0.5 * minus_two(t)[0] for t in drawn]) + 0.5 * (z**2).sum(axis=1)
+    minus_two = np.array([posterior(data, NoiseValues.of_logs(t)) for t in drawn])
+    log_weight = -0.5 * minus_two + 0.5 * (z**2).sum(axis=1)
     weight = np.exp(log_weight - log_weight.max())
     kept = rng.choice(len(drawn), n, p=weight / weight.sum())
     return [NoiseValues.of_logs(drawn[i]) for i in kept]

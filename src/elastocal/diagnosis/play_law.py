@@ -14,7 +14,8 @@ import numpy as np
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.model_set import Item, fit_set
-from elastocal.diagnosis.noise import NoiseValues, fit_noise, project
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.manipulator.model import Model
 
@@ -30,7 +31,7 @@ def with_likelier_play(scene: Scene) -> Scene:
     play = [h for h in scene.hypotheses if h.name == EFFECT]
     if spec.play_side != BY_BOTH or not play:
         return scene
-    noise = fit_noise(scene.data)
+    noise = scene.noise
     other = _under(scene.base, BY_LOAD)
     under_other = scene_of(other, play)
     under_other = replace(under_other, data=replace(under_other.data, left_out=scene.data.left_out))

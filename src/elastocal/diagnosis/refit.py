@@ -12,9 +12,11 @@ from scipy import linalg
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.result import FittedParameter
 from elastocal.diagnosis.scene import Scene, away, widths
+from elastocal.manipulator.model import Regression
 
 Array = NDArray[np.float64]
 
@@ -53,13 +55,15 @@ class Linear:
         base: Baseline,
         further: Array | None = None,
         prior: Mapping[str, float] | None = None,
+        at: Regression | None = None,
     ) -> Linear:
-        """`prior` holds standard deviations of parameters by name, where they are not wide."""
+        """`prior` holds standard deviations of parameters by name, where they are not wide; `at`
+        spares evaluating the model at the fit."""
         seen = base.seen
         known = prior or {}
         names = base.model.names
         width = np.array([known.get(n, w) for n, w in zip(names, widths(base), strict=True)])
-        at = base.model.regressor(seen.table, base.x, observations=seen)
+        at = at or base.model.regressor(seen.table, base.x, observations=seen)
         B = at.B * width
         residual = at.residual + B @ (away(base) / width)
         centre = base.x - away(base)

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from elastocal.diagnosis.columns import is_driven
+from elastocal.diagnosis.evidence import log_sum
 from elastocal.diagnosis.generic import Generic
 from elastocal.diagnosis.gram import Grams, scales_of
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, Projection, project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
 from elastocal.diagnosis.prior import Prior
+from elastocal.diagnosis.projection import Projection, project
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]
@@ -60,7 +61,7 @@ def scan(
     `signs` (F, C) of ±1 are the flips.
     """
     at = project(data, noise)
-    grams = Grams(scene, data, at)
+    grams = Grams(scene, data, at, signs)
     scored, blocks = [], []
     total, flips = [], []
     for h, weight in zip(scene.hypotheses, prior.hypotheses, strict=True):
@@ -69,13 +70,13 @@ def scan(
         log_prior = np.zeros(1) if grid is None else grid.log_prior
         scales = scales_of(h)
         each = found.evidence(scales)
-        evidence = float(logsumexp(each + log_prior))
+        evidence = float(log_sum(each + log_prior))
         k = int(np.argmax(each + log_prior))
         settings = np.zeros(0) if grid is None else grid.values[k]
         scored.append(Scored(evidence, float(each[k]), settings, float(found.distance[k])))
         total.append(weight + evidence)
         if len(signs):
-            flips.append(weight + logsumexp(found.flipped(signs, scales) + log_prior, axis=1))
+            flips.append(weight + log_sum(found.flipped(scales) + log_prior))
     drivers: dict[str, list[float]] = {}
     driver_flips: dict[str, list[Array]] = {}
     for g, weight in zip(generic, prior.blocks, strict=True):
@@ -85,12 +86,12 @@ def scan(
         total.append(weight + evidence)
         drivers.setdefault(g.driver, []).append(evidence)
         if len(signs):
-            flipped = found.flipped(signs)[:, 0]
+            flipped = found.flipped()[:, 0]
             flips.append(weight + flipped)
             driver_flips.setdefault(g.driver, []).append(flipped)
     return Scan(
-        tuple(scored), tuple(blocks), float(logsumexp(total)) - prior.total,
-        logsumexp(np.array(flips), axis=0) - prior.total if flips else np.zeros(0),
+        tuple(scored), tuple(blocks), float(log_sum(np.array(total))) - prior.total,
+        log_sum(np.array(flips), axis=0) - prior.total if flips else np.zeros(0),
         {d: max(v) for d, v in drivers.items()},
         {d: np.max(v, axis=0) for d, v in driver_flips.items()}, at, noise,
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.diagnosis.blocks import Blocks
+from elastocal.diagnosis.blocks import Blocks, VisitPlaces
 from elastocal.diagnosis.columns import (
     Columns,
     Drive,
@@ -20,9 +20,9 @@ from elastocal.diagnosis.columns import (
     typical_sizes,
 )
 from elastocal.diagnosis.hypotheses import Hypothesis, recorded
-from elastocal.diagnosis.noise import NoisyData
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.noise_fit import fit_noise
 from elastocal.diagnosis.settings_grid import Grid, grid_of, moments_between
-from elastocal.diagnosis.sums import VisitPlaces
 from elastocal.identification.solve import is_placed
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
@@ -34,8 +34,10 @@ Mask = NDArray[np.bool_]
 # Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough
 # to leave them to the data, narrow enough that what no reading shows stays where it is.
 FITTED, FITTED_COMPLIANCE = 5.0, 1.0
-PLACED = 5e-3  # m or rad: base and markers, which the fit has placed already
-KEPT = 1_000_000  # numbers of a search's drives that are kept from scan to scan
+# m or rad: base and markers.  The fit has placed them, but an error that it took for another
+# geometry may have moved them by as much; the true effect must be free to bring them back.
+PLACED = 0.1
+KEPT = 20_000_000  # numbers of a search's drives that are kept from scan to scan
 # The load hangs on a flange frame that the markers' freedom leaves undetermined to millimetres.
 LOAD_POINT_TOLERANCE = 2e-3
 
@@ -67,8 +69,17 @@ class Scene:
     load_point: Array | None = None
 
     @cached_property
+    def _packed(self) -> dict[EntryKey | tuple[str, str], Array]:
+        return {}
+
+    @cached_property
     def _kept(self) -> dict[tuple[str, str, bytes], Array]:
         return {}
+
+    @cached_property
+    def noise(self) -> NoiseValues:
+        """The most probable noise beside the fitted parameters alone."""
+        return fit_noise(self.data)
 
     @cached_property
     def visit_table(self) -> Measurements:
@@ -87,7 +98,10 @@ class Scene:
         return self.blocks.pack(self.columns.observed(rows))
 
     def entry(self, key: EntryKey) -> Array:
-        return self.pack(self.columns.entry(key))
+        """Packed columns (C, m, d) of an entry; not to be written to."""
+        if key not in self._packed:
+            self._packed[key] = self.pack(self.columns.entry(key))
+        return self._packed[key]
 
     @cached_property
     def sizes(self) -> dict[tuple[str, str], Array]:
@@ -123,28 +137,50 @@ class Scene:
         return np.zeros(0) if time is None else moments_between(time[self.present.ravel()])
 
     def drive(self, h: Hypothesis, settings: Array) -> Array:
-        """D (G, C, v, d, k) at each visit, per typical size, at `settings` (G, …)."""
+        """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)
+        where all visits of a configuration are driven alike."""
         key = h.name, h.where, settings.tobytes()
         if key in self._kept:
             return self._kept[key]
-        D = self.drives[h.name, h.where](self.visit_table, settings)
-        D = D.reshape(len(settings), *self.present.shape, *D.shape[2:])
-        D = D * self.present[None, :, :, None, None] * self.sizes[h.name, h.where]
-        if D.size < KEPT:
+        visits, present = self._driven_visits[h.name, h.where]
+        D = self.drives[h.name, h.where](visits, settings) * self.sizes[h.name, h.where]
+        D = D.reshape(*present.shape, *D.shape[1:]) * present[:, :, None, None, None]
+        D = np.ascontiguousarray(D.transpose(0, 1, 3, 2, 4))
+        if D.size + sum(kept.size for kept in self._kept.values()) <= KEPT:
             self._kept[key] = D
         return D
 
+    @cached_property
+    def _driven_visits(self) -> dict[tuple[str, str], tuple[Measurements, Mask]]:
+        """Of each driven hypothesis the visits (C·v) that its drive is evaluated at and which of
+        them there are (C, v): one of each configuration where the others are driven alike."""
+        every, present = self.visit_table, self.present
+        first = np.zeros_like(present)
+        first[:, 0] = True
+        one_each = every.take(first.ravel())
+        out = {}
+        for key, drive in self.drives.items():
+            asked = drive.asked(every).reshape(*present.shape, -1)
+            alike = (asked == asked[:, :1]) | ~present[:, :, None]
+            out[key] = (one_each, present[:, :1]) if alike.all() else (every, present)
+        return out
+
     def packed(self, h: Hypothesis, settings: Array) -> Array:
-        """Columns (C, m, k) of a hypothesis at one value of its `settings` (…,), scaled."""
+        """Columns (C, m, k) of a hypothesis at one value of its `settings` (…,), scaled; not to be
+        written to."""
         size = self.sizes[h.name, h.where]
         if not is_driven(h):
-            return self.pack(self.columns.of(h)) * size
-        D = self.drives[h.name, h.where](self.base.seen.table, settings[None])[0]
+            if (h.name, h.where) not in self._packed:
+                self._packed[h.name, h.where] = self.pack(self.columns.of(h)) * size
+            return self._packed[h.name, h.where]
+        D = self.drives[h.name, h.where](self.base.seen.table, settings[None])[:, 0]
         rows = self.columns.entry(entry_key(h, self.base.model)) @ D
         return self.pack(rows) * size
 
     def without(self, faulty: Mask) -> Scene:
         """The same with the observations where `faulty` (N,) holds left out."""
+        if (faulty == self.data.faulty).all():
+            return self
         return replace(self, data=self.data.without(faulty))
 
 
@@ -202,9 +238,7 @@ def scene_of(
         stated=base.stated is not None,
     )
     fitted = FittedColumns(tuple(e for e, u in zip(effects, used, strict=True) if u), width[used])
-    return Scene(
-        base, columns, tuple(hypotheses), blocks, VisitPlaces.of(blocks), data, fitted, load_point
-    )
+    return Scene(base, columns, tuple(hypotheses), blocks, blocks.places, data, fitted, load_point)
 
 
 def away(base: Baseline) -> Array:

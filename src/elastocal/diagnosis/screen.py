@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, Projection, project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.projection import Projection, project
 from elastocal.diagnosis.result import FaultyReading
 from elastocal.diagnosis.scene import Scene
 

@@ -33,6 +33,7 @@ CLOSE_BLOCKS = 3
 CLEARLY = 10.0  # nats by which several named effects must beat fewer without a name
 PART = 0.3
 MOST_EFFECTS, MOST_BESIDE_UNKNOWN = 4, 2
+KEPT = 4  # scans that are kept, the last ones
 
 
 def base_score(scene: Scene, current: ModelSet, seen: Scan) -> float:
@@ -60,6 +61,7 @@ class Search:
     _start: Scene = field(init=False)
     _visited: set[frozenset[int]] = field(init=False, default_factory=set)
     _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
+    _scanned: dict[tuple, Scan] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
@@ -98,7 +100,7 @@ class Search:
             p_values.append(p)
             if is_far(self.scene, current):
                 self.scene = relinearised(self.scene, current)
-                self._fitted.clear()
+                self._forget()
                 current = fit_set(self.scene, current.items, current.noise)
                 seen = self._scan(current)
             if len(current.items) > 1:
@@ -121,11 +123,16 @@ class Search:
         if not named.chosen.items or named.chosen.score < found.chosen.score + CLEARLY:
             return found
         self.scene = named.scene
-        self._fitted.clear()
+        self._forget()
         chosen, slots, _ = self._reexamined(named.chosen, list(named.slots), found.alone)
         return replace(
             found, scene=self.scene, chosen=chosen, slots=tuple(slots), p_values=named.p_values
         )
+
+    def _forget(self) -> None:
+        """What was fitted and scanned about another scene is void."""
+        self._fitted.clear()
+        self._scanned.clear()
 
     def _been_at(self, chosen: ModelSet) -> bool:
         """Whether the search has come round to a set that it had; noted either way."""
@@ -137,14 +144,26 @@ class Search:
     def _scan(
         self, current: ModelSet, noise: NoiseValues | None = None, flips: bool = False
     ) -> Scan:
-        return scan(
+        noise = noise or current.noise
+        items = tuple((id(item.what), item.settings.tobytes()) for item in current.items)
+        # Sets that a step has judged come again when its items are re-examined; a scan with flips
+        # holds what one without them does.
+        key = items, current.scales, noise.logs().tobytes()
+        for known in (True, flips):
+            if (*key, known) in self._scanned:
+                return self._scanned[*key, known]
+        seen = scan(
             self.scene,
             self.generic,
             self._prior(current),
             current.data,
-            noise or current.noise,
+            noise,
             self.signs if flips else self.signs[:0],
         )
+        self._scanned[*key, flips] = seen
+        while len(self._scanned) > KEPT:
+            self._scanned.pop(next(iter(self._scanned)))
+        return seen
 
     def _prior(self, current: ModelSet) -> Prior:
         """Of one item more."""

@@ -162,7 +162,7 @@ def _posterior_draws(rivals: RivalSet, rows: Rows, rng: np.random.Generator) -> 
         lam, U = np.linalg.eigh(S[of, of])
         lam = np.maximum(lam, 0.0)
         beta = U.T @ S[of, -1]
-        each = [float(evidence_of(lam, beta, np.array([s]))) for s in item.scales]
+        each = [evidence_of(lam[None], beta[None], np.array([s]))[0] for s in item.scales]
         precision = lam + 1 / item.scales[int(np.argmax(each))] ** 2
         z = rng.normal(size=(DRAWS, len(lam))) / np.sqrt(precision)
         out.append((beta / precision + np.concatenate([z, -z])) @ U.T)

@@ -12,7 +12,8 @@ from scipy.special import softmax
 from elastocal.diagnosis.generic import Generic, generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.model_set import Item, packed_columns
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.sums import direct

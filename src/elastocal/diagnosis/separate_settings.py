@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from elastocal.diagnosis.gram import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, packed_columns, with_items
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.separate_rivals import RivalSet
 

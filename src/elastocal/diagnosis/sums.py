@@ -6,75 +6,43 @@ all readings of a visit, times the visit's drive D (d, k).  So
     CᵀV⁻¹C = Σ_blocks Σ_{v,w} D_vᵀ (E_vᵀV⁻¹E_w) D_w,
     HᵀC = Σ_v (H_vᵀE_v) D_v,   CᵀPr = Σ_v D_vᵀ E_vᵀu
 
-and a search over thousands of drives costs a few small products each.
+and a search over thousands of drives costs a few products of matrices, all of them at once.
+Where a drive is the same in all visits of a configuration, the sums over visits come first.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.blocks import Blocks
+from elastocal.diagnosis.blocks import VisitPlaces
 from elastocal.diagnosis.evidence import Spectrum, spectrum
-from elastocal.diagnosis.noise import Projection
+from elastocal.diagnosis.projection import Projection
 
 Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
-
-PIECE = 4_000_000  # numbers held at a time
-FEW = 4
-
-
-@dataclass(frozen=True)
-class VisitPlaces:
-    """Where visits stand in the blocks: `one_hot` (C, m, v), and an observation of each visit,
-    `example` (C, v), −1 where a block has fewer visits."""
-
-    one_hot: Array
-    example: Labels
-
-    @classmethod
-    def of(cls, blocks: Blocks) -> VisitPlaces:
-        member = blocks.member
-        visit = np.concatenate([blocks.visit, [-1]])[member]
-        local = np.full(visit.shape, -1)
-        most = 1
-        for c, row in enumerate(visit):
-            known, first, inverse = np.unique(row, return_index=True, return_inverse=True)
-            order = np.argsort(np.argsort(np.where(known < 0, len(row), first)))
-            local[c] = np.where(row < 0, -1, order[inverse])
-            most = max(most, int(local[c].max()) + 1)
-        one_hot = (local[:, :, None] == np.arange(most)).astype(float)
-        example = np.full((len(member), most), -1, dtype=np.int64)
-        for v in range(most):
-            there = one_hot[:, :, v].any(axis=1)
-            example[there, v] = member[there, one_hot[there, :, v].argmax(axis=1)]
-        return cls(np.repeat(one_hot, blocks.size, axis=1), example)
-
-    def gather(self, values: Array) -> Array:
-        """Per observation (N, …) → per visit (C, v, …), zero where there is none."""
-        out = values[np.maximum(self.example, 0)]
-        out[self.example < 0] = 0.0
-        return out
 
 
 @dataclass(frozen=True)
 class EntrySums:
     """Of one entry under one noise: `local` (C, v, d, v, d), `H` (p, C, v, d), `b` (C, v, d).
 
-    `flip` (C, v, d) and `h` (C, p) are of residuals whose signs may be flipped.
+    `flip` (C, v, d) and `h` (F, p) are of residuals that are flipped by `signs` (F, C).
     """
 
     local: Array
     H: Array
     b: Array
+    signs: Array
     flip: Array
     h: Array
 
     @classmethod
-    def of(cls, E: Array, places: VisitPlaces, at: Projection) -> EntrySums:
+    def of(
+        cls, E: Array, places: VisitPlaces, at: Projection, signs: Array | None = None
+    ) -> EntrySums:
         """E (C, m, d): the entry's packed columns, zero in rows that do not count."""
         C, m, d = E.shape
         v = places.one_hot.shape[2]
@@ -82,49 +50,67 @@ class EntrySums:
         local = wide.transpose(0, 2, 1) @ (at.inverse @ wide)
         H = at.H.transpose(0, 2, 1) @ wide  # (C, p, v·d)
         b = np.einsum("cmk,cm->ck", wide, at.u)
-        flip = np.einsum("cmk,cm->ck", wide, at.spread[0])
+        signs, u, h = _flipped(at, signs)
+        flip = np.einsum("cmk,cm->ck", wide, u)
         return cls(
             local.reshape(C, v, d, v, d), H.transpose(1, 0, 2).reshape(-1, C, v, d),
-            b.reshape(C, v, d), flip.reshape(C, v, d), at.spread[1],
+            b.reshape(C, v, d), signs, flip.reshape(C, v, d), h,
+        )  # fmt: skip
+
+    @cached_property
+    def _of_configurations(self) -> EntrySums:
+        """The same for drives that do not differ within a configuration: v = 1."""
+        return replace(
+            self, local=self.local.sum(axis=(1, 3), keepdims=True),
+            H=self.H.sum(axis=2, keepdims=True), b=self.b.sum(axis=1, keepdims=True),
+            flip=self.flip.sum(axis=1, keepdims=True),
         )  # fmt: skip
 
     def driven(self, D: Array) -> Spectrum:
-        """Spectrum of the groups with drives D (V, C, v, d, k)."""
-        V, C, v, d, k = D.shape
-        each = max(1, PIECE // (C * v * d * k * max(k, v * d)))
-        return Spectrum.joined([self._driven(D[i : i + each]) for i in range(0, V, each)])
-
-    def _driven(self, D: Array) -> Spectrum:
-        V, C, v, d, k = D.shape
-        flat = D.reshape(V, C, v * d, k)
-        local = self.local.reshape(C, v * d, v * d)
-        moved = _times(local, flat)
-        A = flat.reshape(V, -1, k).transpose(0, 2, 1) @ moved.reshape(V, -1, k)
-        Z = self.H.reshape(len(self.H), -1) @ flat.reshape(V, -1, k)
-        A = A - Z.transpose(0, 2, 1) @ Z
-        b = np.einsum("gcik,ci->gk", flat, self.b.reshape(C, -1))
-        parts = np.einsum("gcik,ci->cgk", flat, self.flip.reshape(C, -1))
-        return spectrum(A, b, parts - np.tensordot(self.h, Z, (1, 1)))
-
-
-def _times(local: Array, flat: Array) -> Array:
-    """local (C, n, n) times flat (V, C, n, k), matrix by matrix."""
-    n = local.shape[1]
-    if n > FEW:
-        return np.asarray(local[None] @ flat)
-    # Millions of tiny products: sums over their few entries are faster than calls for each.
-    moved = np.empty_like(flat)
-    for i in range(n):
-        moved[:, :, i] = sum(local[:, i, j, None] * flat[:, :, j] for j in range(n))
-    return moved
+        """Spectrum of the groups with drives D (C, v, d, V, k), or (C, 1, d, V, k) where all
+        visits of a configuration are driven alike."""
+        if D.shape[1] < self.b.shape[1]:
+            return self._of_configurations.driven(D)
+        C, v, d, V, k = D.shape
+        n = v * d
+        flat = D.reshape(C, n, V * k)
+        local = self.local.reshape(C, n, n)
+        moved = local * flat if n == 1 else local @ flat
+        Z = self.H.reshape(-1, C * n) @ flat.reshape(C * n, V * k)
+        A = _each_with_each(flat.reshape(-1, V, k), moved.reshape(-1, V, k))
+        A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
+        b = self.b.ravel() @ flat.reshape(C * n, V * k)
+        flips = np.zeros((len(self.signs), V * k))
+        if len(flips):
+            own = np.einsum("ci,cig->cg", self.flip.reshape(C, n), flat)
+            flips = self.signs @ own - self.h @ Z
+        return spectrum(A, b.reshape(V, k), flips.reshape(-1, V, k))
 
 
-def direct(C: Array, at: Projection) -> Spectrum:
-    """Spectrum of one group of packed columns C (blocks, m, k), zero in rows that do not count."""
+def _each_with_each(a: Array, b: Array) -> Array:
+    """Σ_r a_rvk b_rvl (V, K, K) of a and b (R, V, K)."""
+    return np.asarray(a.transpose(1, 2, 0) @ b.transpose(1, 0, 2))
+
+
+def _flipped(at: Projection, signs: Array | None) -> tuple[Array, Array, Array]:
+    """The signs (F, C), what they flip in a projected residual, Σ_c signs (Hᵀe)_c (F, p)."""
+    if signs is None or not len(signs):
+        return np.zeros((0, len(at.u))), np.zeros_like(at.u), np.zeros((0, at.H.shape[2]))
+    u, h = at.spread
+    return signs, u, signs @ h
+
+
+def direct(C: Array, at: Projection, signs: Array | None = None) -> Spectrum:
+    """Spectrum of one group of packed columns C (blocks, m, k), zero in rows that do not count.
+
+    `signs` (F, blocks) are the flips that it holds.
+    """
     k = C.shape[2]
     A = C.reshape(-1, k).T @ (at.inverse @ C).reshape(-1, k)
     Z = at.H.reshape(-1, at.H.shape[2]).T @ C.reshape(-1, k)
-    u, h = at.spread
     b = np.einsum("cmk,cm->k", C, at.u)
-    parts = np.einsum("cmk,cm->ck", C, u) - h @ Z
-    return spectrum((A - Z.T @ Z)[None], b[None], parts[:, None, :])
+    signs, u, h = _flipped(at, signs)
+    flips = np.zeros((0, k))
+    if len(signs):
+        flips = signs @ np.einsum("cmk,cm->ck", C, u) - h @ Z
+    return spectrum((A - Z.T @ Z)[None], b[None], flips[:, None, :])

@@ -18,11 +18,13 @@ from elastocal.diagnosis.fresh import fresh_table
 from elastocal.diagnosis.heldout import left_out_residual, squared_lengths
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, beside, fit_set
-from elastocal.diagnosis.noise import NoiseValues, project
+from elastocal.diagnosis.noise import NoiseValues
 from elastocal.diagnosis.noise_draws import noise_draws
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.refit import Linear, Posterior
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.uncertain_settings import other_settings
+from elastocal.manipulator.model import Model, Regression
 from elastocal.manipulator.observation import Observations, observe
 
 Array = NDArray[np.float64]
@@ -60,11 +62,27 @@ class Confirmation:
     @cached_property
     def parameters(self) -> Posterior:
         """The exact model's values, weighted by all the noise that was found."""
-        return Linear.of(self.scene, self.fitted).posterior(self.chosen.noise)
+        measured = self._regressions(self.fitted)[0]
+        return Linear.of(self.scene, self.fitted, at=measured).posterior(self.chosen.noise)
 
     @cached_property
     def _after(self) -> Array:
-        return self._calibrated(self.fitted)
+        return self._regressions(self.fitted)[1].prediction
+
+    @cached_property
+    def _known_regressions(self) -> dict[tuple[Model, bytes], tuple[Regression, Regression]]:
+        return {}
+
+    def _regressions(self, base: Baseline) -> tuple[Regression, Regression]:
+        """A model at the measured rows and at the fresh ones; kept, since the truths of all items
+        begin with the one that was fitted."""
+        key = base.model, base.x.tobytes()
+        if key not in self._known_regressions:
+            self._known_regressions[key] = (
+                base.model.regressor(base.seen.table, base.x, observations=base.seen),
+                base.model.regressor(self.seen.table, base.x, observations=self.seen),
+            )
+        return self._known_regressions[key]
 
     def truths(self, k: int, rivals: tuple[tuple[Item, float], ...]) -> list[Truth]:
         """Errors without and with item k if the truth is item k at any plausible setting, or one
@@ -113,8 +131,8 @@ class Confirmation:
     ) -> list[Truth]:
         """If that model is true, under each of the noises."""
         measured, fresh = self._by_constant(base, known, item)
-        linear = Linear.of(self.scene, base, measured, self._prior(known))
-        at = base.model.regressor(self.seen.table, base.x, observations=self.seen)
+        here, at = self._regressions(base)
+        linear = Linear.of(self.scene, base, measured, self._prior(known), here)
         B = np.hstack([at.B, fresh])
         start = np.append(base.x, np.zeros(measured.shape[1]))
         size = self.seen.size

@@ -14,7 +14,7 @@ from elastocal.diagnosis.gram import Grams
 from elastocal.diagnosis.heldout import squared_lengths
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, beside
-from elastocal.diagnosis.noise import project
+from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]

@@ -1,8 +1,10 @@
 """Denavit–Hartenberg table → nominal chain.
 
-    standard:  T_{i-1,i} = Rz(θ_i + q_i) Tz(d_i) Tx(a_i) Rx(α_i)
-    modified:  T_{i-1,i} = Rx(α_{i-1}) Tx(a_{i-1}) Rz(θ_i + q_i) Tz(d_i)      (Craig)
+    standard:  T_{i-1,i} = Rz(θ_i + q_i) Tz(d_i) Tx(a_i) Rx(α_i) Ry(β_i)
+    modified:  T_{i-1,i} = Rx(α_{i-1}) Tx(a_{i-1}) Ry(β_{i-1}) Rz(θ_i + q_i) Tz(d_i)      (Craig)
 
+β is Hayati's fifth parameter for nearly parallel axes (Hayati 1983), zero where the table has no
+such column.  Rows of type fixed have no q: they place the first axis in the base, or the flange.
 In the modified convention row i holds α_{i-1} and a_{i-1}.  A prismatic joint adds its q to d
 instead of θ.  Each joint of the chain moves about or along z of its own frame.  That frame is
 DH frame i (modified), or DH frame i−1 turned by θ_i about z (standard, where DH frame i sits at
@@ -36,7 +38,8 @@ from elastocal.nearest import did_you_mean, listed
 
 Convention = Literal["standard", "modified"]
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
-X, Z = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+FIXED = "fixed"
 # Beyond these a unit in the header is wrong: two turns, and longer than any arm's link.
 MAX_ANGLE, MAX_LENGTH = 4 * math.pi, 50.0
 
@@ -45,6 +48,7 @@ DH_COLUMNS = (
     Quantity("d", LENGTH, "length"),
     Quantity("a", LENGTH, "length"),
     Quantity("alpha", ANGLE, "angle"),
+    Quantity("beta", ANGLE, "angle", required=False),
     Quantity("lower", ANGLE, "angular limit", required=False),
     Quantity("upper", ANGLE, "angular limit", required=False),
     Quantity("lower travel", LENGTH, "limit of travel", required=False, shared_header="lower"),
@@ -66,10 +70,11 @@ def read_dh(
 ) -> Chain:
     """The chain of a DH table in CSV, one row per joint.
 
-    Columns theta0_rad|deg, d_m|mm, a_m|mm, alpha_rad|deg; optional: joint (name), type
-    (revolute|prismatic), limits lower_/upper_rad|deg for revolute and lower_/upper_m|mm for
-    prismatic joints (blank: none).  masses_path: CSV with link (1…n, linkN or the joint's name),
-    mass_kg, com_x_m, com_y_m, com_z_m, the centre of mass in DH frame i; every link once.
+    Columns theta0_rad|deg, d_m|mm, a_m|mm, alpha_rad|deg; optional: beta_rad|deg, joint (name),
+    type (revolute|prismatic|fixed), limits lower_/upper_rad|deg for revolute and
+    lower_/upper_m|mm for prismatic joints (blank: none).  masses_path: CSV with link (1…n, linkN or
+    the joint's name), mass_kg, com_x_m, com_y_m, com_z_m, the centre of mass in DH frame i; every
+    link once.
 
     Raises InputError, naming file, row and column.
     """
@@ -80,19 +85,25 @@ def read_dh(
             " is unknown; valid: standard, modified"
         )
     table = read_table(path, DH_COLUMNS, ("joint", "type"))
-    if not MIN_JOINTS <= len(table.rows) <= MAX_JOINTS:
+    moving = [row for row in table.rows if row.texts["type"] != FIXED]
+    if not MIN_JOINTS <= len(moving) <= MAX_JOINTS:
         raise InputError(
-            f"{path}: {len(table.rows)} rows below the header, one per joint; "
+            f"{path}: {len(moving)} rows below the header, one per joint; "
             f"{MIN_JOINTS} to {MAX_JOINTS} joints are supported"
         )
-    before, after = zip(*(_link(row, table, convention) for row in table.rows), strict=True)
-    names = _joint_names(path, table.rows)
-    joints, passed = [], np.eye(4)
-    for row, joint_name, T_before, T_after in zip(table.rows, names, before, after, strict=True):
+    waiting = iter(_joint_names(path, moving))
+    joints, after, passed = [], [], np.eye(4)
+    for row in table.rows:
+        T_before, T_after = _link(row, table, convention)
+        if row.texts["type"] == FIXED:
+            passed = passed @ T_before @ T_after
+            continue
         kind = _kind(row)
         lower, upper = _limits(row, kind, table)
-        joints.append(Joint(joint_name, kind, passed @ T_before, np.array(Z), lower, upper))
+        joints.append(Joint(next(waiting), kind, passed @ T_before, np.array(Z), lower, upper))
         passed = T_after
+        after.append(T_after)
+    names = [joint.name for joint in joints]
     masses = () if masses_path is None else _masses(Path(masses_path), names, after)
     return Chain(name or path.stem, tuple(joints), passed, masses)
 
@@ -104,9 +115,12 @@ def _link(row: Row, table: Table, convention: str) -> tuple[Array, Array]:
     )
     Rz_theta, Tz_d = _rotation(Z, theta0), _translation(Z, d)
     Tx_a, Rx_alpha = _translation(X, a), _rotation(X, alpha)
+    Ry_beta = _rotation(Y, 0.0)
+    if row.numbers.get("beta") is not None:
+        Ry_beta = _rotation(Y, _plausible(row, "beta", table.column_of["beta"]))
     if convention == "standard":
-        return _numbers(Rz_theta), _numbers(Tz_d @ Tx_a @ Rx_alpha)
-    return _numbers(Rx_alpha @ Tx_a @ Rz_theta @ Tz_d), np.eye(4)
+        return _numbers(Rz_theta), _numbers(Tz_d @ Tx_a @ Rx_alpha @ Ry_beta)
+    return _numbers(Rx_alpha @ Tx_a @ Ry_beta @ Rz_theta @ Tz_d), np.eye(4)
 
 
 def _rotation(axis: tuple[float, float, float], angle: float) -> ca.SX:
@@ -142,7 +156,7 @@ def _kind(row: Row) -> JointKind:
         return "prismatic" if text == "prismatic" else "revolute"
     raise InputError(
         f"{row.where}, column type: unknown joint type '{text}'"
-        f"{did_you_mean(text, ('revolute', 'prismatic'))}; valid: revolute, prismatic"
+        f"{did_you_mean(text, ('revolute', 'prismatic', FIXED))}; valid: revolute, prismatic, fixed"
     )
 
 

@@ -1,7 +1,7 @@
 """A small CSV of names and numbers with units in its header, checked cell by cell.
 
 For robot descriptions of a few rows (DH tables, link masses); every complaint names file, row
-(line in the file, header included) and column.
+(line in the file, header included) and column.  Rows that begin with # are comments.
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
             raise InputError(f"{path}: too large for a table of a few rows; check the path")
         text = path.read_text(encoding="utf-8-sig")
         reader = csv.reader(text.splitlines(), strict=True)
-        return [(reader.line_num, cells) for cells in reader]
+        lines = [(reader.line_num, cells) for cells in reader]
+        return [(n, cells) for n, cells in lines if not (cells and cells[0].startswith("#"))]
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path") from None
     except UnicodeDecodeError:

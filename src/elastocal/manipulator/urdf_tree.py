@@ -13,6 +13,8 @@ from elastocal.nearest import did_you_mean, listed
 
 Vector = tuple[float, float, float]
 MOVING = ("revolute", "continuous", "prismatic")
+# Links that `elastocal export` hangs on a flange; none of them is a flange itself.
+TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ class Tree:
 
     def last_link(self, base: str) -> str:
         """The only leaf below `base` that enough moving joints carry to be a flange."""
-        leaves = [link for link in self._below(base) if not self._child_joints[link]]
+        leaves = [link for link in self._below(base) if self._is_leaf(link)]
         able = [leaf for leaf in leaves if len(self._moving(base, leaf)) >= MIN_JOINTS]
         choice = able or leaves
         if len(choice) > 1:
@@ -135,6 +137,11 @@ class Tree:
                 "name the right one as `flange`"
             )
         return choice[0]
+
+    def _is_leaf(self, link: str) -> bool:
+        """Does nothing hang on the link but tool frames that `export` has added?"""
+        below = (joint.child for joint in self._child_joints[link])
+        return not link.startswith(TOOL_FRAMES) and all(c.startswith(TOOL_FRAMES) for c in below)
 
     def _moving(self, base: str, flange: str) -> list[UrdfJoint]:
         joints = self.joints_between(base, flange) or ()

@@ -31,37 +31,39 @@ def write_mjcf(
     """
     root = ET.Element("mujoco", model="elastic arm")
     ET.SubElement(root, "compiler", angle="radian")
-    ET.SubElement(root, "option", gravity=_text(gravity))
+    ET.SubElement(root, "option", gravity=numbers(gravity))
     parent = ET.SubElement(root, "worldbody")
     for i, (joint, k) in enumerate(zip(chain.joints, compliance, strict=True)):
-        parent = ET.SubElement(parent, "body", _body(f"link{i + 1}", joint.placement))
+        parent = ET.SubElement(parent, "body", placed_body(f"link{i + 1}", joint.placement))
         body = masses[i] if masses else LinkMass(0.0, np.zeros(3))
         ET.SubElement(
             parent,
             "inertial",
-            pos=_text(body.com),
+            pos=numbers(body.com),
             mass=repr(max(float(body.mass), NO_MASS)),
-            diaginertia=_text([NO_INERTIA] * 3),
+            diaginertia=numbers([NO_INERTIA] * 3),
         )
         ET.SubElement(
             parent,
             "joint",
             name=f"joint{i + 1}",
             type="slide" if joint.kind == "prismatic" else "hinge",
-            axis=_text(joint.axis),
+            axis=numbers(joint.axis),
             stiffness=repr(1.0 / float(k)) if k > 0 else "0",
             armature="1",  # keeps the mass matrix regular; without motion it exerts no force
         )
-    flange = ET.SubElement(parent, "body", _body("flange", chain.flange_placement))
+    flange = ET.SubElement(parent, "body", placed_body("flange", chain.flange_placement))
     for name, position in sites.items():
-        ET.SubElement(flange, "site", name=name, pos=_text(position))
+        ET.SubElement(flange, "site", name=name, pos=numbers(position))
     return ET.tostring(root, encoding="unicode")
 
 
-def _body(name: str, T: Array) -> dict[str, str]:
+def placed_body(name: str, T: Array) -> dict[str, str]:
+    """Attributes of a body or site called `name` at T (4, 4) in the frame of its parent."""
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-    return {"name": name, "pos": _text(T[:3, 3]), "quat": _text((w, x, y, z))}
+    return {"name": name, "pos": numbers(T[:3, 3]), "quat": numbers((w, x, y, z))}
 
 
-def _text(numbers: ArrayLike) -> str:
-    return " ".join(repr(float(value)) for value in np.asarray(numbers, dtype=float))
+def numbers(values: ArrayLike) -> str:
+    """Numbers separated by blanks, each with the digits that give the same double back."""
+    return " ".join(repr(float(value)) for value in np.asarray(values, dtype=float))

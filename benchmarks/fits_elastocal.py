@@ -1,0 +1,70 @@
+"""elastocal's side of fits_peers.py: one fit, timed.
+
+    python benchmarks/fits_elastocal.py auto|ols|plain[+compiled] FOLDER OUT.npz
+
+`auto`: what `elastocal identify` does without options.  `ols`: the same with `--method ols`.
+`plain`: only placing, choosing parameters, fitting and covariance, by the API; no held-out
+residuals, faulty readings, noise models or diagnostics.  `+compiled`: with the backend "compiled",
+which ELASTOCAL_BACKEND chooses and which finds in its cache what it has compiled before.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from fits_clock import Clock
+
+clock = Clock()
+with clock.step("import"):
+    from dataclasses import replace
+
+    import numpy as np
+
+    # What reading would import when first called.
+    import elastocal.cell_reader
+    import elastocal.manipulator.effects
+    import elastocal.manipulator.urdf
+    import elastocal.measurement_reader  # noqa: F401
+    from elastocal.cli.identify import load_inputs
+    from elastocal.identification.identify import identify
+    from elastocal.identification.noise import Weights
+    from elastocal.identification.options import Options
+    from elastocal.identification.solve import Problem, settle, sizes_and_check
+    from elastocal.identification.start import start_values
+    from elastocal.manipulator.backend import set_default_backend
+    from elastocal.manipulator.model import Model
+    from elastocal.manipulator.observation import observe
+    from elastocal.measurements import Measurements
+
+
+def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
+    """Values (parameters,) of least squares in a minimal complete set, and the size of that set."""
+    seen = observe(table, model.observe)
+    every = np.arange(len(model.parameters))
+    weights = Weights("none", None, False, "")
+    problem = Problem(model, seen, weights, start_values(model, table), every)
+    settled = settle(problem, sizes_and_check(problem))
+    settled.fit.cofactor()
+    return settled.fit.x, len(settled.reduction.kept)
+
+
+def main(how: str, folder: Path, out: Path) -> None:
+    given = np.load(folder / "given.npz")
+    method, _, backend = how.partition("+")
+    set_default_backend(backend or None)
+    with clock.step("read"):
+        model, (table,) = load_inputs(folder / "cell.toml", [folder / "data.csv"])
+    with clock.step("fit"):
+        if method == "plain":
+            x, p = plain(model, table)
+        else:
+            result = identify(model, table, Options(method=method))
+            x, p = result.x, len(result.determined)
+    n = len(given["fresh_q"])
+    fresh = replace(table.take(np.zeros(n, dtype=np.int64)), q=given["fresh_q"])
+    np.savez(out, predicted=model.predict(fresh, x).reshape(n, 3), parameters=p, **clock.seconds)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))

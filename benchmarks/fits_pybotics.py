@@ -1,0 +1,71 @@
+"""pybotics' side of fits_peers.py: one calibration, timed.
+
+    PEERS_PYTHON benchmarks/fits_pybotics.py lengths|components FOLDER OUT.npz
+
+`lengths`: as its calibration example does it, the length of each reading's error handed to scipy's
+least_squares with its defaults.  `components`: its x, y and z instead, which its `Robot.fk` allows
+and the example does not do.  Runs in the peers' environment, imports nothing of elastocal.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from fits_clock import Clock
+
+clock = Clock()
+with clock.step("import"):
+    import numpy as np
+    from pybotics.geometry import vector_2_matrix
+    from pybotics.optimization import OptimizationHandler, optimize_accuracy
+    from pybotics.robot import Robot
+    from pybotics.tool import Tool
+    from scipy.optimize import least_squares
+
+# What is estimated of α, a, θ, d of each link, chosen by hand: pybotics has no choice of its own.
+# The base takes up all of link 1, the tool θ and d of the last link; axes 2, 3 and 4 are parallel
+# and share one d.
+ESTIMATED = [[0, 0, 0, 0], [1, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 0, 0]]
+
+
+def components(vector: Any, handler: OptimizationHandler, qs: Any, points: Any) -> Any:
+    handler.apply_optimization_vector(vector)
+    return (positions(handler.robot, qs) - points).ravel()
+
+
+def positions(robot: Robot, qs: Any) -> Any:
+    return np.array([robot.fk(q)[:3, 3] for q in qs])
+
+
+def main(residual: str, folder: Path, out: Path) -> None:
+    given = np.load(folder / "given.npz")
+    with clock.step("read"):
+        # The start of base and tool comes from whoever measures: 10 mm and half a degree off.
+        base = given["base"] + np.array([0.01, -0.01, 0.01, 0.01, -0.01, 0.01])
+        robot = Robot.from_parameters(given["table"].copy())
+        robot.world_frame = vector_2_matrix(base)
+        robot.tool = Tool()
+        robot.tool.position = given["marker"] + np.array([-0.01, 0.01, -0.01])
+        handler = OptimizationHandler(
+            robot,
+            kinematic_chain_mask=np.array(ESTIMATED, dtype=bool).ravel(),
+            tool_mask=np.array([1, 1, 1, 0, 0, 0], dtype=bool),
+            world_mask=np.ones(6, dtype=bool),
+        )
+    with clock.step("fit"):
+        found = least_squares(
+            optimize_accuracy if residual == "lengths" else components,
+            handler.generate_optimization_vector(),
+            args=(handler, given["q"], given["points"]),
+        )
+    handler.apply_optimization_vector(found.x)
+    np.savez(
+        out, predicted=positions(handler.robot, given["fresh_q"]), parameters=len(found.x),
+        evaluations=found.nfev, status=found.status, **clock.seconds,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))

@@ -1,0 +1,193 @@
+"""elastocal export: the calibrated arm for other programs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from elastocal.cli.app import (
+    CellFile,
+    Json,
+    Seed,
+    app,
+    check_outputs,
+    console,
+    progress_line,
+    reporting_errors,
+)
+from elastocal.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from elastocal.export.cost import Cost
+    from elastocal.export.export import Exported
+
+
+@app.command()
+@reporting_errors
+def export(
+    cell: CellFile,
+    result: Annotated[Path, typer.Argument(help="Result of identify (JSON).")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", help="File to write: .urdf, .xml or .mjcf, .csv (DH), .yaml, .json."
+        ),
+    ],
+    format: Annotated[
+        str | None,
+        typer.Option(help="urdf, mjcf, dh, mdh (modified DH), yaml, json; default: by the ending."),
+    ] = None,
+    load: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Force in N at the load point (tracker's axes) to state costs under."),
+    ] = None,
+    frames: Annotated[
+        bool,
+        typer.Option("--frames/--no-frames", help="URDF: links for markers and load point."),
+    ] = True,
+    base_frame: Annotated[
+        bool,
+        typer.Option("--base-frame", help="Put the tracker's frame above the robot's base."),
+    ] = False,
+    temperature_c: Annotated[
+        float | None, typer.Option("--temperature-c", help="Temperature in °C to export at.")
+    ] = None,
+    time_s: Annotated[
+        float | None, typer.Option("--time-s", help="Time in s, as in the data, to export at.")
+    ] = None,
+    poses: Annotated[
+        int, typer.Option(min=2, max=1_000_000, help="Random poses to find costs at.")
+    ] = 500,
+    seed: Seed = 0,
+    as_json: Json = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Write the calibrated arm as URDF, MJCF, DH table or parameters, and say what that loses.
+
+    Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
+    """
+    import numpy as np
+
+    from elastocal.export.export import Wish
+    from elastocal.export.export import export as run
+    from elastocal.export.formats import format_of
+    from elastocal.export.kept import Conditions
+    from elastocal.export.urdf import Frames
+    from elastocal.files import atomic_write_text
+    from elastocal.manipulator.calibrated import read_calibrated
+
+    chosen = format_of(output, format)
+    check_outputs(output)
+    for name, value in (("--temperature-c", temperature_c), ("--time-s", time_s)):
+        if value is not None and not np.isfinite(value):
+            raise InputError(f"{name} takes a finite number; found {value}")
+    force = np.zeros(3) if load is None else np.array(load)
+    if not np.isfinite(force).all():
+        raise InputError(f"--load takes three finite numbers in N; found {force.tolist()}")
+    wish = Wish(
+        format=chosen,
+        frames=Frames(tool=frames, base=base_frame),
+        conditions=Conditions(force, time_s, temperature_c),
+        poses=poses,
+        seed=seed,
+    )
+    with progress_line(quiet) as progress:
+        progress("reading")
+        calibrated = read_calibrated(cell, result)
+        _keep_inputs(output, cell, result, calibrated.model.cell.robot)
+        done = run(calibrated, wish, progress)
+    atomic_write_text(output, done.text)
+    if as_json:
+        typer.echo(json.dumps({"output": str(output)} | done.to_json(), indent=1, allow_nan=False))
+        return
+    _tell(done)
+    typer.echo(f"wrote {output}")
+
+
+def _keep_inputs(output: Path, *inputs: object) -> None:
+    """Refuse to write over what the calibration was read from."""
+    for given in inputs:
+        paths = [given] if isinstance(given, Path) else [given.urdf, given.dh]  # type: ignore[attr-defined]
+        for path in paths:
+            if path is not None and output.exists() and output.samefile(path):
+                raise InputError(
+                    f"{output}: is an input of this export; write to another file, so that the "
+                    "nominal robot is kept"
+                )
+
+
+def _tell(done: Exported) -> None:
+    """What the file holds and what not, for people."""
+    from elastocal.report.units import length
+    from elastocal.report.words import printable
+
+    screen = console()
+    cost, (name, in_title) = done.cost, NAMES[done.format]
+    if cost.effects:
+        screen.print(_cost_table(f"What {in_title} cannot hold", cost))
+    force = ", ".join(f"{v:g}" for v in cost.force)
+    held = list(done.held)
+    more = f" and {len(held) - 8} more" if len(held) > 8 else ""
+    for wanted, sentence in (
+        (not cost.effects, f"{name} holds all of the calibrated model."),
+        (
+            cost.effects,
+            f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
+            f"joint limits under a load of ({force}) N, each effect left out alone.",
+        ),
+        (
+            done.checked is not None,
+            f"Read back with {done.checked_with}: {length(done.checked or 0.0)} at most.",
+        ),
+        (
+            done.without_beta is not None,
+            f"Without the column beta_rad: {length(done.without_beta or 0.0)} at most.",
+        ),
+        (
+            held,
+            "Held, as the data do not determine them on their own, at the values that the "
+            f"identification predicts with: {', '.join(held[:8])}{more}.",
+        ),
+        (
+            done.of_the_measurement,
+            f"Of the measurement, not of the arm, and left out: "
+            f"{', '.join(done.of_the_measurement)}.",
+        ),
+        *((True, f"Note: {warning}.") for warning in done.warnings),
+    ):
+        if wanted:
+            screen.print(printable(sentence), markup=False)
+
+
+def _cost_table(title: str, cost: Cost) -> Table:
+    from elastocal.report.console_table import titled
+    from elastocal.report.units import length
+    from elastocal.report.words import printable
+
+    table = titled(title)
+    for head in ("effect", "markers rms", "max", "flange rms", "max", ""):
+        table.add_column(head, justify="left" if head in ("effect", "") else "right")
+    rows = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
+    for name, d, note in [*rows, ("all of it", cost.total, "")]:
+        cells = [""] * 4
+        if d is not None:
+            sizes = (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
+            cells = [length(size) for size in sizes]
+        table.add_row(printable(name), *cells, printable(note))
+    return table
+
+
+# At the start of a sentence and in a title.
+NAMES = {
+    "urdf": ("The URDF", "a URDF"),
+    "mjcf": ("The MJCF", "this MJCF"),
+    "dh": ("The DH table", "a DH table"),
+    "mdh": ("The DH table", "a DH table"),
+    "yaml": ("Geometry alone", "geometry alone"),
+    "json": ("Geometry alone", "geometry alone"),
+}

@@ -1,0 +1,93 @@
+"""The command line as a terminal's guest: completion, colours, Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support.exports import write_result
+from support.robots import KR270
+
+PROGRAM = "import sys; from elastocal.cli import main; sys.argv[0] = 'elastocal'; main()"
+# What a shell's completion script sets, for "elastocal exp".
+ASKED = {
+    "bash": {"COMP_WORDS": "elastocal exp", "COMP_CWORD": "1"},
+    "zsh": {"_TYPER_COMPLETE_ARGS": "elastocal exp"},
+    "fish": {"_TYPER_COMPLETE_ARGS": "elastocal exp", "_TYPER_COMPLETE_FISH_ACTION": "get-args"},
+}
+
+
+def elastocal(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("NO_COLOR", "FORCE_COLOR"))}
+    command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=clean | environment)
+
+
+@pytest.mark.parametrize("shell", ASKED)
+def test_a_shell_completes_the_verbs(shell: str) -> None:
+    done = elastocal(**ASKED[shell], _ELASTOCAL_COMPLETE=f"complete_{shell}")
+    assert "export" in done.stdout and "identify" not in done.stdout
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("shell", ASKED)
+def test_the_completion_script_is_of_this_command(shell: str) -> None:
+    # Which shell is running cannot be seen from within a test; then it is asked for by name.
+    off = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    done = elastocal("--show-completion", shell, **off)
+    assert done.returncode == 0 and "_ELASTOCAL_COMPLETE" in done.stdout
+    assert "python -m" not in done.stdout
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals of POSIX")
+@pytest.mark.parametrize("colours", [True, False])
+def test_no_color_is_obeyed_on_a_terminal(colours: bool, tmp_path: Path) -> None:
+    import pty
+
+    written = write_result(tmp_path, f'urdf = "{KR270}"', ["joint_offset", "joint_compliance"])
+    command = [sys.executable, "-c", PROGRAM, "export", *map(str, written)]
+    command += ["-o", str(tmp_path / "a.urdf"), "--load", "0", "0", "-100", "--poses", "5"]
+    environment = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "FORCE_COLOR")}
+    environment |= {"TERM": "xterm-256color"} | ({} if colours else {"NO_COLOR": "1"})
+    master, slave = pty.openpty()
+    with subprocess.Popen(command, stdout=slave, stderr=slave, env=environment) as process:
+        os.close(slave)
+        told = b""
+        while True:
+            try:
+                piece = os.read(master, 65536)
+            except OSError:  # the other end is closed
+                break
+            if not piece:
+                break
+            told += piece
+    os.close(master)
+    assert process.returncode == 0 and b"wrote" in told
+    # Colours are 30 to 37, 90 to 97, 38;… ; bold (1) is no colour.
+    assert bool(re.search(rb"\x1b\[(?:\d+;)*(?:3[0-8]|9[0-7])", told)) == colours
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_ctrl_c_ends_an_export_cleanly(tmp_path: Path) -> None:
+    written = write_result(tmp_path, f'urdf = "{KR270}"')
+    before = sorted(path.name for path in tmp_path.iterdir())
+    command = [sys.executable, "-c", PROGRAM, "export", *map(str, written)]
+    command += ["-o", str(tmp_path / "a.urdf"), "--poses", "1000000", "--load", "0", "0", "-100"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        assert process.stderr is not None
+        told = b""
+        while b"cannot hold" not in told:  # the long part has begun
+            told += os.read(process.stderr.fileno(), 4096)
+            assert process.poll() is None, told
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        told += process.communicate()[1]
+    assert process.returncode == 130
+    assert told.endswith(b"elastocal: interrupted\n") and b"Traceback" not in told
+    assert sorted(path.name for path in tmp_path.iterdir()) == before

@@ -1,0 +1,83 @@
+"""Spectra over settings against the columns of each setting, formed one by one."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from support.diagnosis_data import campaign
+
+from elastocal.diagnosis import gram, scene
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.gram import Grams
+from elastocal.diagnosis.hypotheses import Hypothesis, possible
+from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.projection import project
+from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.diagnosis.sums import direct
+
+NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
+TRIED = (
+    ("gear_ripple", "joint5"), ("encoder_jump", "joint2"), ("frame_jump", "tracker"),
+    ("base_drift", "base"), ("encoder_scale", "joint3"),
+)  # fmt: skip
+
+
+@lru_cache
+def made() -> Scene:
+    model, table = campaign(n=24)
+    hypotheses = [h for h in possible(model, table)[0] if (h.name, h.where) in TRIED]
+    return scene_of(fit_baseline(model, table), hypotheses)
+
+
+def fresh() -> Scene:
+    """The scene without what it has kept."""
+    known = made()
+    return Scene(
+        known.base, known.columns, known.hypotheses, known.blocks, known.places, known.data,
+        known.fitted, known.load_point,
+    )  # fmt: skip
+
+
+def hypothesis(name: str) -> Hypothesis:
+    return next(h for h in made().hypotheses if h.name == name)
+
+
+@pytest.mark.parametrize("held", [gram.HELD, 500])
+@pytest.mark.parametrize("name", [name for name, _ in TRIED])
+def test_every_setting_scores_as_the_columns_it_stands_for(
+    name: str, held: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gram, "HELD", held)
+    at = project(made().data, NOISE)
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], (5, len(made().blocks.member)))
+    h = hypothesis(name)
+    found = Grams(fresh(), made().data, at, signs).of_hypothesis(h)
+    values = made().grids[h.name, h.where].values
+    assert len(found.lam) == len(values)
+    for k in range(0, len(values), max(len(values) // 7, 1)):
+        expected = direct(made().data.masked(made().packed(h, values[k])), at, signs)
+        np.testing.assert_allclose(found.evidence()[k], expected.evidence()[0], atol=1e-6)
+        np.testing.assert_allclose(found.flipped()[:, k], expected.flipped()[:, 0], atol=1e-6)
+
+
+def test_what_follows_a_joint_angle_is_evaluated_once_for_a_configuration() -> None:
+    """Its visits under all loads stand at the same angles, at different times."""
+    known, visits = made(), made().present.shape[1]
+    assert visits > 1
+    for name, of_each in (("gear_ripple", 1), ("frame_jump", visits)):
+        h = hypothesis(name)
+        assert known.drive(h, known.grids[h.name, h.where].values[:3]).shape[1] == of_each
+
+
+def test_nothing_hangs_on_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    h = hypothesis("gear_ripple")
+    settings = made().grids[h.name, h.where].values
+    kept = made().drive(h, settings)
+    assert made().drive(h, settings) is kept
+    monkeypatch.setattr(scene, "KEPT", 0)
+    forgetful = fresh()
+    first = forgetful.drive(h, settings)
+    assert forgetful.drive(h, settings) is not first
+    np.testing.assert_array_equal(first, kept)

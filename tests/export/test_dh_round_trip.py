@@ -1,0 +1,119 @@
+"""A calibrated arm as DH table: exact, read back by `[robot] dh`, nominal where unchanged."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from support.cells import nominal_flanges
+from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, write_result
+from support.robots import KR270, packaged_urdf, random_chain_urdf
+
+from elastocal.export.dh_rows import NEARLY_PARALLEL, split
+from elastocal.manipulator.dh import read_dh
+
+CONVENTIONS = {"dh": "standard", "mdh": "modified"}
+
+
+def rows_of(text: str) -> list[dict[str, str]]:
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(io.StringIO("\n".join(lines))))
+
+
+def check(cell: Path, result: Path, format: str) -> list[dict[str, str]]:
+    calibrated, done = exported(cell, result, format)
+    path = cell.parent / "out.csv"
+    path.write_text(done.text)
+    chain = read_dh(path, CONVENTIONS[format])
+    q = poses_of(calibrated, 20, seed=3)
+    expected = flanges_in_base(calibrated, q, np.zeros(3))
+    assert np.abs(nominal_flanges(chain, q) - expected).max() < 1e-9
+    joints = calibrated.model.chain.joints
+    assert [(j.name, j.kind, j.lower, j.upper) for j in chain.joints] == [
+        (j.name, j.kind, j.lower, j.upper) for j in joints
+    ]
+    return rows_of(done.text)
+
+
+@pytest.mark.parametrize("format", CONVENTIONS)
+@pytest.mark.parametrize("name", ["UR5", "iiwa14", "KR270"])
+def test_robots_with_a_urdf(name: str, format: str, tmp_path: Path) -> None:
+    path, flange = (KR270, None) if name == "KR270" else packaged_urdf(name)
+    robot = f'urdf = "{path}"' + (f'\nflange = "{flange}"' if flange else "")
+    check(*write_result(tmp_path, robot, GEOMETRY), format)
+
+
+@pytest.mark.parametrize("format", CONVENTIONS)
+@pytest.mark.parametrize("seed", range(2))
+def test_slides_and_axes_anywhere(seed: int, format: str, tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(random_chain_urdf(seed))
+    robot = 'urdf = "arm.urdf"\nbase = "base"\nflange = "flange"'
+    check(*write_result(tmp_path, robot, GEOMETRY, seed=seed), format)
+
+
+@pytest.mark.parametrize("format", CONVENTIONS)
+def test_numbers_that_calibration_leaves_alone_are_the_users(format: str, tmp_path: Path) -> None:
+    (tmp_path / "dh.csv").write_text(DH)
+    robot = f'dh = "dh.csv"\ndh_convention = "{CONVENTIONS[format]}"'
+    nominal = rows_of(DH)
+
+    rows = check(*write_result(tmp_path, robot, ["marker_position"]), format)
+    assert len(rows) == 6  # nothing changed: no fixed rows, no beta
+    for row, old in zip(rows, nominal, strict=True):
+        for key in ("theta0_rad", "d_m", "a_m", "alpha_rad"):
+            assert float(row[key]) == float(old[key]), (row, key)
+
+    rows = check(*write_result(tmp_path, robot, ["joint_offset:joint4"]), format)
+    changed = [
+        (row["joint"], key)
+        for row, old in zip(rows, nominal, strict=True)
+        for key in ("theta0_rad", "d_m", "a_m", "alpha_rad")
+        if float(row[key]) != float(old[key])
+    ]
+    assert changed == [("a4", "theta0_rad")]
+
+    rows = check(*write_result(tmp_path, robot, ["link_geometry:link4"]), format)
+    assert len(rows) == 6
+    for i in (0, 1, 2):  # links beyond the error move, those before it do not
+        assert all(float(rows[i][k]) == float(nominal[i][k]) for k in ("theta0_rad", "d_m", "a_m"))
+
+
+def test_nearly_parallel_axes_keep_their_lengths_by_beta(tmp_path: Path) -> None:
+    (tmp_path / "dh.csv").write_text(DH)
+    written = write_result(tmp_path, 'dh = "dh.csv"', GEOMETRY)
+    rows = check(*written, "dh")
+    second = next(row for row in rows if row["joint"] == "a2")
+    assert float(second["beta_rad"]) != 0.0 and float(second["d_m"]) == 0.0
+    assert abs(float(second["a_m"]) - 0.6) < 5e-3
+    _, done = exported(*written, "dh")
+    # Dropping an angle of a milliradian at arms of a metre costs tenths of a millimetre and more.
+    assert done.without_beta is not None and 1e-5 < done.without_beta < 1e-2
+    assert f"{done.without_beta * 1e6:.3g} um" in done.text
+
+
+@given(
+    st.tuples(*[st.floats(-1, 1)] * 3),
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.sampled_from([1.0, 1e-3, 1e-9, 0.0]),
+)
+def test_a_link_is_its_row_and_a_remainder_about_the_next_axis(
+    shift: tuple[float, ...], turn: tuple[float, ...], scale: float
+) -> None:
+    """`scale` brings the two axes to and into parallel."""
+    vector = np.array(turn) * [scale, scale, 1.0]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(vector).as_matrix(), shift
+    row, rest = split(T)
+    assert np.abs(row.transform() @ rest - T).max() < 1e-12
+    away = rest.copy()
+    away[:2, :2], away[2, 3] = np.eye(2), 0.0
+    tilted = np.hypot(T[0, 2], T[1, 2]) > NEARLY_PARALLEL
+    # The foot of nearly parallel lines' common normal carries rounding over their angle.
+    assert np.abs(away - np.eye(4)).max() < (1e-12 if tilted else 1e-13)
+    assert tilted == (row.beta == 0.0) or row.beta == 0.0

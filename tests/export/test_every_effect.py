@@ -1,0 +1,102 @@
+"""Every effect of the catalogue is held by a file, left out with its cost, or not the arm's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import COMPENSATOR, SLANTED, kr270_cell
+
+from elastocal.cell import Nominal
+from elastocal.export.cost import cost_of
+from elastocal.export.kept import ELASTIC, FROZEN, GEOMETRY, Conditions, keep
+from elastocal.export.pieces import evaluate_pieces
+from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.model import Model
+
+CONDITIONS = Conditions(SLANTED, time=1800.0, temperature=30.0)
+# Without parameters of their own they act through the others.
+ALWAYS = ("payload", "link_gravity")
+INSTRUMENT = {
+    name
+    for name, effect in CATALOGUE.items()
+    if (effect.stage == "tracker" and name != "base_frame") or name == "marker_slip"
+}
+
+
+def calibrated(name: str) -> Calibrated:
+    """A KR 270 with soft joints, its weights, and one effect at a place of its own."""
+    observe = "distance" if name == "distance_sensor" else "position"
+    nominal = Nominal(joint_compliance=(3e-7,) * 6, gravity_compensator=COMPENSATOR)
+    cell = kr270_cell((), observe, nominal=nominal, link_gravity=True)
+    chain = Model.from_cell(cell).chain
+    effect = CATALOGUE[name]
+    place = effect.places(chain, cell)[0]
+    keys = {s.key for s in effect.settings(place, chain, cell) if s.default is None}
+    settings = {place: {key: 20.0 if "order" in key else 900.0 for key in keys}} if keys else {}
+    cell = kr270_cell(
+        [f"{name}:{place}", *(() if name == "joint_compliance" else ["joint_compliance"])],
+        observe,
+        nominal=replace(nominal, settings=settings),
+        link_gravity=True,
+    )
+    model = Model.from_cell(cell)
+    x = model.nominal.copy()
+    for i, p in enumerate(model.parameters):
+        if p.effect == name and name != "joint_compliance":
+            x[i] += abs(p.typical or 1e-7)
+    return Calibrated(model, x, (), np.zeros((0, 0)), "result.json")
+
+
+@pytest.mark.parametrize("name", [name for name in CATALOGUE if name not in ALWAYS])
+@pytest.mark.parametrize("elastic", [False, True])
+def test_it_is_accounted_for(name: str, elastic: bool) -> None:
+    kept = keep(calibrated(name), elastic, CONDITIONS)
+    held = GEOMETRY | FROZEN | (ELASTIC if elastic else frozenset())
+    left_out = {omission.effect for omission in kept.omissions}
+    assert (name in kept.of_the_measurement) == (name in INSTRUMENT)
+    if name in INSTRUMENT:
+        assert name not in left_out and name not in kept.full.effects
+        return
+    assert (name in left_out) == (name not in held)
+    assert (name in kept.exported.effects) == (name in held)
+    if elastic:
+        cost = cost_of(kept, 8, seed=0)
+        (entry,) = cost.effects if name not in held else (None,)
+        assert (cost.total.flange_max > 1e-9) == (entry is not None)
+        if entry is not None:
+            assert entry.difference == cost.total
+    assert evaluate_pieces(kept.exported, CONDITIONS).chain.n_joints == 6
+
+
+def test_values_that_no_spring_has_leave_the_effect_out_with_its_cost() -> None:
+    arm = calibrated("gravity_compensator")
+    x = arm.x.copy()
+    x[list(arm.model.names).index("joint2.compensator_stiffness")] = -1e5
+    kept = keep(replace(arm, x=x), True, CONDITIONS)
+    (omission,) = kept.omissions
+    assert omission.effect == "gravity_compensator"
+    assert "negative" in omission.note
+    assert cost_of(kept, 8, seed=0).total.flange_max > 1e-6
+
+
+def test_measured_torques_give_way_to_those_of_the_load() -> None:
+    arm = calibrated("joint_offset")
+    spec = replace(arm.model.cell.model, torque="measured", link_gravity=False)
+    measured = Model(arm.model.chain, replace(arm.model.cell, model=spec))
+    kept = keep(replace(arm, model=measured), True, CONDITIONS)
+    assert kept.full.model.cell.model.torque == "computed"
+    assert cost_of(kept, 4, seed=0).total.flange_max == 0.0
+
+
+def test_linear_deflections_are_held_at_the_deflected_pose_and_that_costs() -> None:
+    arm = calibrated("joint_offset")
+    spec = replace(arm.model.cell.model, deflection_model="linear")
+    linear = Model(arm.model.chain, replace(arm.model.cell, model=spec))
+    kept = keep(replace(arm, model=linear), True, CONDITIONS)
+    (omission,) = kept.omissions
+    assert omission.effect == "linear deflections"
+    # Second order: the deflection of some millimetres times that over the metres of the arm.
+    assert 1e-8 < cost_of(kept, 8, seed=0).total.flange_max < 1e-4

@@ -1,0 +1,205 @@
+"""MuJoCo comes to rest under load where the model's static equilibrium is."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.exports import DH, LOAD, SPRINGS, exported, flanges_in_base, poses_of, write_result
+from support.robots import KR270, packaged_urdf, random_chain_urdf
+
+from elastocal.export.mujoco_rest import MujocoRest
+from elastocal.export.urdf import Frames
+from elastocal.manipulator.parameter import Parameter
+
+mujoco = pytest.importorskip("mujoco")
+
+MICROMETRE = 1e-6
+BEARINGS = (*SPRINGS, "off_axis_compliance", "link_bending:link2", "base_compliance")
+WEIGHTS = (*SPRINGS, "gravity_compensator", "link_mass_error", "payload_error")
+COMPENSATOR = "[model.nominal]\ngravity_compensator = {joint = 'joint2', stiffness_N_per_m = 1.4e5}"
+
+
+def check_rest(cell: Path, result: Path, force=LOAD, poses: int = 5) -> str:
+    calibrated, done = exported(cell, result, "mjcf", force)
+    q = poses_of(calibrated, poses, seed=5)
+    expected = flanges_in_base(calibrated, q, force)
+    arm = MujocoRest(done.text)
+    for row, T in zip(q, expected, strict=True):
+        found = arm.sites(row, force, ["flange", "marker_M2"])
+        own = [calibrated.values[f"marker:M2.{k}"] for k in "xyz"]
+        wanted = [T[:3, 3], T[:3, :3] @ own + T[:3, 3]]
+        assert np.abs(found - wanted).max() < MICROMETRE
+    assert done.checked is not None and done.checked < MICROMETRE
+    assert done.cost.total.flange_max == 0.0
+    return done.text
+
+
+@pytest.mark.parametrize("name", ["UR5", "iiwa14", "KR210"])
+def test_packaged_robots(name: str, tmp_path: Path) -> None:
+    path, flange = packaged_urdf(name)
+    robot = f'urdf = "{path}"' + (f'\nflange = "{flange}"' if flange else "")
+    check_rest(*write_result(tmp_path, robot))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["UR10", "Panda", "IRB140"])
+def test_more_packaged_robots(name: str, tmp_path: Path) -> None:
+    path, flange = packaged_urdf(name)
+    robot = f'urdf = "{path}"' + (f'\nflange = "{flange}"' if flange else "")
+    check_rest(*write_result(tmp_path, robot))
+
+
+def test_every_spring_that_a_file_can_hold(tmp_path: Path) -> None:
+    """Tilting bearings, a bending link and a tilting pedestal, each in its place in the chain."""
+
+    def value(p: Parameter) -> float | None:
+        return 3e-7 if p.effect in ("link_bending", "base_compliance") else None
+
+    text = check_rest(*write_result(tmp_path, f'urdf = "{KR270}"', BEARINGS, value=value))
+    springs = [j for j in ET.fromstring(text).iter("joint") if j.get("stiffness")]
+    assert len(springs) == 6 + 12 + 3 + 2
+
+
+def test_weights_compensator_and_a_payload_not_as_declared(tmp_path: Path) -> None:
+    def value(p: Parameter) -> float | None:
+        given = {
+            "joint2.compensator_stiffness": 1.4e5,
+            "joint2.compensator_free_length": 0.458,
+            "load.payload_scale": 0.05,
+            "load.load_point_x": 0.03,
+            "link3.mass_error": 20.0,
+            "link3.moment_x": 4.0,
+        }
+        if p.effect in ("gravity_compensator", "link_mass_error", "payload_error"):
+            return given.get(p.name, p.nominal)
+        return None
+
+    model = f"link_gravity = true\n{COMPENSATOR}"
+    written = write_result(tmp_path, f'urdf = "{KR270}"', WEIGHTS, model, value=value)
+    text = check_rest(*written)
+    masses = {b.get("name"): float(b.find("inertial").get("mass")) for b in bodies(text)}
+    assert masses["link3"] == pytest.approx(240.0)  # 220 kg and what was found missing
+    assert masses["link1"] == pytest.approx(330.0)
+    assert mujoco.MjModel.from_xml_string(text).ntendon == 1
+
+
+def bodies(text: str):
+    return [b for b in ET.fromstring(text).iter("body") if b.find("inertial") is not None]
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_slides_and_branches(seed: int, tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(random_chain_urdf(seed))
+    robot = 'urdf = "arm.urdf"\nbase = "base"\nflange = "flange"'
+    check_rest(*write_result(tmp_path, robot, model="link_gravity = true", seed=seed))
+
+
+def test_an_arm_of_a_dh_table_with_masses(tmp_path: Path) -> None:
+    (tmp_path / "dh.csv").write_text(DH)
+    rows = [f"{i},{30 - 4 * i},0.01,{0.02 * i},-0.03" for i in range(1, 7)]
+    (tmp_path / "m.csv").write_text("\n".join(["link,mass_kg,com_x_m,com_y_m,com_z_m", *rows]))
+    robot = 'dh = "dh.csv"\nmasses = "m.csv"'
+    check_rest(*write_result(tmp_path, robot, model="link_gravity = true"))
+
+
+def test_in_the_trackers_frame_the_arm_stands_where_it_was_identified(tmp_path: Path) -> None:
+    cell, result = write_result(tmp_path, f'urdf = "{KR270}"')
+    calibrated, base = exported(cell, result, "mjcf", LOAD)
+    _, world = exported(cell, result, "mjcf", LOAD, frames=Frames(base=True))
+    q = poses_of(calibrated, 1, seed=1)[0]
+    in_base, in_world = (
+        MujocoRest(done.text).sites(q, LOAD, ["flange", "marker_M1", "load_point"])
+        for done in (base, world)
+    )
+    from scipy.spatial.transform import Rotation
+
+    values = [calibrated.values[f"base.{k}"] for k in ("x", "y", "z", "rx", "ry", "rz")]
+    moved = Rotation.from_rotvec(values[3:]).apply(in_base) + values[:3]
+    assert np.abs(in_world - moved).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("weights", "rigid"), [(True, ""), (False, "joint1.compliance"), (True, "joint2.compliance")]
+)
+def test_a_run_of_mujoco_settles_where_newton_does(
+    tmp_path: Path, weights: bool, rigid: str
+) -> None:
+    """The actuators hold the arm by themselves: no other program than mj_step is needed."""
+
+    def value(p: Parameter) -> float | None:
+        return 0.0 if p.name == rigid else None
+
+    gravity = "link_gravity = true" if weights else ""
+    written = write_result(tmp_path, f'urdf = "{KR270}"', model=gravity, value=value)
+    calibrated, done = exported(*written, "mjcf", LOAD)
+    q = poses_of(calibrated, 1, seed=1)[0]
+    model = mujoco.MjModel.from_xml_string(done.text)
+    data = mujoco.MjData(model)  # at zero, from where the command is a step
+    data.ctrl[:6], data.ctrl[6:] = q, LOAD
+    for _ in range(4000):
+        mujoco.mj_step(model, data)
+    T = flanges_in_base(calibrated, q[None], LOAD)[0]
+    assert np.linalg.norm(data.site("flange").xpos - T[:3, 3]) < MICROMETRE
+
+
+def test_the_nominal_arm_has_the_inertia_of_its_urdf(tmp_path: Path) -> None:
+    """Mass matrix and weights as pinocchio finds them in the URDF."""
+    import pinocchio as pin
+
+    written = write_result(
+        tmp_path,
+        f'urdf = "{KR270}"',
+        ["joint_compliance"],
+        "link_gravity = true",
+        value=lambda p: 1e-6,
+    )
+    calibrated, done = exported(*written, "mjcf")
+    model = mujoco.MjModel.from_xml_string(done.text)
+    data = mujoco.MjData(model)
+    own = pin.buildModelFromUrdf(str(KR270))
+    for q in poses_of(calibrated, 5, seed=1):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        found = np.zeros((6, 6))
+        mujoco.mj_fullM(model, data, found)
+        expected = pin.crba(own, own.createData(), q) + np.diag(model.dof_armature)
+        assert np.abs(found - expected).max() < 1e-6 * np.abs(expected).max()
+
+
+def test_limits_bound_what_is_commanded(tmp_path: Path) -> None:
+    written = write_result(tmp_path, f'urdf = "{KR270}"')
+    calibrated, done = exported(*written, "mjcf")
+    model = mujoco.MjModel.from_xml_string(done.text)
+    joints = calibrated.model.chain.joints
+    wanted = [(joint.lower, joint.upper) for joint in joints]
+    assert np.array_equal(model.actuator_ctrlrange[:6], wanted)
+    assert not model.jnt_limited.any()
+
+
+def test_a_joint_without_compliance_is_rigid_and_said_so(tmp_path: Path) -> None:
+    written = write_result(
+        tmp_path,
+        f'urdf = "{KR270}"',
+        value=lambda p: 0.0 if p.name == "joint1.compliance" else None,
+    )
+    _, done = exported(*written, "mjcf", LOAD)
+    assert any("joint1: rigid" in warning for warning in done.warnings)
+    assert any("weigh nothing" in warning for warning in done.warnings)
+
+
+def test_what_no_spring_does_is_left_out_with_its_cost(tmp_path: Path) -> None:
+    written = write_result(
+        tmp_path,
+        f'urdf = "{KR270}"',
+        value=lambda p: -1e-6 if p.name == "joint2.compliance" else None,
+    )
+    _, done = exported(*written, "mjcf", LOAD)
+    (entry,) = done.cost.effects
+    assert entry.effect == "negative compliance" and "joint2.compliance" in entry.note
+    assert entry.difference is not None and entry.difference == done.cost.total
+    # About the deflection that the negative compliance makes, 1e-6 rad/(N m) at 2 m and 130 N.
+    assert 1e-6 < done.cost.total.flange_max < 1e-3
+    assert done.checked is not None and done.checked < MICROMETRE

@@ -1,0 +1,146 @@
+"""Parameters as YAML and JSON, and the cost of what a format cannot hold."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.exports import GEOMETRY, LOAD, SPRINGS, exported, write_result
+from support.robots import KR270
+
+from elastocal.export.export import Wish, export
+from elastocal.export.kept import Conditions
+from elastocal.export.yaml_text import to_yaml
+from elastocal.manipulator.calibrated import read_calibrated
+from elastocal.manipulator.urdf import read_urdf
+
+ROBOT = f'urdf = "{KR270}"'
+
+FINITE = st.none() | st.booleans() | st.integers() | st.floats(
+    allow_nan=False, allow_infinity=False
+) | st.text(st.characters(codec="utf-8"))  # fmt: skip
+
+
+@given(
+    st.recursive(
+        FINITE,
+        lambda inner: (
+            st.lists(inner, max_size=4)
+            | st.dictionaries(st.text(st.characters(codec="utf-8")), inner, max_size=4)
+        ),
+        max_leaves=12,
+    )
+)
+def test_a_yaml_reader_finds_what_was_written(data: object) -> None:
+    yaml = pytest.importorskip("yaml")
+    assert yaml.safe_load(to_yaml(data)) == data
+
+
+def test_yaml_and_json_say_the_same(tmp_path: Path) -> None:
+    yaml = pytest.importorskip("yaml")
+    written = write_result(tmp_path, ROBOT)
+    from_yaml = yaml.safe_load(exported(*written, "yaml", LOAD)[1].text)
+    calibrated, done = exported(*written, "json", LOAD)
+    document = json.loads(done.text)
+    assert from_yaml == document
+    assert [p["name"] for p in document["parameters"]] == list(calibrated.model.names)
+    first = document["parameters"][0]
+    assert first["value"] == calibrated.x[0] and first["std"] == 1e-5
+    assert first["ci95"] == [first["value"] - 2e-5, first["value"] + 2e-5]
+    assert first["identifiable"] is True and first["unit"] == "m"
+    total = document["geometry_alone"]["total"]
+    assert total["marker_rms_um"] == done.cost.total.marker_rms * 1e6 > 1.0
+
+
+def test_what_the_data_did_not_determine_is_listed_with_its_value(tmp_path: Path) -> None:
+    cell, result = write_result(tmp_path, ROBOT)
+    content = json.loads(result.read_text())
+    entry = content["parameters"][7]
+    entry |= {"value": None, "std": None, "ci95": None, "identifiable": False}
+    result.write_text(json.dumps(content))
+    _, done = exported(cell, result, "urdf")
+    assert done.held == {entry["name"]: entry["held"]}
+
+
+def test_a_gear_error_costs_what_it_moves(tmp_path: Path) -> None:
+    """Joint 1 errs by a sin q₁: a point is off by a |sin q₁| times its distance from axis 1."""
+    written = write_result(
+        tmp_path,
+        ROBOT,
+        ["gear_eccentricity:joint1"],
+        value=lambda p: 1e-3 if p.name == "joint1.eccentricity_sin" else 0.0,
+    )
+    calibrated, done = exported(*written, "urdf", poses=400)
+    (entry,) = done.cost.effects
+    assert entry.effect == "gear_eccentricity" and entry.difference == done.cost.total
+    from elastocal.export.check import flanges
+    from elastocal.export.cost import random_table
+
+    q = random_table(calibrated.model, Conditions(), 400, 0).q
+    place = flanges(calibrated.model.chain, q)[:, :2, 3]
+    off = 1e-3 * np.abs(np.sin(q[:, 0])) * np.linalg.norm(place, axis=1)
+    assert done.cost.total.flange_max == pytest.approx(off.max(), rel=2e-3)
+    assert done.cost.total.flange_rms == pytest.approx(np.sqrt(np.mean(off**2)), rel=2e-3)
+
+
+def test_a_rigid_file_costs_the_deflection_and_none_without_load(tmp_path: Path) -> None:
+    written = write_result(tmp_path, ROBOT)
+    _, loaded = exported(*written, "urdf", LOAD)
+    _, unloaded = exported(*written, "urdf")
+    (entry,) = loaded.cost.effects
+    assert entry.effect == "joint_compliance" and entry.difference == loaded.cost.total
+    assert loaded.cost.total.flange_rms > 1e-5
+    assert unloaded.cost.total.flange_max == 0.0
+    assert any("--load" in warning for warning in unloaded.warnings)
+
+
+def test_levels_of_a_joint_are_held_by_their_mean(tmp_path: Path) -> None:
+    def value(p):
+        return float(p.name[-1]) * 1e-7 if "level" in p.name else None
+
+    model = "[model.compliance_levels]\njoint2_deg = [-10, -60, -120]"
+    written = write_result(tmp_path, ROBOT, ["joint_compliance"], model, value=value)
+    _, done = exported(*written, "mjcf", LOAD)
+    (entry,) = done.cost.effects
+    assert entry.effect == "levels of a joint" and entry.difference == done.cost.total
+    assert done.cost.total.flange_max > 1e-6
+    assert f'kp="{1 / 2e-7!r}"' in done.text or 'kp="5000000' in done.text
+
+
+def test_temperature_is_frozen_into_the_lengths_where_it_is_stated(tmp_path: Path) -> None:
+    written = write_result(
+        tmp_path,
+        ROBOT,
+        ["thermal_expansion:all"],
+        'thermal_driver = "temperature"',
+        value=lambda p: 12e-6,
+    )
+    calibrated = read_calibrated(*written)
+    without = export(calibrated, Wish("urdf", poses=20))
+    (entry,) = without.cost.effects
+    assert entry.difference is None and "--temperature-c" in entry.note
+    warm = export(calibrated, Wish("urdf", conditions=Conditions(temperature=30.0), poses=20))
+    assert not warm.cost.effects and warm.cost.total.flange_max == 0.0
+    (tmp_path / "warm.urdf").write_text(warm.text)
+    forearm = read_urdf(tmp_path / "warm.urdf").joints[2].placement
+    assert forearm[0, 3] == pytest.approx(1.25 * (1 + 12e-6 * 10), rel=1e-15)
+    assert "at 30 °C" in warm.text
+
+
+def test_what_belongs_to_the_instrument_is_no_cost_of_the_arm(tmp_path: Path) -> None:
+    written = write_result(tmp_path, ROBOT, [*SPRINGS, "tracker_distortion"])
+    _, done = exported(*written, "mjcf", LOAD)
+    assert done.of_the_measurement == ("tracker_distortion",)
+    assert done.cost.total.flange_max == 0.0
+
+
+def test_the_same_seed_gives_the_same_answer(tmp_path: Path) -> None:
+    written = write_result(tmp_path, ROBOT, [*GEOMETRY, "backlash", "hysteresis"])
+    once, again = (exported(*written, "urdf", LOAD)[1].to_json() for _ in range(2))
+    assert once == again
+    effects = {e["effect"] for e in once["cannot_hold"]["effects"]}
+    assert effects == {"backlash", "hysteresis"}
