@@ -1,8 +1,9 @@
 """The results as tables: bars, confusion, reliability, size, distance, poses.
 
-    python result_tables.py RESULTS
+    python result_tables.py RESULTS…
 
 prints those of the worlds done so far, also while the study runs, and draws reliability.png here.
+Several results are those of one study whose suites ran apart.
 """
 
 from __future__ import annotations
@@ -172,6 +173,6 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 if __name__ == "__main__":
-    found = records_of(read_results(sys.argv[1]))
+    found = [r for folder in sys.argv[1:] for r in records_of(read_results(folder))]
     print(report(found))
     draw_reliability(reliability(answerable(by_suite(found))), Path("reliability.png"))

@@ -23,9 +23,11 @@ from suites import tasks as suite_tasks
 def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
     for suite in SUITES:
         per_effect = options[suite.partition("-")[0]]
-        # Names follow from effect and number; the seed comes with `rng`.
-        for task in suite_tasks(suite, 0, per_effect):
-            yield {"suite": suite, "world": task.recipe.name}
+        # Names follow from effect and number; the seed comes with `rng`.  The first world of every
+        # effect before the second of any: what is done when it stops is of all effects.
+        names = (task.recipe.name for task in suite_tasks(suite, 0, per_effect))
+        for name in sorted(names, key=lambda name: name.rpartition("-")[2]):
+            yield {"suite": suite, "world": name}
 
 
 def run(task: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:

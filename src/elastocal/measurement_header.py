@@ -17,11 +17,15 @@ REQUIRED = {
     "pose": (("position",), ("rotation", "quaternion")),
     "distance": (("distance",),),
     "plan": (),
+    "targets": (),
 }
 EXCLUSIVE = (("sigma_cartesian", "sigma_polar"), ("rotation", "quaternion"))
 NUMBERED = re.compile(r"(q|torque_|approach_)([1-9][0-9]{0,3})(_[a-zA-Z]+)?", re.ASCII)
 IGNORED = ("#", "_", "note")
+PLANS = ("plan", "targets")
 PLAN_ONLY = ("level", "order")
+# What `compensate` writes beside its commands, which are a plan too.
+BESIDE_COMMANDS = ("correction_", "error_", "std_", "status")
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ def layout_of(
     }
     present: dict[str, dict[str, Column]] = {}
     for text in header:
-        if text.startswith(IGNORED) or (observe == "plan" and text in PLAN_ONLY):
+        if text.startswith(IGNORED) or (observe in PLANS and _of_a_plan(text)):
             continue
         if text not in meaning:
             raise InputError(f"{source}: {_unknown(text, header, known, list(meaning))}")
@@ -66,7 +70,8 @@ def layout_of(
         family = present.setdefault(name, {})
         _check_unit(source, known[name], family, stem, Column(text, unit))
         family[stem] = Column(text, unit)
-    if joint_kinds and len(present.get("q", {})) != len(joint_kinds):
+    stated = observe != "targets" or "q" in present  # targets need no joints, perhaps no positions
+    if joint_kinds and stated and len(present.get("q", {})) != len(joint_kinds):
         raise InputError(f"{source}: {_wrong_count(header, known['q'])}")
     for name, found in present.items():
         _check_complete(source, known[name], found)
@@ -77,6 +82,10 @@ def layout_of(
     labels = [c.header for name, cs in columns.items() if known[name].is_label for c in cs]
     numbers = [c.header for name, cs in columns.items() if not known[name].is_label for c in cs]
     return Layout(columns, tuple(labels), tuple(numbers))
+
+
+def _of_a_plan(text: str) -> bool:
+    return text in PLAN_ONLY or text.startswith(BESIDE_COMMANDS)
 
 
 def _check_names(source: str, header: Sequence[str]) -> None:

@@ -34,7 +34,8 @@ def read_measurements(
 
     `joint_kinds`: "revolute" or "prismatic" per joint of the robot; `marker_names`: the cell's
     markers, () if it names none; `observe`: "position", "deflection", "pose" or "distance",
-    which decides the columns that must be there.  Quaternions become rotation vectors.
+    which decides the columns that must be there, or "plan" or "targets", which ask for none.
+    Quaternions become rotation vectors.
 
     Raises InputError that names file, line, column and the offending text.
     """
@@ -82,7 +83,8 @@ def read_measurements(
         approach=approach,
         temperature=None if temperature is None else temperature[:, 0],
     )
-    _check_duplicates(raw, table)
+    if observe != "targets":  # a path may pass a place twice
+        _check_duplicates(raw, table)
     return table
 
 

@@ -7,7 +7,16 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Importing a command registers it.
-from elastocal.cli import demo, design, diagnose, export, identify, simulate, study  # noqa: F401
+from elastocal.cli import (  # noqa: F401
+    compensate,
+    demo,
+    design,
+    diagnose,
+    export,
+    identify,
+    simulate,
+    study,
+)
 from elastocal.cli.app import app
 
 

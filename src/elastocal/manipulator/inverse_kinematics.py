@@ -94,7 +94,7 @@ def _postures(
         found, value = task.solve(
             np.tile(some, (len(left), 1)), np.repeat(targets[left], len(some))
         )
-        found = _unwound(chain, found, near, task.lower, task.upper)
+        found = unwound(chain, found, near, task.lower, task.upper)
         found = np.concatenate([q[left], found.reshape(len(left), -1, n)], axis=1)
         value = np.concatenate([cost[left], value.reshape(len(left), -1)], axis=1)
         order = _best_first(value, found, near)[:, :K]
@@ -116,7 +116,7 @@ def _best_first(cost: Array, q: Array, near: Array) -> IntArray:
     return np.lexsort((np.where(reached, distance, cost), ~reached), axis=1)
 
 
-def _unwound(chain: Chain, q: Array, near: Array, lower: Array, upper: Array) -> Array:
+def unwound(chain: Chain, q: Array, near: Array, lower: Array, upper: Array) -> Array:
     """The same postures with revolute joints turned back by whole turns, as near as allowed."""
     turn = 2 * np.pi
     turns = np.round((near - q) / turn)

@@ -36,47 +36,16 @@ NULL_STEPS = 40
 NEAR_ENOUGH = 1e-5  # rad or m; a null-space step that gains less is the last
 
 
-class Reaching:
-    """r(q) and J(q) of all targets, and the solver on rows of (posture, target index)."""
+class BoundedSearch:
+    """The solver on rows of (posture, target index), for any r(q) and J(q); `lower` and `upper`
+    (n,) are the joint limits in rad or m."""
 
-    def __init__(
-        self,
-        chain: Chain,
-        position: Array,
-        rotation: Array | None,
-        point: Array | None,
-        T_data_base: Array | None,
-        lower: Array,
-        upper: Array,
-    ) -> None:
+    def __init__(self, lower: Array, upper: Array) -> None:
         self.lower, self.upper = lower, upper
-        self.goal = np.clip(position, -FARTHEST, FARTHEST)
-        q = ca.SX.sym("q", chain.n_joints)
-        T = rigid.constant(np.eye(4) if T_data_base is None else T_data_base)
-        T = T @ rigid.nominal_flange(chain, q)
-        value = rigid.point(T, np.zeros(3) if point is None else point)
-        self.oriented = rotation is not None
-        if rotation is not None:
-            # ‖R − R₀‖² = 8 sin²(θ/2) → 2θ²: smooth at every θ, which a rotation vector is not.
-            scale = ARM_LENGTH / np.sqrt(2)
-            value = ca.vertcat(value, scale * ca.vec(T[:3, :3]))
-            turned = np.broadcast_to(rotation, (len(self.goal), 3, 3))
-            by_column = turned.transpose(0, 2, 1).reshape(len(self.goal), 9)
-            self.goal = np.hstack([self.goal, scale * by_column])
-        self._tape = Tape([q], [value, ca.jacobian(value, q)])
 
     def residual(self, q: Array, target: IntArray) -> tuple[Array, Array]:
         """r (R, m) and J (R, m, n) of postures q (R, n) for the targets (R,)."""
-        value, J = self._tape(q)
-        return value[..., 0] - self.goal[target], J
-
-    def errors(self, q: Array, target: IntArray) -> tuple[Array, Array]:
-        """Distance in m and angle in rad (R,) from the targets."""
-        r = self.residual(q, target)[0]
-        if not self.oriented:
-            return np.linalg.norm(r, axis=1), np.zeros(len(r))
-        sine = np.linalg.norm(r[:, 3:], axis=1) / (2 * ARM_LENGTH)
-        return np.linalg.norm(r[:, :3], axis=1), 2 * np.arcsin(np.minimum(sine, 1.0))
+        raise NotImplementedError
 
     def solve(self, q: Array, target: IntArray, steps: int = MOST_STEPS) -> tuple[Array, Array]:
         """Postures (R, n) at minima of ½‖r‖² and those minima (R,), from starts q (R, n)."""
@@ -117,6 +86,54 @@ class Reaching:
         """(R, n) whether a joint may move in that direction: not out of a limit it stands at."""
         held = ((q <= self.lower) & (direction < 0)) | ((q >= self.upper) & (direction > 0))
         return ~held
+
+
+class Reaching(BoundedSearch):
+    """r(q) and J(q) of all targets for the nominal chain."""
+
+    def __init__(
+        self,
+        chain: Chain,
+        position: Array,
+        rotation: Array | None,
+        point: Array | None,
+        T_data_base: Array | None,
+        lower: Array,
+        upper: Array,
+    ) -> None:
+        super().__init__(lower, upper)
+        self.goal = np.clip(position, -FARTHEST, FARTHEST)
+        q = ca.SX.sym("q", chain.n_joints)
+        T = rigid.constant(np.eye(4) if T_data_base is None else T_data_base)
+        T = T @ rigid.nominal_flange(chain, q)
+        value = rigid.point(T, np.zeros(3) if point is None else point)
+        self.oriented = rotation is not None
+        if rotation is not None:
+            # ‖R − R₀‖² = 8 sin²(θ/2) → 2θ²: smooth at every θ, which a rotation vector is not.
+            scale = ARM_LENGTH / np.sqrt(2)
+            value = ca.vertcat(value, scale * ca.vec(T[:3, :3]))
+            turned = np.broadcast_to(rotation, (len(self.goal), 3, 3))
+            by_column = turned.transpose(0, 2, 1).reshape(len(self.goal), 9)
+            self.goal = np.hstack([self.goal, scale * by_column])
+        self._tape = Tape([q], [value, ca.jacobian(value, q)])
+
+    def residual(self, q: Array, target: IntArray) -> tuple[Array, Array]:
+        """r (R, m) and J (R, m, n) of postures q (R, n) for the targets (R,)."""
+        value, J = self._tape(q)
+        return value[..., 0] - self.goal[target], J
+
+    @property
+    def equations(self) -> int:
+        """Number of independent equations: an arm with more joints has a choice."""
+        return 6 if self.oriented else 3
+
+    def errors(self, q: Array, target: IntArray) -> tuple[Array, Array]:
+        """Distance in m and angle in rad (R,) from the targets."""
+        r = self.residual(q, target)[0]
+        if not self.oriented:
+            return np.linalg.norm(r, axis=1), np.zeros(len(r))
+        sine = np.linalg.norm(r[:, 3:], axis=1) / (2 * ARM_LENGTH)
+        return np.linalg.norm(r[:, :3], axis=1), 2 * np.arcsin(np.minimum(sine, 1.0))
 
     def nearest(self, q: Array, target: IntArray, near: Array) -> Array:
         """Postures (R, n) that still reach the targets, moved towards `near` (n,).

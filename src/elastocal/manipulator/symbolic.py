@@ -86,7 +86,8 @@ class SymbolicArm:
         return bool(self.arm.springs) and not self._linear
 
     @cached_property
-    def _residual(self) -> ca.SX:
+    def residual(self) -> ca.SX:
+        """F = θ − law(τ(θ)) (springs,), zero at the equilibrium."""
         arm = self.arm
         return arm.theta - arm.deflection_laws(arm.generalised_forces())
 
@@ -94,7 +95,7 @@ class SymbolicArm:
         """Eq. (3): h(0) + ∂h/∂θ · law(τ(0)), loads and lever arms of the undeflected pose."""
         theta = self.arm.theta
         rest = ca.SX.zeros(theta.shape[0], 1)
-        deflection = ca.substitute(theta - self._residual, theta, rest)
+        deflection = ca.substitute(theta - self.residual, theta, rest)
         slope = ca.substitute(ca.jacobian(expression, theta), theta, rest)
         return ca.substitute(expression, theta, rest) + slope @ deflection
 
@@ -110,7 +111,7 @@ class SymbolicArm:
         theta = self.arm.theta
         if not self.implicit:
             return expression
-        law = theta - self._residual
+        law = theta - self.residual
         settled = ca.SX.zeros(theta.shape[0], 1)
         for _ in range(steps):
             settled = ca.substitute(law, theta, settled)
@@ -124,7 +125,7 @@ class SymbolicArm:
     @cached_property
     def equilibrium(self) -> Equilibrium:
         inputs = list(self.arm.inputs.values())
-        return Equilibrium(inputs, self.p, self.arm.theta, self._residual, self.backend)
+        return Equilibrium(inputs, self.p, self.arm.theta, self.residual, self.backend)
 
     @property
     def backend_reports(self) -> dict[str, BackendReport]:
@@ -161,6 +162,6 @@ class SymbolicArm:
         # Adjoint of the equilibrium: with λ = F_θ⁻ᵀ h_θᵀ the total derivative of component c is
         # the partial one of h_c − λ_cᵀ F, a few reverse sweeps instead of all of ∂F/∂X.
         adjoint = ca.SX.sym("adjoint", h.shape[0], theta.shape[0])
-        lagrangian = h - adjoint @ self._residual
+        lagrangian = h - adjoint @ self.residual
         B = ca.jacobian(lagrangian, p)[:, columns]
         return Tape([*inputs, ca.vec(adjoint.T)], [h, B], self.backend)

@@ -1,0 +1,158 @@
+"""elastocal compensate: commands that put the real tool at its targets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from elastocal.cli.app import (
+    CellFile,
+    Json,
+    Seed,
+    app,
+    check_outputs,
+    console,
+    progress_line,
+    reporting_errors,
+)
+from elastocal.cli.plan_files import check_apart
+from elastocal.errors import InputError, require
+
+if TYPE_CHECKING:
+    from elastocal.cell import Array
+    from elastocal.compensation.targets import Targets
+    from elastocal.manipulator.calibrated import Calibrated
+
+Progress = Callable[[str], None]
+
+
+@app.command()
+@reporting_errors
+def compensate(
+    cell: CellFile,
+    result: Annotated[Path, typer.Argument(help="Result of identify -o (JSON).")],
+    targets: Annotated[
+        Path | None,
+        typer.Argument(help="Targets (CSV): x_mm, y_mm, z_mm, rx_deg, …, or q1_deg, …"),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Commands to write (CSV).")
+    ] = None,
+    target: Annotated[
+        str | None, typer.Option(help="One target instead: x,y,z[,rx,ry,rz] in mm and degrees.")
+    ] = None,
+    frame: Annotated[
+        str, typer.Option(help="Frame of targets and forces: base (as identified) or tracker.")
+    ] = "base",
+    point: Annotated[
+        str | None,
+        typer.Option(help="Point of the tool: a marker, or x,y,z in m in the flange frame."),
+    ] = None,
+    load: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Force in N at the load point where the table states none."),
+    ] = None,
+    near: Annotated[
+        str | None,
+        typer.Option(help="Joints in degrees (mm where prismatic) whose posture to begin near."),
+    ] = None,
+    partial: Annotated[
+        bool, typer.Option("--partial", help="Write what is reached; leave other rows empty.")
+    ] = False,
+    table: Annotated[
+        Path | None, typer.Option(help="Correction table to write (CSV), over --grid.")
+    ] = None,
+    grid: Annotated[
+        str, typer.Option(help="Levels per joint (or of x, y, z): 5 or 9,7,7,3,3,1.")
+    ] = "5",
+    box: Annotated[
+        str | None, typer.Option(help="Grid over x0,y0,z0,x1,y1,z1 in mm, base frame, not joints.")
+    ] = None,
+    rotation: Annotated[
+        str | None, typer.Option(help="Rotation vector of the tool in --box: rx,ry,rz in degrees.")
+    ] = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Which commands put the tool where it shall be?
+
+    Solves the calibrated arm, under its load, for every target.  With --table it writes the
+    corrections that a controller adds to its nominal targets.
+
+    Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
+    """
+    import numpy as np
+
+    from elastocal.cli.compensate_files import read_near, read_table_grid, write_commands
+    from elastocal.cli.compensate_files import write_table as write
+    from elastocal.compensation.point import tool_point
+    from elastocal.compensation.targets import FRAMES
+    from elastocal.manipulator.calibrated import read_calibrated
+
+    # What can be wrong with the options is told before any file is read.
+    require(frame in FRAMES, f"--frame takes base or tracker; found '{frame}'")
+    require(
+        targets is not None or target is not None or table is not None,
+        "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE",
+    )
+    require(
+        targets is None or target is None,
+        f"both {targets} and --target are given; drop one of them",
+    )
+    require(
+        output is None or targets is not None or target is not None,
+        "-o writes the commands of targets; name a table of them, or give --target",
+    )
+    require(
+        table is not None or (box is None and rotation is None and grid == "5"),
+        "--grid, --box and --rotation belong to a correction table; give --table FILE",
+    )
+    require(rotation is None or box is not None, "--rotation belongs to --box")
+    force = None if load is None else np.array(load)
+    if force is not None and not np.isfinite(force).all():
+        raise InputError("--load takes three finite numbers in N")
+    written = [path for path in (output, table) if path is not None]
+    check_outputs(*written)
+    check_apart(written, [path for path in (cell, result, targets) if path is not None])
+    content = {}
+    with progress_line(quiet) as progress:
+        progress("reading")
+        arm = read_calibrated(cell, result)
+        where = tool_point(arm.model.cell, point)
+        start = read_near(arm, near)
+        lines = read_table_grid(arm, grid, box, rotation) if table is not None else None
+        wanted = _targets(arm, targets, target, frame, force)
+        if wanted is not None:
+            from elastocal.compensation.compensate import compensate as run
+
+            found = run(arm, wanted, where, start, seed, progress)
+            content["commands"] = write_commands(found, arm, output, partial)
+        if table is not None and lines is not None:
+            from elastocal.compensation.table import correction_table
+
+            corrections = correction_table(arm, lines, where, force, start, seed, progress)
+            content["table"] = write(corrections, arm, table, partial)
+    if as_json:
+        both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
+        typer.echo(json.dumps(both, indent=1, allow_nan=False))
+        return
+    from elastocal.cli.compensate_files import print_summaries
+
+    print_summaries(console(), content)
+    for path in written:
+        typer.echo(f"wrote {path}")
+
+
+def _targets(
+    arm: Calibrated, path: Path | None, target: str | None, frame: str, force: Array | None
+) -> Targets | None:
+    from elastocal.compensation.targets import one_target, read_targets
+
+    if path is not None:
+        return read_targets(path, arm.model.chain.kinds, frame, force)  # type: ignore[arg-type]
+    return None if target is None else one_target(target, frame, force)  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""Commands that put the real tool where the nominal arm was told to go."""

@@ -1,0 +1,217 @@
+"""From targets to commands: nominal joints, their error, the command that undoes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.compensation.nominal import jumps, nominal_path
+from elastocal.compensation.notices import notices_of
+from elastocal.compensation.point import ToolPoint
+from elastocal.compensation.solve import TOLERANCE, Commanding, Goals, Solved
+from elastocal.compensation.targets import Targets
+from elastocal.compensation.tool import CalibratedTool
+from elastocal.compensation.uncertainty import Uncertainty, position_uncertainty, undetermined
+from elastocal.identification.checks import check_limits
+from elastocal.manipulator import rigid
+from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.chain import Array, Chain
+from elastocal.manipulator.inverse_kinematics import inverse_kinematics
+from elastocal.manipulator.limits import joint_limits
+from elastocal.manipulator.reaching import Reaching
+from elastocal.manipulator.tape import Tape
+
+REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
+SENSITIVITIES = 5000  # rows at a time, which bounds the memory
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """Commands for n targets.
+
+    `q` and `nominal` (n, joints) rad or m; `before` and `after` (n,) m: predicted distance of the
+    tool from its target at the nominal command and at the new one (NaN: no equilibrium), `turn`
+    (n, 2) rad the same for the rotation; `status` (n,) of reached, limit, no equilibrium, not
+    reached; `goals` in the data's frame, `force` (n, 3) N in the data's frame;
+    `T_data_base` (n, 4, 4); `place` (n, 3) m and `turned` (n, 3, 3): the point and the tool's
+    rotation in the flange frame; `nominal_miss` (n,) m: how far the nominal arm is from the
+    target at the nominal command (zero where it reaches it).  `uncertainty` is NaN where a
+    row is not reached.
+    """
+
+    chain: Chain
+    targets: Targets
+    point: ToolPoint
+    q: Array
+    nominal: Array
+    before: Array
+    after: Array
+    turn: Array
+    status: tuple[str, ...]
+    goals: Goals
+    force: Array
+    T_data_base: Array
+    place: Array
+    turned: Array
+    nominal_miss: Array
+    uncertainty: Uncertainty
+    warnings: tuple[str, ...]
+
+    @property
+    def reached(self) -> NDArray[np.bool_]:
+        """(n,)"""
+        return np.array([status == REACHED for status in self.status])
+
+
+def compensate(
+    arm: Calibrated,
+    targets: Targets,
+    point: ToolPoint,
+    near: Array | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda message: None,
+) -> Compensation:
+    """Commanded joints that put the tool's point at the targets under their loads.
+
+    Targets in the base frame are taken to the data's frame by the base frame as identified.  The
+    nominal command is the table's, or the nominal arm's inverse kinematics along the path, the
+    first place in the posture nearest to `near` (joints,).  The new command solves the
+    calibrated model for the target within the joint limits, nearest to the nominal one where
+    joints or a free rotation leave a choice.
+
+    Raises InputError where the table lacks a column that the model needs, or a nominal command
+    lies beyond the limits.
+    """
+    tool = CalibratedTool(arm, point)
+    chain = tool.chain
+    limits = joint_limits(tool.cell, chain)
+    T, place, turn = tool.frames(tool.rows(targets.table))
+    force = targets.table.force
+    if targets.frame == "base":
+        force = np.einsum("nij,nj->ni", T[:, :3, :3], force)
+    rows = tool.rows(replace(targets.table, force=force))
+    goals = _goals(targets, chain, T, place, turn)
+    in_base, flange = _seen_from_base(goals, T, turn)
+    if targets.q is None:
+        progress("nominal commands")
+        nominal = nominal_path(chain, in_base, flange, place[0], limits, near, seed).q
+    else:
+        check_limits(arm.model, replace(targets.table, q=targets.q))
+        nominal = np.clip(targets.q, *limits)
+    progress("commands")
+    search = Commanding(tool, rows, goals, *limits)
+    every = np.arange(len(targets))
+    found = search.commands(nominal, every)
+    lost = np.flatnonzero(~found.reached)
+    if targets.q is None and len(lost):
+        progress(f"other postures for {len(lost)} targets")
+        nominal = _other_postures(
+            search, chain, in_base, flange, place[0], limits, lost, nominal, seed
+        )
+        found = found.replaced(lost, search.commands(nominal[lost], lost))
+    before = search.misses(nominal, every)
+    status = _status(search, found, nominal)
+    reached = found.reached
+    progress("uncertainty")
+    uncertainty = _uncertainty(tool, rows, found.q, reached, seed)
+    task = Reaching(chain, in_base, flange, place[0], None, *limits)
+    path = jumps(task, found.q, reached)
+    result = Compensation(
+        chain, targets, point, found.q, nominal, before[0], found.miss,
+        np.column_stack([before[1], found.turn]), status, goals, force, T, place, turn,
+        task.errors(nominal, every)[0], uncertainty, (),
+    )  # fmt: skip
+    told = notices_of(
+        tool.cell, chain, targets, limits, found.q, nominal, before[0], reached, path, uncertainty
+    )
+    return replace(result, warnings=told)
+
+
+def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
+    """The targets in the data's frame."""
+    position, rotation = targets.position, targets.rotation
+    if position is None:
+        assert targets.q is not None  # read_targets: positions or joints
+        flange = nominal_flanges(chain, targets.q)
+        position = flange[:, :3, 3] + np.einsum("nij,nj->ni", flange[:, :3, :3], place)
+        # Fewer than six joints cannot keep the rotation too.
+        rotation = flange[:, :3, :3] @ turn if chain.n_joints >= 6 else None
+    if targets.frame == "base":
+        position = T[:, :3, 3] + np.einsum("nij,nj->ni", T[:, :3, :3], position)
+        rotation = None if rotation is None else T[:, :3, :3] @ rotation
+    return Goals(position, rotation)
+
+
+def _seen_from_base(goals: Goals, T: Array, turn: Array) -> tuple[Array, Array | None]:
+    """Position (n, 3) of the point and rotation (n, 3, 3) of the flange in the base frame."""
+    back = T[:, :3, :3].transpose(0, 2, 1)
+    position = np.einsum("nij,nj->ni", back, goals.position - T[:, :3, 3])
+    if goals.rotation is None:
+        return position, None
+    return position, back @ goals.rotation @ turn.transpose(0, 2, 1)
+
+
+def nominal_flanges(chain: Chain, q: Array) -> Array:
+    """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
+    symbol = ca.SX.sym("q", chain.n_joints)
+    return np.asarray(Tape([symbol], [rigid.nominal_flange(chain, symbol)])(q)[0])
+
+
+def _other_postures(
+    search: Commanding, chain: Chain, position: Array, flange: Array | None, place: Array,
+    limits: tuple[Array, Array], lost: NDArray[np.int64], nominal: Array, seed: int,
+) -> Array:  # fmt: skip
+    """Nominal commands (n, joints), those of the targets `lost` in another posture where the
+    calibrated arm reaches them from one: the nearest to the old command."""
+    found = inverse_kinematics(
+        chain, position[lost], limits, rotation=None if flange is None else flange[lost],
+        point=place, seed=seed,
+    )  # fmt: skip
+    count = found.q.shape[1]
+    starts = found.q.reshape(len(lost) * count, -1)
+    target = np.repeat(lost, count)
+    q, _ = search.solve(starts, target)
+    miss, turn = search.misses(q, target)
+    good = np.asarray((miss <= TOLERANCE) & (turn <= TOLERANCE)).reshape(len(lost), count)
+    far = np.linalg.norm(found.q - nominal[lost][:, None], axis=2)
+    best = np.where(good, far, np.inf).argmin(axis=1)
+    chosen = found.q[np.arange(len(lost)), best]
+    nominal = nominal.copy()
+    nominal[lost] = np.where(good.any(axis=1, keepdims=True), chosen, nominal[lost])
+    return nominal
+
+
+def _status(search: Commanding, found: Solved, nominal: Array) -> tuple[str, ...]:
+    """What became of every row; LIMIT where joints without limits would reach the target."""
+    reached, lost = found.reached, ~np.isfinite(found.miss)
+    status = np.where(reached, REACHED, np.where(lost, NO_EQUILIBRIUM, NOT_REACHED)).astype(object)
+    left = np.flatnonzero(~reached & ~lost)
+    if len(left):
+        wide = np.full(nominal.shape[1], np.inf)
+        free = Commanding(search.tool, search.rows, search.goals, -wide, wide)
+        q, _ = free.solve(nominal[left], left)
+        miss, turn = free.misses(q, left)
+        within = (miss <= TOLERANCE) & (turn <= TOLERANCE)
+        status[left[within]] = LIMIT
+    return tuple(status)
+
+
+def _uncertainty(
+    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: NDArray[np.bool_], seed: int
+) -> Uncertainty:
+    n = len(q)
+    covariance, unknown = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
+    blamed: dict[str, None] = {}
+    left = undetermined(tool, rows, seed)
+    good = np.flatnonzero(reached)
+    for first in range(0, len(good), SENSITIVITIES):
+        some = good[first : first + SENSITIVITIES]
+        A = tool.sensitivity([values[some] for values in rows], q[some])
+        part = position_uncertainty(tool.calibrated, A, left)
+        covariance[some], unknown[some] = part.covariance, part.unknown
+        blamed |= dict.fromkeys(part.blamed)
+    return Uncertainty(covariance, unknown, tuple(blamed))

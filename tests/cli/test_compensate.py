@@ -1,0 +1,166 @@
+"""elastocal compensate from files to files, and what it says to wrong input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.calibration import with_values
+from typer.testing import CliRunner
+
+from elastocal.cell_reader import read_cell
+from elastocal.cli import app
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.model import Model
+
+URDF = Path(__file__).parents[2] / "src" / "elastocal" / "demo" / "kr270_2.urdf"
+CELL = f"""
+[robot]
+urdf = "{URDF}"
+[tool]
+load_point_m = [0.2, 0.0, 0.25]
+[tool.markers_m]
+M1 = [0.25, 0.0, 0.0]
+M2 = [-0.1, 0.2, 0.1]
+[model]
+effects = ["joint_offset", "joint_compliance"]
+[limits]
+joint1_deg = [-100, 100]
+"""
+TRUTH = {"joint2.offset": 1e-3, "joint5.offset": -8e-4, "joint2.compliance": 2.9e-7,
+         "joint3.compliance": 4.2e-7, "joint5.compliance": 3.5e-6}  # fmt: skip
+TARGETS = """x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,force_x_N,force_y_N,force_z_N
+1800,300,1500,0,120,0,0,0,-2600
+1810,300,1500,0,120,0,0,0,-2600
+1820,300,1500,0,120,0,0,0,-2600
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "cell.toml").write_text(CELL)
+    (tmp_path / "targets.csv").write_text(TARGETS)
+    model = Model.from_cell(read_cell(tmp_path / "cell.toml", known_effects=tuple(CATALOGUE)))
+    x = with_values(model, TRUTH)
+    entries = [{"name": n, "held": float(v)} for n, v in zip(model.names, x, strict=True)]
+    result = {
+        "schema": "elastocal/identification/1",
+        "parameters": entries,
+        "covariance_of": list(TRUTH),
+        "covariance": (1e-16 * np.eye(len(TRUTH))).tolist(),
+    }
+    (tmp_path / "result.json").write_text(json.dumps(result))
+    return tmp_path
+
+
+def run(folder, *arguments):
+    files = [str(folder / "cell.toml"), str(folder / "result.json")]
+    outcome = CliRunner().invoke(
+        app, ["compensate", *files, *map(str, arguments), "-q"], catch_exceptions=False
+    )
+    assert "Traceback" not in outcome.stderr
+    return outcome
+
+
+def test_targets_become_commands(folder):
+    out = folder / "commands.csv"
+    outcome = run(folder, folder / "targets.csv", "-o", out, "--json")
+    assert outcome.exit_code == 0, outcome.stderr
+    told = json.loads(outcome.stdout)
+    assert told["schema"] == "elastocal/compensation/1"
+    assert told["n"] == told["reached"] == 3
+    assert told["error_before_um"]["rms"] > 1000 > 0.1 > told["error_after_um"]["max"]
+    rows = list(csv.DictReader(out.open()))
+    assert [row["status"] for row in rows] == ["reached"] * 3
+    assert all(float(row["std_um"]) > 0 for row in rows)
+    q = [[float(row[f"q{k}_deg"]) for k in range(1, 7)] for row in rows]
+    # simulate reads the commands, and agrees on where the load point's tool goes.
+    sets = [v for name, value in TRUTH.items() for v in ("--set", f"{name}={value}")]
+    again = CliRunner().invoke(
+        app,
+        ["simulate", str(folder / "cell.toml"), str(out), "-o", str(folder / "s.csv"),
+         "--no-noise", *sets],
+    )  # fmt: skip
+    assert again.exit_code == 0, again.stderr
+    assert np.abs(np.diff(q, axis=0)).max() < 2
+
+
+def test_the_marker_named_is_where_simulate_sees_it(folder):
+    out = folder / "commands.csv"
+    outcome = run(folder, folder / "targets.csv", "-o", out, "--point", "M2")
+    assert outcome.exit_code == 0, outcome.stderr
+    assert "3 of 3 targets reached by the marker M2" in outcome.stdout
+    sets = [v for name, value in TRUTH.items() for v in ("--set", f"{name}={value}")]
+    CliRunner().invoke(
+        app,
+        ["simulate", str(folder / "cell.toml"), str(out), "-o", str(folder / "s.csv"),
+         "--no-noise", *sets],
+    )  # fmt: skip
+    seen = [row for row in csv.DictReader((folder / "s.csv").open()) if row["marker"] == "M2"]
+    x = [float(row["x_m"]) for row in seen]
+    assert np.allclose(x, [1.8, 1.81, 1.82], atol=1e-7)
+
+
+def test_one_target_on_the_terminal(folder):
+    outcome = run(folder, "--target", "1800,300,1500", "--load", "0", "0", "-2600")
+    assert outcome.exit_code == 0, outcome.stderr
+    assert "target 1: q1_deg" in outcome.stdout
+
+
+def test_a_table_of_corrections(folder):
+    out = folder / "table.csv"
+    outcome = run(folder, "--table", out, "--grid", "2,2,1,1,1,1", "--json")
+    assert outcome.exit_code == 0, outcome.stderr
+    told = json.loads(outcome.stdout)["table"]
+    assert told["points"] == 4 and told["checked_between"] > 0
+    rows = list(csv.DictReader(out.open()))
+    assert len(rows) == 4 and "dx_mm" in rows[0] and "drz_deg" in rows[0]
+
+
+def test_a_target_out_of_reach_ends_with_1_and_writes_nothing_unless_partial(folder):
+    (folder / "targets.csv").write_text(TARGETS + "9000,0,0,0,0,0,0,0,-2600\n")
+    out = folder / "commands.csv"
+    outcome = run(folder, folder / "targets.csv", "-o", out)
+    assert outcome.exit_code == 1
+    assert "line 5 (not reached)" in outcome.stderr and "--partial" in outcome.stderr
+    assert not out.exists()
+    outcome = run(folder, folder / "targets.csv", "-o", out, "--partial")
+    assert outcome.exit_code == 0, outcome.stderr
+    rows = list(csv.DictReader(out.open()))
+    assert rows[3]["q1_deg"] == "" and rows[3]["status"] == "not reached"
+    assert rows[0]["status"] == "reached"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ((), "nothing to compensate"),
+        (("targets.csv", "--frame", "world"), "--frame takes base or tracker"),
+        (("targets.csv", "--target", "1,2,3"), "drop one of them"),
+        (("targets.csv", "--point", "M3"), "did you mean 'M"),
+        (("targets.csv", "--point", "1,2"), "--point takes x,y,z"),
+        (("targets.csv", "--near", "0,0"), "--near takes 6 numbers"),
+        (("targets.csv", "--near", "170,0,0,0,0,0"), "joint 1 is beyond its limits"),
+        (("targets.csv", "--load", "0", "0", "-5"), "forces of its own"),
+        (("targets.csv", "--grid", "3"), "--table FILE"),
+        (("--target", "1,2"), "--target takes"),
+        (("--target", "1,2,x"), "--target takes"),
+        (("--table", "t.csv", "--grid", "a"), "whole numbers"),
+        (("--table", "t.csv", "--rotation", "0,0,0"), "belongs to --box"),
+        (("--table", "t.csv", "--box", "1,2,3"), "--box takes"),
+        (("missing.csv",), "no such file"),
+        (("targets.csv", "-o", "targets.csv"), "written over"),
+        (("targets.csv", "-o", "nowhere/c.csv"), "does not exist"),
+    ],
+)
+def test_wrong_input_is_told(folder, monkeypatch, arguments, told):
+    monkeypatch.chdir(folder)
+    before = sorted(os.listdir(folder))
+    outcome = run(folder, *arguments)
+    assert outcome.exit_code == 2
+    assert told in outcome.stderr
+    assert sorted(os.listdir(folder)) == before

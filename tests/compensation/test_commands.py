@@ -1,0 +1,374 @@
+"""A command puts the tool at its target, says so where it cannot, and keeps the limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from support.calibration import cell_of, random_chain
+from support.cells import (
+    COMPENSATOR,
+    COMPLIANCE,
+    DOWN,
+    SLANTED,
+    kr270_cell,
+    kr270_chain,
+    random_poses,
+)
+from support.commands import calibrated, circumstances, erring, tool_errors
+
+from elastocal.cell import Nominal
+from elastocal.compensation.compensate import compensate, nominal_flanges
+from elastocal.compensation.point import tool_point
+from elastocal.compensation.targets import targets_at
+from elastocal.errors import InputError
+from elastocal.manipulator.model import Model
+
+EVERYWHERE = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
+SOME = ("joint_offset", "link_geometry:link3", "joint_compliance")
+# Regular postures of the KR 270, well inside its limits.
+POSTURES = np.radians(
+    [
+        [10, -80, 90, 30, 50, -20],
+        [-60, -60, 60, -80, 60, 100],
+        [80, -110, 100, 120, -70, -150],
+        [-120, -90, 20, -40, -50, 60],
+    ]
+)
+FARTHEST = 1e-7  # m and rad
+
+
+def near(chain, q, rng, size=2e-3):
+    """Targets a few mm and mrad from where the nominal flange is at q: (n, 3), (n, 3, 3)."""
+    T = nominal_flanges(chain, q)
+    turn = Rotation.from_rotvec(size * rng.normal(size=(len(q), 3))).as_matrix()
+    return T[:, :3, 3] + size * rng.normal(size=(len(q), 3)), T[:, :3, :3] @ turn
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        ("encoder_scale", "gear_eccentricity", "gear_second_harmonic", "gear_ripple"),
+        ("wrist_coupling", "backlash", "hysteresis", "joint_hardening"),
+        ("off_axis_compliance:joint2", "link_bending:link2", "base_compliance"),
+        ("gravity_compensator", "payload_error", "link_mass_error"),
+        ("thermal_expansion:all", "base_drift", "joint_drift:joint2", "marker_slip:marker:M1"),
+        ("encoder_jump:joint3", "frame_jump", "marker_orientation"),
+    ],
+)
+def test_every_effect_is_undone(effects):
+    check_effects(effects, "equilibrium", FARTHEST)
+
+
+def test_the_paper_s_linear_model_is_undone():
+    # Rotations of eq. (3) are rotations to first order in the deflection (1e-3 rad) alone.
+    check_effects(("gear_eccentricity",), "linear", 2e-6)
+
+
+def check_effects(effects, model, farthest_turn):
+    settings_of = {
+        "joint3": {"jump_time_s": 3000.0},
+        "tracker": {"jump_time_s": 4000.0},
+        "marker:M1": {"slip_time_s": 2000.0},
+    }
+    names = {e.partition(":")[0] for e in effects}
+    keep = {
+        "joint3": "encoder_jump" in names,
+        "tracker": "frame_jump" in names,
+        "marker:M1": "marker_slip" in names,
+    }
+    nominal = Nominal(
+        joint_compliance=COMPLIANCE,
+        gravity_compensator=COMPENSATOR if "gravity_compensator" in names else None,
+        settings={place: given for place, given in settings_of.items() if keep[place]},
+    )
+    cell = kr270_cell(
+        (*EVERYWHERE, *effects), nominal=nominal, deflection_model=model, link_gravity=True,
+        gear_ripple_orders=(88.5,),
+    )  # fmt: skip
+    chain, rng = kr270_chain(), np.random.default_rng(5)
+    arm = calibrated(chain, cell)
+    arm = replace(arm, x=erring(arm.model, rng))
+    position, rotation = near(chain, POSTURES, rng)
+    targets = targets_at("targets", position, rotation, "base", SLANTED, q=POSTURES)
+    n = len(POSTURES)
+    targets = replace(targets, table=replace(targets.table, **circumstances(n, 6, rng)))
+    # The flange's own place, so that nominal joints are near; M1 is some way off.
+    found = compensate(arm, targets, tool_point(cell, "M1"))
+    missed = [s for s in found.status if s != "reached"]
+    assert not missed, missed
+    miss, turn = tool_errors(arm, found)
+    assert miss.max() < FARTHEST and turn.max() < farthest_turn
+    # The nominal command itself was far off: the test would see an effect left out.
+    assert found.before.min() > 1e-4
+
+
+@settings(max_examples=3, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10_000),
+    joints=st.integers(6, 7),
+    oriented=st.booleans(),
+    load=st.floats(0.0, 300.0),
+)
+def test_random_arms_reach_what_they_can(seed, joints, oriented, load):
+    """Targets of the nominal arm: reached within the limits, or said not to be."""
+    check_random_arm(seed, joints, oriented, load)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(30))
+def test_many_random_arms_reach_what_they_can(seed):
+    check_random_arm(seed, 6 + seed % 3, seed % 2 == 0, 10.0 * seed)
+
+
+def check_random_arm(seed, joints, oriented, load):
+    rng = np.random.default_rng(seed)
+    chain = random_chain(seed, joints)
+    nominal = Nominal(joint_compliance=(1e-5,) * joints)
+    cell = cell_of(SOME, nominal=nominal)
+    arm = calibrated(chain, cell)
+    arm = replace(arm, x=erring(arm.model, rng, 0.3))
+    q = rng.uniform(-1.8, 1.8, (4, joints))
+    T = nominal_flanges(chain, q)
+    goal = targets_at("t", T[:, :3, 3], T[:, :3, :3] if oriented else None, "base",
+                      load * np.array([0.3, 0.2, -1.0]))  # fmt: skip
+    found = compensate(arm, goal, tool_point(cell, "M1"), near=q[0])
+    good = found.reached
+    miss, turn = tool_errors(arm, found)
+    assert np.all(miss[good] < FARTHEST) and np.all(turn[good] < FARTHEST)
+    # A row that is not reached is never told to be, and never said to be near.
+    assert np.all(miss[~good] > 1e-9) or np.all(turn[~good] > 1e-9)
+    assert np.all(np.abs(found.q) <= 2.5)
+    assert np.allclose(np.nan_to_num(found.after), np.nan_to_num(miss), atol=1e-12)
+
+
+def narrow(limit: dict[str, tuple[float, float]]):
+    return replace(kr270_cell(EVERYWHERE), limits=limit)
+
+
+def test_a_limit_is_kept_and_named():
+    chain, rng = kr270_chain(), np.random.default_rng(1)
+    low, high = POSTURES[0, 2], POSTURES[0, 2]
+    cell = narrow({"joint3": (low - 0.5, high + 1e-5)})
+    arm = calibrated(chain, cell)
+    arm = replace(arm, x=erring(arm.model, rng))
+    # A posture further out, which needs joint 3 beyond its limit.
+    wanted = nominal_flanges(chain, POSTURES[:1] + np.array([0, 0, 0.05, 0, 0, 0]))
+    point = tool_point(cell, "0,0,0.001")
+    targets = targets_at("t", wanted[:, :3, 3], wanted[:, :3, :3], "base", DOWN, q=POSTURES[:1])
+    found = compensate(arm, targets, point)
+    assert found.status == ("limit",)
+    assert found.after[0] > 1e-3
+    assert found.q[0, 2] <= high + 1e-5
+    assert np.isnan(found.uncertainty.std[0])
+    # With the rotation free, the other joints take over, and a sentence says so.
+    free = compensate(arm, replace(targets, rotation=None), point)
+    assert free.status == ("reached",)
+    assert free.q[0, 2] <= high + 1e-5
+    assert any("joint 3 stands at its limit" in told for told in free.warnings)
+
+
+def test_too_soft_an_arm_has_no_equilibrium():
+    nominal = Nominal(joint_compliance=(1e-3,) * 6)
+    cell = kr270_cell(("joint_compliance",), nominal=nominal)
+    arm = calibrated(kr270_chain(), cell)
+    found = compensate(
+        arm, targets_at("t", None, None, "base", DOWN, q=POSTURES[:2]), tool_point(cell, "M1")
+    )
+    assert set(found.status) == {"no equilibrium"}
+    assert np.isnan(found.after).all()
+
+
+def test_frames_say_the_same_place_in_two_ways():
+    chain, rng = kr270_chain(), np.random.default_rng(2)
+    cell = kr270_cell(EVERYWHERE)
+    arm = calibrated(chain, cell)
+    x = erring(arm.model, rng)
+    base = [arm.model.names.index(f"base.{k}") for k in ("x", "y", "z", "rx", "ry", "rz")]
+    x[base] = [1.0, -2.0, 0.5, 0.02, -0.3, 2.0]
+    arm = replace(arm, x=x)
+    R, p = Rotation.from_rotvec(x[base[3:]]).as_matrix(), x[base[:3]]
+    position, rotation = near(chain, POSTURES, rng)
+    point = tool_point(cell, "M1")
+    in_base = compensate(arm, targets_at("t", position, rotation, "base", DOWN, q=POSTURES), point)
+    in_tracker = compensate(
+        arm,
+        targets_at("t", p + position @ R.T, R @ rotation, "tracker", R @ DOWN, q=POSTURES),
+        point,
+    )
+    assert np.allclose(in_base.q, in_tracker.q, atol=1e-10)
+    assert np.allclose(in_base.uncertainty.std, in_tracker.uncertainty.std)
+    assert tool_errors(arm, in_base)[0].max() < FARTHEST
+
+
+def test_redundant_joints_move_as_little_as_possible():
+    """The correction stands at right angles to every motion that leaves the tool where it is."""
+    rng = np.random.default_rng(3)
+    chain = random_chain(11, 7)
+    cell = cell_of(SOME, nominal=Nominal(joint_compliance=(2e-5,) * 7))
+    arm = calibrated(chain, cell)
+    arm = replace(arm, x=erring(arm.model, rng))
+    q = rng.uniform(-1.5, 1.5, (8, 7))
+    found = compensate(
+        arm, targets_at("t", None, None, "base", 100 * DOWN / 2600, q=q), tool_point(cell, "M1")
+    )
+    # Corrections of the size of the arm's errors; singular postures ask for larger ones.
+    small = found.reached & (np.abs(found.q - found.nominal).max(axis=1) < 0.03)
+    assert small.sum() >= 3
+    for i in np.flatnonzero(small)[:3]:
+        step = 1e-5
+        both = []
+        for sign in (1, -1):
+            moved = replace(found, q=found.q[i] + sign * step * np.eye(7))
+            both.append(_poses(arm, moved, i))
+        J = ((both[0] - both[1]) / (2 * step)).T
+        null = np.linalg.svd(J)[2][6:]
+        correction = found.q[i] - found.nominal[i]
+        assert np.linalg.norm(null @ correction) < 2e-3 * np.linalg.norm(correction)
+
+
+def _poses(arm, found, i):
+    """(7, 6) m and rad: the tool against target i at seven commands."""
+    n = len(found.q)
+    first = np.full(n, i)
+    goals = replace(
+        found.goals, position=found.goals.position[first], rotation=found.goals.rotation[first]
+    )
+    same = replace(found, force=found.force[first], goals=goals)
+    same = replace(same, targets=replace(same.targets, table=same.targets.table.take(first)))
+    from elastocal.measurements import Measurements
+
+    rows = Measurements(
+        source="t", row=np.arange(n), q=same.q, configuration=np.arange(n),
+        configuration_labels=tuple(map(str, range(n))), repeat=np.zeros(n, dtype=np.int64),
+        marker=np.zeros(n, dtype=np.int64), marker_names=("M1",), force=same.force,
+    )  # fmt: skip
+    rotation, position = arm.model.target_poses(rows, arm.x)
+    turned = Rotation.from_matrix(goals.rotation.transpose(0, 2, 1) @ rotation).as_rotvec()
+    return np.hstack([position - goals.position, turned])
+
+
+def test_levels_between_which_a_joint_stands():
+    """The demo's kind of model: one compliance per level of joint 2; commands leave the levels."""
+    levels = {"joint2": tuple(np.radians([-140.0, -60.0, -100.0]))}
+    cell = kr270_cell(("joint_compliance",), compliance_levels=levels)
+    chain = kr270_chain()
+    arm = calibrated(chain, cell)
+    x = arm.x.copy()
+    for k, value in enumerate((2e-7, 4e-7, 3e-7)):
+        x[arm.model.names.index(f"joint2.compliance_level{k + 1}")] = value
+    plain = kr270_cell(("joint_compliance",))
+    same = calibrated(chain, plain)
+    x_same = same.x.copy()
+    q = POSTURES[:1].copy()
+    q[0, 1] = np.radians(-80.0)  # between the levels of 4e-7 and 3e-7
+    x_same[same.model.names.index("joint2.compliance")] = 3.5e-7
+    targets = targets_at("t", None, None, "base", DOWN, q=q)
+    of_levels = compensate(replace(arm, x=x), targets, tool_point(cell, "M1"))
+    of_one = compensate(replace(same, x=x_same), targets, tool_point(plain, "M1"))
+    assert of_levels.status == ("reached",)
+    # The correction moves joint 2 by less than 0.1°, a hundredth of the way between levels.
+    assert np.allclose(of_levels.q, of_one.q, atol=1e-5)
+    q[0, 1] = np.radians(-20.0)
+    beyond = compensate(replace(arm, x=x), replace(targets, q=q), tool_point(cell, "M1"))
+    assert any("beyond its levels" in told for told in beyond.warnings)
+
+
+def test_a_column_that_the_model_needs_is_asked_for():
+    cell = kr270_cell(("joint_offset", "hysteresis"))
+    arm = calibrated(kr270_chain(), cell)
+    targets = targets_at("targets.csv", None, None, "base", DOWN, q=POSTURES)
+    with pytest.raises(InputError, match=r"targets\.csv: the model needs the column approach_1"):
+        compensate(arm, targets, tool_point(cell, "M1"))
+
+
+def test_uncertainty_is_what_other_values_would_do():
+    """Σ_p by differences of the model's own predictions, not by the derivative under test."""
+    chain, rng = kr270_chain(), np.random.default_rng(4)
+    cell = kr270_cell(EVERYWHERE)
+    arm = calibrated(chain, cell, std=0.01)
+    arm = replace(arm, x=erring(arm.model, rng))
+    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
+    found = compensate(arm, targets, tool_point(cell, "M1"))
+    std = np.sqrt(np.diag(arm.covariance))
+    off = []
+    for k, s in enumerate(std):
+        ends = []
+        for sign in (1, -1):
+            x = arm.x.copy()
+            x[k] += sign * s
+            ends.append(_places(arm.model, found, x))
+        off.append((ends[0] - ends[1]) / 2)
+    expected = np.sqrt((np.array(off) ** 2).sum(axis=(0, 2)))
+    assert np.allclose(found.uncertainty.std, expected, rtol=1e-3)
+    assert not found.uncertainty.blamed
+
+
+def _places(model: Model, found, x):
+    from elastocal.measurements import Measurements
+
+    n = len(found.q)
+    rows = Measurements(
+        source="t", row=np.arange(n), q=found.q, configuration=np.arange(n),
+        configuration_labels=tuple(map(str, range(n))), repeat=np.zeros(n, dtype=np.int64),
+        marker=np.zeros(n, dtype=np.int64), marker_names=tuple(model.cell.tool.markers),
+        force=found.force,
+    )  # fmt: skip
+    return model.target_poses(rows, x)[1]
+
+
+@pytest.mark.parametrize("observe", ["deflection", "pose", "distance"])
+def test_what_was_observed_does_not_matter(observe):
+    cell = kr270_cell(("joint_compliance",), observe=observe)
+    arm = calibrated(kr270_chain(), cell)
+    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
+    found = compensate(arm, targets, tool_point(cell, "M1"))
+    same = kr270_cell(("joint_compliance",))
+    expected = compensate(calibrated(kr270_chain(), same), targets, tool_point(same, "M1"))
+    assert found.reached.all() and np.allclose(found.q, expected.q, atol=1e-10)
+
+
+def test_nothing_known_is_no_certainty():
+    cell = kr270_cell(("joint_compliance",))
+    arm = calibrated(kr270_chain(), cell)
+    arm = replace(arm, determined=(), covariance=np.zeros((0, 0)))
+    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
+    found = compensate(arm, targets, tool_point(cell, "M1"))
+    assert found.reached.all() and np.isnan(found.uncertainty.std).all()
+
+
+def test_what_no_marker_showed_is_told():
+    """Tool and last link move the markers alike, so that a marker is known and the flange not."""
+    chain = kr270_chain()
+    cell = kr270_cell(("base_frame", "link_geometry:link6", "marker_position"))
+    arm = calibrated(chain, cell, std=0.01)
+    kept = tuple(name for name in arm.model.names if not name.startswith("link6"))
+    n = len(kept)
+    arm = replace(arm, determined=kept, covariance=1e-12 * np.eye(n))
+    targets = targets_at("t", None, None, "base", None, q=POSTURES)
+    marker = compensate(arm, targets, tool_point(cell, "M1"))
+    assert np.all(marker.uncertainty.unknown < 1e-9)
+    place = compensate(arm, targets, tool_point(cell, "0.1,0.2,0.3"))
+    assert np.all(place.uncertainty.unknown > 1e-3)
+    assert any("link6." in told and "--point" in told for told in place.warnings)
+
+
+def test_random_poses_of_the_demo_arm_are_reached_without_joints_given():
+    chain = kr270_chain()
+    cell = kr270_cell(EVERYWHERE)
+    arm = calibrated(chain, cell)
+    arm = replace(arm, x=erring(arm.model, np.random.default_rng(6)))
+    q = 0.7 * random_poses(chain, 12, 7)
+    q = q[np.abs(q[:, 4]) > 0.3]
+    T = nominal_flanges(chain, q)
+    position = T[:, :3, 3] + T[:, :3, :3] @ cell.tool.markers["M1"]
+    found = compensate(
+        arm, targets_at("t", position, T[:, :3, :3], "base", DOWN), tool_point(cell, "M1")
+    )
+    assert found.reached.sum() >= len(q) - 1
+    miss, turn = tool_errors(arm, found)
+    assert miss[found.reached].max() < FARTHEST and turn[found.reached].max() < FARTHEST

@@ -1,0 +1,119 @@
+"""Small pieces: levels, points, targets as tables, commands as tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.cells import DOWN, kr270_cell, kr270_chain
+from support.commands import calibrated
+
+from elastocal.compensation.commands_file import commands_csv, summary
+from elastocal.compensation.compensate import compensate
+from elastocal.compensation.levels import share_of_levels
+from elastocal.compensation.point import tool_point
+from elastocal.compensation.targets import one_target, read_targets, targets_at
+from elastocal.errors import ElastocalError, InputError
+from elastocal.measurement_reader import read_plan
+
+KINDS = ("revolute",) * 6
+JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
+POSE = np.radians([[10, -80, 90, 30, 50, -20]])
+
+
+@given(
+    levels=st.lists(st.integers(-30, 30), min_size=1, max_size=6, unique=True),
+    angle=st.floats(-40, 40),
+)
+def test_shares_interpolate_between_levels(levels, angle) -> None:
+    values = np.array(levels, dtype=float)
+    share = share_of_levels(np.array([angle]), values)[0]
+    assert np.isclose(share.sum(), 1) and share.min() >= 0
+    # Shares of a linear function of the level give that function, clamped at the ends.
+    assert np.isclose(share @ values, np.clip(angle, values.min(), values.max()))
+    assert np.count_nonzero(share) <= 2
+
+
+def test_points_are_named_or_given() -> None:
+    cell = kr270_cell()
+    assert tool_point(cell, None).marker is None
+    assert tool_point(cell, "M2").marker == "M2"
+    assert np.array_equal(tool_point(cell, "0.1,-0.2,0.3").place, [0.1, -0.2, 0.3])
+    for text, told in (("M9", "did you mean"), ("1,2", "x,y,z in m"), ("200,0,0", "10 m")):
+        with pytest.raises(InputError, match=told):
+            tool_point(cell, text)
+    bare = replace(cell, tool=replace(cell.tool, load_point=np.zeros(3)))
+    with pytest.raises(InputError, match="--point"):
+        tool_point(bare, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x_mm,y_mm\n1,2\n", "without z_mm"),
+        ("rx_deg,ry_deg,rz_deg\n1,2,3\n", "x_mm,y_mm,z_mm are missing"),
+        ("x_mm,y_mm,z_mm,approach_1\n1,2,3,1\n", "approach_2"),
+        ("x,y_mm,z_mm\n1,2,3\n", "has no unit"),
+        ("x_mm,y_mm,z_mm\n1,2,three\n", "line 2, column z_mm"),
+        ("x_mm,y_mm,z_mm,q1_deg\n1,2,3,4\n", "the robot has 6 joints"),
+        ("x_mm,y_mm,z_mm,speed\n1,2,3,4\n", "unknown column 'speed'"),
+        ("x_mm,y_mm,z_mm,marker\n1,2,3,A\n1,2,3,B\n", "--point"),
+        ("x_mm,y_mm,z_mm,qw,qx,qy,qz\n1,2,3,1,1,0,0\n", "norm"),
+    ],
+)
+def test_tables_that_say_no_target_are_refused(tmp_path, text, told) -> None:
+    path = tmp_path / "targets.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=told):
+        read_targets(path, KINDS, "base")
+
+
+def test_joints_alone_are_targets_of_the_base_frame(tmp_path) -> None:
+    path = tmp_path / "targets.csv"
+    path.write_text(f"{JOINTS}\n1,2,3,4,5,6\n1,2,3,4,5,6\n")
+    targets = read_targets(path, KINDS, "base", np.array([0.0, 0.0, -5.0]))
+    assert targets.position is None and len(targets) == 2  # a path may pass a place twice
+    assert np.array_equal(targets.table.force[1], [0, 0, -5])
+    with pytest.raises(InputError, match="base frame"):
+        read_targets(path, KINDS, "tracker")
+
+
+@settings(max_examples=60, deadline=None)
+@given(text=st.text("0123456789,.-+eE naif", max_size=30))
+def test_any_target_text_is_a_target_or_told(text) -> None:
+    try:
+        targets = one_target(text, "base")
+    except ElastocalError as error:
+        assert "--target takes" in str(error)
+    else:
+        assert np.isfinite(targets.position).all()
+
+
+def test_commands_are_a_plan_and_rows_not_reached_are_empty(tmp_path) -> None:
+    chain = kr270_chain()
+    cell = kr270_cell(("joint_compliance",))
+    arm = calibrated(chain, cell, std=0.01)
+    joints = np.repeat(POSE, 2, axis=0)
+    position = np.array([[1.8, 0.3, 1.5], [9.0, 0.0, 0.0]])
+    found = compensate(
+        arm, targets_at("t", position, None, "base", DOWN, q=joints), tool_point(cell, "M1")
+    )
+    assert found.status == ("reached", "not reached")
+    rows = list(csv.DictReader(io.StringIO(commands_csv(found, chain.kinds))))
+    assert rows[1]["q1_deg"] == "" and rows[1]["correction_q1_deg"] == ""
+    assert rows[1]["status"] == "not reached" and float(rows[1]["error_after_um"]) > 1e6
+    assert float(rows[0]["force_z_N"]) == DOWN[2]
+    told = summary(found, chain.kinds, commands=True)
+    assert told["reached"] == 1 and told["not_reached"][0]["line"] == 2
+    assert "q1_deg" in told["commands"][0] and "q1_deg" not in told["commands"][1]
+    path = tmp_path / "commands.csv"
+    path.write_text("\n".join(commands_csv(found, chain.kinds).splitlines()[:2]) + "\n")
+    plan = read_plan(path, joint_kinds=chain.kinds)
+    assert np.allclose(plan.q, found.q[:1], atol=1e-10)
+    change = [float(rows[0][f"correction_q{k}_deg"]) for k in range(1, 7)]
+    assert np.allclose(found.q[0] - found.nominal[0], np.radians(change))

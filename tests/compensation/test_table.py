@@ -1,0 +1,85 @@
+"""A correction added to a nominal target leads the real tool to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.cells import DOWN, kr270_cell, kr270_chain
+from support.commands import calibrated, erring, tool_errors
+
+from elastocal.compensation.compensate import compensate, nominal_flanges
+from elastocal.compensation.point import tool_point
+from elastocal.compensation.table import EXACT, Grid, box_grid, correction_table, joint_grid
+from elastocal.compensation.targets import targets_at
+from elastocal.errors import InputError
+
+EFFECTS = ("joint_offset", "link_geometry", "joint_compliance")
+LOW = np.radians([-30, -110, 60, -20, 40, -20])
+HIGH = np.radians([30, -70, 100, 20, 80, 20])
+
+
+def arm_and_point():
+    cell = kr270_cell(EFFECTS)
+    arm = calibrated(kr270_chain(), cell)
+    arm = replace(arm, x=erring(arm.model, np.random.default_rng(8), 0.5))
+    return arm, tool_point(cell, "M1")
+
+
+def joint_box(counts) -> Grid:
+    axes = zip(LOW, HIGH, counts, strict=True)
+    return Grid(tuple(np.linspace(a, b, n) if n > 1 else np.array([(a + b) / 2])
+                      for a, b, n in axes), True)  # fmt: skip
+
+
+def test_corrected_targets_are_reached_by_the_nominal_arm() -> None:
+    arm, point = arm_and_point()
+    found = correction_table(arm, joint_box((2, 2, 1, 1, 2, 1)), point, DOWN)
+    assert set(found.status) == {EXACT}
+    T = nominal_flanges(arm.model.chain, found.points)
+    place = T[:, :3, 3] + T[:, :3, :3] @ arm.model.cell.tool.markers["M1"]
+    turned = Rotation.from_rotvec(found.correction[:, 3:]).as_matrix() @ T[:, :3, :3]
+    # A rigid, nominal arm stands for the controller.
+    rigid = kr270_cell(())
+    controller = compensate(
+        calibrated(arm.model.chain, rigid),
+        targets_at("t", place + found.correction[:, :3], turned, "base", q=found.points),
+        tool_point(rigid, "M1"),
+    )
+    assert controller.reached.all()
+    real = compensate(arm, targets_at("t", None, None, "base", DOWN, q=found.points), point)
+    miss, turn = tool_errors(arm, replace(real, q=controller.q))
+    assert miss.max() < 1e-7 and turn.max() < 1e-7
+
+
+def test_a_finer_grid_leaves_less_between_its_points() -> None:
+    arm, point = arm_and_point()
+    errors = []
+    for counts in ((2, 2, 2, 1, 1, 1), (4, 4, 4, 1, 1, 1)):
+        found = correction_table(arm, joint_box(counts), point, DOWN)
+        assert len(found.between) == 512
+        errors.append(np.sqrt(np.mean(found.between[:, 0] ** 2)))
+    before = np.sqrt(np.mean(found.before[:, 0] ** 2))
+    # A third of the step, a ninth of what linear interpolation leaves.
+    assert errors[1] < errors[0] / 5 and errors[0] < before / 5
+
+
+def test_a_box_with_one_rotation() -> None:
+    arm, point = arm_and_point()
+    T = nominal_flanges(arm.model.chain, np.radians([[0, -90, 80, 0, 60, 0]]))[0]
+    centre = T[:3, 3] + T[:3, :3] @ arm.model.cell.tool.markers["M1"]
+    grid = box_grid(centre - 0.1, centre + 0.1, (3,), T[:3, :3])
+    found = correction_table(arm, grid, point, DOWN, near=np.radians([0, -90, 80, 0, 60, 0]))
+    assert len(found.points) == 27 and set(found.status) == {EXACT}
+    assert found.between[:, 0].max() < found.before[:, 0].max() / 20
+
+
+@pytest.mark.parametrize(
+    ("counts", "told"),
+    [((5, 5), "one per joint"), ((0,), "1 or more"), ((30,), "points, and")],
+)
+def test_a_grid_that_cannot_be_is_refused(counts, told) -> None:
+    with pytest.raises(InputError, match=told):
+        joint_grid(arm_and_point()[0], counts)
