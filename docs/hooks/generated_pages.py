@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ import effects_page
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
 
 PAGES = {
     "reference/effects.md": effects_page.page,
@@ -42,10 +44,28 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """What the files have for other readers, as a site takes it."""
+    return plain_fences(links_inside(markdown, page.file.src_uri))
+
+
+def plain_fences(markdown: str) -> str:
     """Fences whose language has a word of ours behind it (```toml workspace), as Markdown has it.
 
     The word says to tests and readers of the file which piece of a cell it is; a site would take
     the fence for text.
     """
     return re.sub(r"^```(\w+) \w+$", r"```\1", markdown, flags=re.M)
+
+
+def links_inside(markdown: str, page: str) -> str:
+    """Links that lead out of docs/, into the repository, as the path that they lead to."""
+
+    def shown(found: re.Match[str]) -> str:
+        text, target = found.groups()
+        path = posixpath.normpath(posixpath.join("docs", posixpath.dirname(page), target))
+        if "://" in target or path.startswith("docs/"):
+            return found.group()
+        return text if path in text else f"{text} (`{path}`)"
+
+    return re.sub(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)[^)]*\)", shown, markdown)

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import cell_keys_page
 import pytest
+from typer.testing import CliRunner
 
 from elastocal.cell_reader import read_cell
+from elastocal.cli import app
 from elastocal.diagnosis.diagnose import diagnose
 from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.diagnosis.published import publish
@@ -38,7 +40,7 @@ def keys(value):
     """Every key of nested JSON, those apart that the arm names."""
     if isinstance(value, dict):
         for key, inside in value.items():
-            yield key
+            yield re.sub(r"^q[2-9]_", "q1_", key)  # "q1_deg …" on the page
             if key not in NAMED_BY_THE_ARM:
                 yield from keys(inside)
     elif isinstance(value, list | tuple):
@@ -103,6 +105,22 @@ def test_every_key_of_a_diagnosis_is_on_the_page():
     published = publish(diagnosis, model, "data.csv")
     assert not missing([*keys(published), *rare], section("Diagnosis of `diagnose`"))
     assert published["effects"], "the example's backlash is found, so that its keys are compared"
+
+
+@pytest.mark.parametrize(
+    "command, heading",
+    [
+        ("compensate cell.toml result.json targets.csv", "Targets and commands of `compensate`"),
+        ("export cell.toml result.json -o arm.urdf --load 0 0 -98", "Answer of `export`"),
+    ],
+)
+def test_every_key_of_what_is_done_with_a_result_is_on_the_page(
+    course, monkeypatch, command, heading
+):
+    monkeypatch.chdir(course.folder)
+    done = CliRunner().invoke(app, [*command.split(), "--json", "--quiet"])
+    assert done.exit_code == 0, done.output
+    assert not missing(keys(json.loads(done.stdout)), section(heading))
 
 
 def test_a_key_that_the_page_lacks_is_noticed():

@@ -56,5 +56,18 @@ def test_fences_with_a_word_of_ours_become_plain_ones():
 
     text = (DOCS / "file-formats.md").read_text(encoding="utf-8")
     assert "```toml workspace\n" in text
-    after = re.findall(r"^```(.*)$", hook.on_page_markdown(text), re.M)
+    after = re.findall(r"^```(.*)$", hook.plain_fences(text), re.M)
     assert len(after) == text.count("```") and set(after) <= {"", "toml", "text", "console"}
+
+
+def test_links_out_of_the_documentation_become_paths():
+    import generated_pages as hook
+
+    text = (
+        "[the study](../experiment_design/a/README.md#x), [files](file-formats.md#y), ![](../x.png)"
+    )
+    after = hook.links_inside(text, "exporting.md")
+    assert "the study (`experiment_design/a/README.md`)" in after
+    assert "[files](file-formats.md#y)" in after and "![](../x.png)" in after
+    inside = "[formats](../file-formats.md)"
+    assert hook.links_inside(inside, "explanation/chain.md") == inside
