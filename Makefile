@@ -30,7 +30,7 @@ help:
 	@echo "make demo       set up .venv if needed, then calibrate a simulated arm"
 	@echo "make test       the test suite              (PYTEST_ARGS=\"tests/manipulator -x\", WORKERS=2)"
 	@echo "make test-long  the long studies among the tests"
-	@echo "make bench      a million readings: wall time and peak memory (BENCH_ARGS=\"--rows 200000\")"
+	@echo "make bench      the benchmarks, to benchmarks/result.md      (BENCH_ARGS=--full: all sizes)"
 	@echo "make lint       ruff check, ruff format --check, mypy"
 	@echo "make docs       the documentation as pages in site/ (strict: a broken link is an error)"
 	@echo "make docs-figures  its figures anew"
@@ -55,9 +55,8 @@ test: $(TEST_TOOLS)
 test-long: $(TEST_TOOLS)
 	$(PYTEST) -m long $(PYTEST_ARGS)
 
-bench: export OPENBLAS_NUM_THREADS = 1
 bench: $(RUN_TIME)
-	$(BIN)/python benchmarks/million_rows.py $(BENCH_ARGS)
+	$(BIN)/python benchmarks/run.py $(BENCH_ARGS)
 
 lint: $(TEST_TOOLS)
 	$(BIN)/python -m ruff check .

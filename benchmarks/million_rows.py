@@ -24,10 +24,10 @@ import numpy as np
 
 from elastocal.cell_reader import read_cell
 from elastocal.identification import partition
-from elastocal.identification.checks import limits
 from elastocal.identification.identify import identify
 from elastocal.identification.result import IdentificationResult
 from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
 from elastocal.measurement_reader import read_measurements
 from elastocal.measurement_writer import write_measurements
@@ -57,7 +57,7 @@ def write_cell(folder: Path, effects: tuple[str, ...]) -> Path:
 def readings(model: Model, first: int, n: int, x: np.ndarray, loaded: bool) -> Measurements:
     """Readings `first` to `first + n` at random poses, every other one loaded where asked."""
     rng = np.random.default_rng([SEED, first])
-    low, high = limits(model)
+    low, high = joint_limits(model.cell, model.chain)
     force = np.zeros((n, 3))
     if loaded:
         force[::2] = LOAD_N
@@ -189,7 +189,9 @@ def campaign(kind: str, n: int, loaded: bool) -> None:
 
 def _own_process(*arguments: Any) -> None:
     sys.stdout.flush()
-    subprocess.run([sys.executable, __file__, "--process", *map(str, arguments)], check=True)
+    command = [sys.executable, __file__, "--process", *map(str, arguments)]
+    # With a thread for each core linear algebra waits for itself more than it works.
+    subprocess.run(command, check=True, env=os.environ | {"OPENBLAS_NUM_THREADS": "1"})
 
 
 def main() -> None:

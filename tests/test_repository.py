@@ -23,7 +23,7 @@ SOURCE = ROOT / "src" / "elastocal"
 LAYERS = (
     {"manipulator"},
     {"simulation", "identification"},
-    {"design", "diagnosis", "compensation", "export"},
+    {"design", "diagnosis", "compensation", "export", "importing"},
     {"report"},
     {"demo"},
     {"cli", "__main__"},

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.measurement_columns import column, families
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,45 @@ class Measurements:
 
     def __len__(self) -> int:
         return len(self.row)
+
+    def to_dataframe(self, joint_kinds: Sequence[str] | None = None) -> pd.DataFrame:
+        """The table with the columns of the canonical CSV, one row per reading, in SI units.
+
+        `joint_kinds`: "revolute" (default for all joints) or "prismatic", which decides q1_rad or
+        q1_m.
+        """
+        import pandas as pd
+
+        known = families(joint_kinds or ("revolute",) * self.q.shape[1])
+        blocks: dict[str, np.ndarray | None] = {
+            "repeat": self.repeat,
+            "q": self.q,
+            "force": self.force,
+            "position": self.position,
+            "rotation": self.rotation,
+            "distance": self.distance,
+            "torque": self.torque,
+            f"sigma_{self.sigma_frame}": self.sigma,
+            "time": self.time,
+            "approach": None if self.approach is None else self.approach.astype(np.int64),
+            "temperature": self.temperature,
+        }
+        columns: dict[str, object] = {
+            "configuration": np.array(self.configuration_labels, dtype=object)[self.configuration],
+            "marker": np.array(self.marker_names, dtype=object)[self.marker],
+        }
+        for name, values in blocks.items():
+            if values is None:
+                continue
+            stems = known[name].units
+            for stem, numbers in zip(stems, values.reshape(len(self), len(stems)).T, strict=True):
+                unit = next(unit for unit in SI_UNITS if unit in stems[stem])
+                columns[column(stem, unit)] = numbers
+        return pd.DataFrame(columns, copy=False)
+
+    def _repr_html_(self) -> str:
+        """The first and last rows, as notebooks show a data frame."""
+        return str(self.to_dataframe()._repr_html_())
 
     def take(self, index: NDArray) -> Measurements:
         """The rows `index` (integers or a mask) as a table of their own; labels are kept."""

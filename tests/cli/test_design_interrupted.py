@@ -1,5 +1,6 @@
 """An interrupted design goes on where it was, and ends as if nothing had happened."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -106,9 +107,14 @@ def test_a_curve_is_kept_too(tmp_path, monkeypatch):
     interrupted(cell, monkeypatch, 2, *options)
     result = design(cell, *options, quiet=False)
     assert result.exit_code == 0 and "4 poses: " not in result.stderr
-    resumed = (tmp_path / "plan.json").read_text("utf-8")
+    resumed = without_backend(tmp_path / "plan.json")
     assert design(cell, *options).exit_code == 0
-    assert (tmp_path / "plan.json").read_text("utf-8") == resumed
+    assert without_backend(tmp_path / "plan.json") == resumed
+
+
+def without_backend(path):
+    """Which engine evaluated the model depends on how much there was to evaluate."""
+    return {k: v for k, v in json.loads(path.read_text("utf-8")).items() if k != "backend"}
 
 
 def test_an_interrupt_that_a_solver_catches_is_not_lost(tmp_path, monkeypatch):

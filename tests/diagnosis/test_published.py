@@ -33,6 +33,11 @@ def test_every_part_of_the_result_is_published(model):
     assert names <= set(publish(EXPLAINED, model, "data.csv"))
 
 
+def test_what_evaluated_the_model_is_told(model):
+    content = publish(EXPLAINED, model, "data.csv")
+    assert content["backend"] == model.backend_report()
+
+
 def test_keys_and_units_of_the_design(model):
     content = publish(EXPLAINED, model, "data.csv")
     assert content["schema"] == "elastocal/diagnosis/1"

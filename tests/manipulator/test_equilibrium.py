@@ -30,6 +30,7 @@ from support.robots import KR270
 
 from elastocal.cell import Array, Nominal
 from elastocal.errors import ElastocalError
+from elastocal.manipulator import equilibrium
 from elastocal.manipulator.chain import Chain, Joint, LinkMass
 from elastocal.manipulator.effects.off_axis_compliance import transverse_axes
 from elastocal.manipulator.model import Model
@@ -363,3 +364,28 @@ def test_message_says_what_to_check() -> None:
         kr270(nominal=SOFT).regressor(table_of(poses, np.array([3e4, 0.0, -1e5])))
     text = str(caught.value)
     assert re.search(r"force_\*_N", text) and "joint_compliance" in text and "rad/(N m)" in text
+
+
+# --- many springs ---------------------------------------------------------------------------
+
+
+def test_many_springs_settle_by_slopes_along_directions_as_by_the_whole_jacobian(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Small tables first take F_θ direction by direction; B and θ are those of F_θ whole."""
+    poses = table_of(kr270_poses(5), SLANTED, tuple(MARKERS), True)
+    whole = kr270("joint_compliance", "off_axis_compliance", "marker_position")
+    x = whole.nominal + 1e-7
+    expected, theta = whole.regressor(poses, x), whole.deflection(poses, x)
+    monkeypatch.setattr(equilibrium, "LARGEST_JACOBIAN", 0)
+    monkeypatch.setattr(equilibrium, "ROWS_THAT_PAY", 8 * len(poses))
+    monkeypatch.setattr(equilibrium, "AT_A_TIME", 100)
+    model = kr270("joint_compliance", "off_axis_compliance", "marker_position")
+    solver = model._symbolic.equilibrium
+    for _ in range(4):
+        found = model.regressor(poses, x)
+        np.testing.assert_allclose(found.B, expected.B, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(model.deflection(poses, x), theta, rtol=0, atol=1e-15)
+        if solver._rows <= 8 * len(poses):
+            assert "_whole" not in vars(solver)
+    assert "_along" in vars(solver) and "_whole" in vars(solver)

@@ -217,6 +217,39 @@ def test_outputs_that_do_not_depend_on_the_inputs() -> None:
     np.testing.assert_array_equal(same[:, 0, 0], [0, 1, 2])
 
 
+def test_an_output_is_also_an_operand_and_is_put_out_twice() -> None:
+    """A value stands in its first output, is read from there, and copied to the second."""
+    x, p = ca.SX.sym("x", 2), ca.SX.sym("p")
+    product = x[0] * x[1]
+    outputs = [ca.vertcat(product, ca.sin(product) + x[0], product), ca.vertcat(p * 2, x[1])]
+    rows = np.random.default_rng(4).normal(size=(9, 2))
+    first, second = Tape([x, p], outputs, "numpy")(rows, np.array([0.5]), chunk=4)
+    expected = rows.prod(axis=1)
+    np.testing.assert_array_equal(first[:, [0, 2], 0], np.stack([expected, expected], axis=1))
+    np.testing.assert_array_equal(first[:, 1, 0], np.sin(expected) + rows[:, 0])
+    np.testing.assert_array_equal(second[..., 0], np.stack([np.ones(9), rows[:, 1]], axis=1))
+
+
+def test_division_by_zero_among_the_values_in_common_is_infinite() -> None:
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    with np.errstate(all="ignore"):
+        found = Tape([x, p], [x / p, x * (1 / p)], "numpy")(np.ones((2, 1)), np.zeros(1))
+    assert np.isposinf(found).all()
+
+
+def test_a_long_sum_needs_few_registers() -> None:
+    """Registers are taken again as soon as what they held has been read for the last time."""
+    x = ca.SX.sym("x", 40)
+    total = ca.SX(0)
+    for k in range(40):
+        total = ca.sin(total + x[k])
+    tape = Tape([x], [total], "numpy")
+    rows = np.random.default_rng(5).normal(size=(3, 40))
+    assert_replays([x], total, rows)
+    tape(rows)
+    assert tape._replay._plan((True,)).n_registers <= 2
+
+
 def test_a_table_without_rows_gives_no_rows() -> None:
     found = Tape(*three_outputs())(np.zeros((0, 3)), np.ones(2))
     assert [f.shape for f in found] == [(0, 2, 2), (0, 3, 2), (0, 1, 1)]

@@ -14,6 +14,7 @@ from elastocal.cli import (  # noqa: F401
     diagnose,
     export,
     identify,
+    import_,
     simulate,
     study,
 )

@@ -81,7 +81,9 @@ def write_all(
     chain = plan.model.chain
     rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
     write_plan(output, rows, chain.kinds)
-    write_plan_json(report, plan.to_json() | {"command": shlex.join(["elastocal", *sys.argv[1:]])})
+    command = shlex.join(["elastocal", *sys.argv[1:]])
+    backend = plan.model.backend_report()
+    write_plan_json(report, plan.to_json() | {"command": command, "backend": backend})
     for path in programs:
         text = _program(path, plan.execution, chain, plan.configurations, plan.forces)
         atomic_write_text(path, text)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from elastocal.design.order.execution import Execution
 from elastocal.design.reasons import Predicted, Reason
 from elastocal.manipulator.model import Model
+from elastocal.notebook import ForNotebooks
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -54,7 +55,7 @@ class SizePoint:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Plan(ForNotebooks):
     """q (N, n) in SI units, numbered by configuration; `load` (N,) the load state or −1 for all;
     `group` (N,) into `levels`.  `value` is Φ, `reported` what the user knows it by, in `unit`."""
 

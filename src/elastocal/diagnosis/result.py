@@ -7,6 +7,7 @@ from typing import Literal
 
 from elastocal.diagnosis.separate_result import ExtraPlan
 from elastocal.manipulator.effects.base import Stage
+from elastocal.notebook import ForNotebooks
 
 Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
 Interval = tuple[float, float]
@@ -172,7 +173,7 @@ class NoiseFloor:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(ForNotebooks):
     """The whole answer.  `p_value`: of what was found, against the whole family of hypotheses."""
 
     verdict: Verdict

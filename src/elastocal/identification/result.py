@@ -14,6 +14,7 @@ from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.robust.report import OutlierReport
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import COMPONENTS, Observations
+from elastocal.notebook import ForNotebooks
 
 Array = NDArray[np.float64]
 
@@ -84,7 +85,7 @@ class TestErrors:
 
 
 @dataclass(frozen=True)
-class IdentificationResult:
+class IdentificationResult(ForNotebooks):
     """What `identify` found.
 
     `x` (parameters,) are the values the model uses; `covariance` (determined, determined) goes
@@ -227,6 +228,7 @@ class IdentificationResult:
                 None if self.faulty_report is None else self.faulty_report.to_json()
             ),
             "converged": self.converged,
+            "backend": self.model.backend_report(),
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
             "warnings": list(self.warnings),

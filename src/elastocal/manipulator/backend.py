@@ -99,8 +99,7 @@ class BackendReport:
     def __str__(self) -> str:
         cores = f"{self.threads} thread{'s' if self.threads > 1 else ''}"
         if self.backend == "compiled":
-            origin = "from the cache" if self.cached else "compiled now"
-            return f"compiled ({self.compiler}; {origin}; {cores})"
+            return f"compiled ({self.compiler}; {cores})"
         why = f"; {self.reason}" if self.reason else ""
         return f"{self.backend} ({cores}{why})"
 

@@ -21,13 +21,14 @@ from elastocal.manipulator.backend_plan import Plan
 class Replay:
     """A tape's instructions, and `evaluate`, which replays them on whole blocks of rows.
 
-    Raises NotImplementedError for a CasADi operation that numpy has no counterpart for.
+    `n_registers` is the most that any plan needs.  Raises NotImplementedError for a CasADi
+    operation that numpy has no counterpart for.
     """
 
     def __init__(self, function: TapeFunction) -> None:
         self._table, self._constants, self.n_registers = instructions(function)
         widths = [*function.sizes, *[rows * columns for rows, columns in function.shapes]]
-        self._ends = [int(end) for end in self.n_registers + np.cumsum([0, *widths])]
+        self._ends = [int(end) for end in np.cumsum([0, *widths])]
         self._plans: dict[tuple[bool, ...], Plan] = {}
 
     def _plan(self, by_row: tuple[bool, ...]) -> Plan:
@@ -44,17 +45,18 @@ class Replay:
         plan = self._plan(tuple(a.ndim == 2 for a in inputs))
         common = self._in_common(plan, inputs)
         size = max((block.stop - block.start for block in blocks), default=0)
-        buffer = np.empty((self.n_registers, size), dtype=results[0].dtype)
+        buffer = np.empty((plan.n_registers, size), dtype=results[0].dtype)
         flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
         stage = [np.zeros((f.shape[1], size), dtype=f.dtype) for f in flat]
         for block in blocks:
             m = block.stop - block.start
-            slots = list(buffer[:, :m])
+            slots: list[Any] = []
             for a in inputs:
                 slots += list(a[block].T.copy()) if a.ndim == 2 else _cells(a)
             for s in stage:
                 slots += list(s[:, :m])
             slots += common
+            slots += list(buffer[:, :m])
             for operation, first, second, out in plan.steps:
                 if second >= 0:
                     operation(slots[first], slots[second], slots[out])
@@ -63,20 +65,27 @@ class Replay:
             for f, s in zip(flat, stage, strict=True):
                 f[block] = s[:, :m].T
 
-    def _in_common(self, plan: Plan, inputs: Sequence[NDArray]) -> list[NDArray]:
-        """The values that are the same in all rows."""
+    def _in_common(self, plan: Plan, inputs: Sequence[NDArray]) -> list[Any]:
+        """The values that are the same in all rows; None where only `plan.once` reads them."""
         slots: list[Any] = [None] * (plan.first_common + plan.n_common)
         for start, a in zip(self._ends, inputs, strict=False):
             if a.ndim == 1:
-                slots[start : start + len(a)] = _cells(a)
+                slots[start : start + len(a)] = a.tolist()
+        constants = self._constants.tolist()
         for place, k in plan.constants:
-            slots[place] = self._constants[k, ...]
+            slots[place] = constants[k]
         for operation, first, second, out in plan.once:
-            operands = (slots[first],) if second < 0 else (slots[first], slots[second])
-            slots[out] = np.asarray(operation(*operands))
-        return slots[plan.first_common :]
+            if second >= 0:
+                slots[out] = operation(slots[first], slots[second])
+            else:
+                slots[out] = operation(slots[first])
+        common: list[Any] = [None] * plan.n_common
+        for slot in plan.shared:
+            # numpy takes arrays without axes faster than scalars.
+            common[slot - plan.first_common] = np.asarray(slots[slot])
+        return common
 
 
 def _cells(a: NDArray) -> list[NDArray]:
-    """The numbers of `a` (n,) as arrays without axes: numpy takes these faster than scalars."""
+    """The numbers of `a` (n,) as arrays without axes."""
     return [a[k, ...] for k in range(len(a))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -61,4 +62,10 @@ BINARY: dict[int, Any] = {
     ca.OP_EQ: _as_number(np.equal), ca.OP_NE: _as_number(np.not_equal),
     ca.OP_AND: _as_number(np.logical_and), ca.OP_OR: _as_number(np.logical_or),
     ca.OP_IF_ELSE_ZERO: _if_else_zero, ca.OP_COPYSIGN: np.copysign,
+}  # fmt: skip
+# The same on single numbers, where Python's operators take a tenth of the time of a numpy function.
+# Not division: Python refuses to divide by zero.
+ON_NUMBERS: dict[Any, Any] = {
+    np.negative: operator.neg, np.add: operator.add, np.subtract: operator.sub,
+    np.multiply: operator.mul,
 }  # fmt: skip

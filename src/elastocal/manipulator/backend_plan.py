@@ -8,19 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.manipulator.backend_instructions import BINARY_OP, CONSTANT, READ, WRITE
-from elastocal.manipulator.backend_operations import BINARY, UNARY
+from elastocal.manipulator.backend_instructions import BINARY_OP, CONSTANT, READ, UNARY_OP
+from elastocal.manipulator.backend_operations import BINARY, ON_NUMBERS, UNARY
 
-# A numpy function, the slots of its first and second operand (−1: none) and of its result.
+# A function, the slots of its first and second operand (−1: none) and of its result.
 Step = tuple[Any, int, int, int]
 
 
 class Plan:
     """What a tape does where the inputs `by_row` vary by row and the others do not.
 
-    Slots hold, in this order: registers, components of the inputs, components of the outputs,
-    and every value that is the same in all rows.  `once` makes the latter; `steps` is what
-    remains for a block of rows, `constants` the slots of constants with their numbers.
+    Slots hold, in this order: components of the inputs, components of the outputs, every value
+    that is the same in all rows, and `n_registers` registers.  `constants` are the slots of
+    constants with their numbers, `once` makes the other values in common, and `shared` lists
+    those of both that rows need.  `steps` is what remains for a block of rows; a value that is an
+    output is computed where it is put out.
     """
 
     def __init__(
@@ -28,27 +30,77 @@ class Plan:
     ) -> None:
         """`ends`: first slot of every input, of every output, and of the values in common."""
         self.once: list[Step] = []
-        self.steps: list[Step] = []
         self.constants: list[tuple[int, int]] = []
         self.first_common = free = ends[-1]
-        slot = list(range(ends[0]))  # where each register's value stands
-        varies = [False] * ends[0]
+        steps: list[Step] = []  # the k-th result of all rows is value `unplaced` + k
+        unplaced = free + len(table)
+        varies = [False] * unplaced  # of inputs and of values in common; results all do
+        for k, rows in enumerate(by_row):
+            varies[ends[k] : ends[k + 1]] = [rows] * (ends[k + 1] - ends[k])
+        value = [0] * (1 + max(table[:, 2], default=0))  # what a register of the table holds now
+        home: dict[int, int] = {}  # the output's slot where a result is put out
+        copies: list[Step] = []
         for kind, code, out, a, b in table.tolist():
-            if kind == READ:
-                slot[out], varies[out] = ends[a] + b, by_row[a]
-            elif kind == WRITE:
-                self.steps.append((np.positive, slot[out], -1, ends[len(by_row) + a] + b))
+            if kind >= UNARY_OP:
+                first, second = value[a], -1
+                per_row = first >= unplaced or varies[first]
+                if kind == BINARY_OP:
+                    second, operation = value[b], BINARY[code]
+                    per_row = per_row or second >= unplaced or varies[second]
+                else:
+                    operation = UNARY[code]
+                if per_row:
+                    value[out] = unplaced + len(steps)
+                    steps.append((operation, first, second, value[out]))
+                else:
+                    operation = ON_NUMBERS.get(operation, operation)
+                    self.once.append((operation, first, second, free))
+                    value[out], free = free, free + 1
+            elif kind == READ:
+                value[out] = ends[a] + b
             elif kind == CONSTANT:
                 self.constants.append((free, code))
-                slot[out], varies[out], free = free, False, free + 1
+                value[out], free = free, free + 1
             else:
-                binary = kind == BINARY_OP
-                operation = BINARY[code] if binary else UNARY[code]
-                first, second = slot[a], slot[b] if binary else -1
-                if varies[a] or (binary and varies[b]):
-                    self.steps.append((operation, first, second, out))
-                    slot[out], varies[out] = out, True
+                source, place = value[out], ends[len(by_row) + a] + b
+                if source >= unplaced and source not in home:
+                    home[source] = place
                 else:
-                    self.once.append((operation, first, second, free))
-                    slot[out], varies[out], free = free, False, free + 1
+                    copies.append((np.positive, home.get(source, source), -1, place))
         self.n_common = free - self.first_common
+        placed, self.n_registers = _placed(steps, home, unplaced, free)
+        self.steps = placed + copies
+        read = {slot for _, first, second, _ in self.steps for slot in (first, second)}
+        self.shared = sorted(slot for slot in read if self.first_common <= slot < free)
+
+
+def _placed(
+    steps: Sequence[Step], home: dict[int, int], unplaced: int, first: int
+) -> tuple[list[Step], int]:
+    """The steps with their results in output slots and registers `first`…, and how many of these.
+
+    A register is free after the last step that reads it, and what became free last is taken
+    first: it is in cache.
+    """
+    last = {slot: k for k, step in enumerate(steps) for slot in step[1:3]}
+    slot_of = dict(home)
+    placed: list[Step] = []
+    unused: list[int] = []
+    count = 0
+    for k, (operation, a, b, out) in enumerate(steps):
+        x, y = a, b
+        if a >= unplaced:
+            x = slot_of[a]
+            if x >= first and last[a] == k:
+                unused.append(x)
+        if b >= unplaced:
+            y = slot_of[b]
+            if y >= first and last[b] == k and b != a:
+                unused.append(y)
+        if out not in slot_of:
+            if not unused:
+                unused.append(first + count)
+                count += 1
+            slot_of[out] = unused.pop()
+        placed.append((operation, x, y, slot_of[out]))
+    return placed, count

@@ -62,9 +62,12 @@ def observe(table: Measurements, kind: str) -> Observations:
     partner.
     """
     n = len(table)
-    lead, combine = np.arange(n), sparse.csr_array(sparse.eye_array(n))
     if kind == "deflection":
         lead, combine = pair_loaded_with_unloaded(table)
+    else:
+        lead = np.arange(n)
+        places = np.arange(n + 1, dtype=np.int32)  # the identity; scipy's own takes 0.1 ms more
+        combine = sparse.csr_array((np.ones(n), places[:n], places), shape=(n, n))
     if kind == "distance":
         value = _needed(table.distance, table, "distance_mm (or distance_m)", kind)[:, None]
     else:

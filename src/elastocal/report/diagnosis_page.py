@@ -86,6 +86,7 @@ def diagnosis_page(
         command=None if command is None else printable(command),
         inputs={printable(k): printable(v) for k, v in digests(inputs).items()},
         seed=seed,
+        backend=printable(model.backend_report()),
     )
 
 

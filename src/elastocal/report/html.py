@@ -81,6 +81,7 @@ def report_page(
         command=None if command is None else printable(command),
         inputs={printable(k): printable(v) for k, v in digests(inputs).items()},
         seed=seed,
+        backend=printable(result.model.backend_report()),
     )
 
 

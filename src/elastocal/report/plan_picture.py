@@ -88,7 +88,7 @@ def draw_plan(
     """The figure of `write_plan_picture`."""
     from matplotlib.figure import Figure
 
-    arms, markers = _arms(cell, chain, np.asarray(q, dtype=float))
+    arms, markers = pose_lines(cell, chain, np.asarray(q, dtype=float))
     figure = Figure(figsize=(13.0, 7.6), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1.0))
     space: Any = figure.add_subplot(grid[:, 0], projection="3d")
@@ -107,7 +107,7 @@ def draw_plan(
     return figure
 
 
-def _arms(cell: Cell, chain: Chain, q: Array) -> tuple[Array, Array]:
+def pose_lines(cell: Cell, chain: Chain, q: Array) -> tuple[Array, Array]:
     """Polylines (N, n + 2, 3) base – joints – flange, and markers (N, M, 3), of the data."""
     kinematics = Kinematics(cell, chain)
     poses = kinematics.poses(q, np.zeros(3))

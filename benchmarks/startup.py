@@ -1,0 +1,144 @@
+"""Imports, --help, building a model with the whole catalogue, and peak memory of every verb.
+
+python benchmarks/startup.py [--size tiny|short|full] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from bench_clock import Ran, elastocal, own, process
+from bench_part import Part, Table, run_alone
+
+REPEATS = {"tiny": 1, "short": 5, "full": 9}
+IMPORTS = ("pass", "import elastocal", "import numpy", "import casadi",
+           "from elastocal.manipulator.model import Model",
+           "from elastocal.identification.identify import identify")  # fmt: skip
+# Not in one model: a distance sensor sees no position, a marker's orientation no position; payload
+# and weights act without being named.
+WITHOUT = ("distance_sensor", "marker_orientation", "link_gravity", "payload")
+SETTINGS = """link_gravity = true
+gear_ripple_orders = [8.0]
+[model.nominal]
+joint_compliance = [3e-7, 3e-7, 4e-7, 3e-6, 3e-6, 2e-6]
+gravity_compensator = { joint = "joint2", stiffness_N_per_m = 1.4e5, anchor_m = [0.686, 0.12], \
+arm_m = 0.185, free_length_m = 0.458 }
+settings.tracker = { jump_time_s = 4000.0 }
+settings."marker:M1" = { slip_time_s = 3500.0 }
+""" + "".join(f"settings.joint{k} = {{ jump_time_s = 3000.0 }}\n" for k in range(1, 7))
+
+
+def best(run: Callable[[], Ran], repeats: int) -> Ran:
+    """The run of least wall time."""
+    runs = [run() for _ in range(repeats)]
+    if runs[0].code:
+        sys.exit(f"failed:\n{runs[0].errors}")
+    return min(runs, key=lambda ran: ran.wall)
+
+
+def start(repeats: int, part: Part) -> None:
+    table = Table("Start-up", ["what", "wall, s", "CPU, s", "peak, MB"])
+    for code in IMPORTS:
+        ran = best(lambda c=code: process([sys.executable, "-c", c]), repeats)
+        what = "Python itself" if code == "pass" else f"`{code}`"
+        table.rows.append([what, ran.wall, ran.cpu, ran.peak_mb])
+    for verb in ((), ("identify",), ("design",), ("diagnose",)):
+        ran = best(lambda v=verb: elastocal(*v, "--help"), repeats)
+        table.rows.append([f"`elastocal {' '.join((*verb, '--help'))}`", ran.wall, ran.cpu,
+                           ran.peak_mb])  # fmt: skip
+        if not verb:
+            part.goal("`elastocal --help`, wall, at most 0.3 s", ran.wall, 0.3, "s")
+    part.tables.append(table)
+
+
+def child() -> None:
+    """Seconds of building the arm, imports apart, and of the first and second B of 60 poses."""
+    from bench_arms import GEOMETRY, kr270, poses
+
+    from elastocal.manipulator.effects import CATALOGUE
+
+    clock = time.process_time
+    with tempfile.TemporaryDirectory() as folder:
+        begun = clock()
+        kr270(Path(folder), GEOMETRY)  # reads a URDF, and imports what that takes
+        imported = clock()
+        effects = [name for name in CATALOGUE if name not in WITHOUT]
+        model = kr270(Path(folder), effects, SETTINGS)
+    built = clock()
+    table = poses(model, 60, loaded=True, everything=True)
+    before = clock()
+    model.regressor(table)
+    first = clock()
+    model.regressor(table)
+    print(json.dumps({
+        "parameters": len(model.parameters), "imports": imported - begun,
+        "build": built - imported, "first": first - before, "second": clock() - first,
+    }))  # fmt: skip
+
+
+def building(repeats: int, part: Part) -> None:
+    """With an empty cache, and with what that run has left in it."""
+    steps = ("a first small model (imports)", "build", "first B", "second B")
+    columns = ["", *[f"{step}, CPU s" for step in steps], "peak, MB"]
+    title = "A model of a 6-axis arm with the whole catalogue of effects, B of 60 loaded poses"
+    table = Table(title, columns)
+    with tempfile.TemporaryDirectory() as cache:
+        runs: dict[str, list[dict]] = {"first": [], "cached": []}
+        for _ in range(repeats):
+            shutil.rmtree(cache)
+            os.mkdir(cache, 0o700)
+            for found in runs.values():
+                found.append(own(__file__, ELASTOCAL_CACHE=cache, OMP_NUM_THREADS="1"))
+        for what, found in runs.items():
+            least = min(found, key=lambda run: run["build"] + run["first"])
+            times = [least[key] for key in ("imports", "build", "first", "second")]
+            name = f"{what}, {least['parameters']} parameters"
+            table.rows.append([name, *times, least["peak_mb"]])
+            part.goal(f"model and first B, {what}, CPU, at most 1 s",
+                      least["build"] + least["first"], 1.0, "s")  # fmt: skip
+    part.tables.append(table)
+
+
+def verbs(folder: Path, part: Part, tiny: bool) -> None:
+    """Every verb on the demo, each in a process of its own."""
+    table = Table("The verbs on the demo", ["verb", "wall, s", "CPU, s", "peak, MB"])
+
+    def run(what: str, *arguments: object) -> None:
+        ran = elastocal(*arguments)
+        if ran.code:
+            sys.exit(f"elastocal {arguments} failed:\n{ran.errors}")
+        table.rows.append([what, ran.wall, ran.cpu, ran.peak_mb])
+
+    demo = folder / "demo"
+    run("demo", "demo", "-o", demo)
+    cell, data = demo / "cell.toml", demo / "data.csv"
+    run("identify", "identify", cell, data, "-o", folder / "result.json", "--quiet")
+    run("identify with report", "identify", cell, data, "--report", folder / "r.html", "--quiet")
+    run("simulate", "simulate", cell, demo / "plan.csv", "-o", folder / "sim.csv",
+        "--load", 0, 0, -2600, "--repeats", 6)  # fmt: skip
+    if not tiny:
+        run("diagnose", "diagnose", cell, data, "-o", folder / "diagnosis.json", "--quiet")
+        run("design, quick, 1000 candidates", "design", cell, "-o", folder / "plan.csv",
+            "--effort", "quick", "--candidates", 1000, "--fix", "joint1.compliance",
+            "--quiet")  # fmt: skip
+    part.tables.append(table)
+
+
+def measure(size: str) -> Part:
+    part = Part("startup", "Start-up, model building, memory of the verbs")
+    start(REPEATS[size], part)
+    building(REPEATS[size], part)
+    with tempfile.TemporaryDirectory() as folder:
+        verbs(Path(folder), part, size == "tiny")
+    return part
+
+
+if __name__ == "__main__":
+    child() if "--child" in sys.argv else run_alone(measure)

@@ -1,0 +1,1 @@
+"""Exports of trackers and robot controllers → the measurement table."""

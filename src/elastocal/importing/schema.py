@@ -1,0 +1,122 @@
+"""The keys of a mapping file: what the columns of somebody's export mean."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from elastocal.cell_table import NonNegative, Positive, Table, Text, Vector3, key
+
+Place = Annotated[int, Field(ge=1)] | Text
+Where = Place | Annotated[list[Place], Field(min_length=1)]
+Texts = Annotated[list[Text], Field(min_length=1)]
+COLUMNS = (
+    'places in the file by column of the measurement table, as in x_mm = "X [mm]", q1_deg = 5, '
+    'q#_deg = "A#" or name = "Point"'
+)
+
+
+class TextTable(Table):
+    """How the text is written; what is left out is found out or taken from the preset."""
+
+    format: Literal["table", "krl", "rapid"] | None = key('"table", "krl" or "rapid"')
+    encoding: Literal["auto", "utf-8", "utf-16", "cp1252", "latin-1"] | None = key(
+        '"auto", "utf-8", "utf-16", "cp1252" or "latin-1"'
+    )
+    delimiter: Literal["auto", ",", ";", "tab", "space"] | None = key(
+        '"auto", ",", ";", "tab" or "space"'
+    )
+    decimal: Literal["auto", ".", ","] | None = key('"auto", "." or ","')
+    thousands: Literal["none", ",", ".", " ", "'"] | None = key('"none", ",", ".", " " or "\'"')
+    comments: list[Text] | None = key('a list of what begins a comment line, as in ["//", "#"]')
+    ignore: Text | None = key("a regular expression for lines to pass over")
+    unit_comment: Text | None = key("a regular expression with a group (?P<unit>…)")
+    missing: list[str] | None = key('a list of cells that mean no value, as in ["-", "n/a"]')
+
+
+class NamesTable(Table):
+    """What a point's or pose's name says."""
+
+    pattern: Text | Texts | None = key(
+        "a regular expression with groups (?P<configuration>…), (?P<marker>…), (?P<repeat>…), "
+        "(?P<load>…), or a list of them to be tried in order"
+    )
+    unmatched: Literal["refuse", "ignore"] | None = key('"refuse" or "ignore"')
+    markers: dict[str, Text] | None = key('names by what the file says, as in { "1" = "M1" }')
+    in_order: Texts | None = key('the markers in the order they are measured, as in ["M1", "M2"]')
+
+
+class SourceTable(Table):
+    """One kind of file."""
+
+    preset: Text | None = key("the name of a preset (elastocal import --help lists them)")
+    files: Texts | None = key('patterns of file names, as in ["loaded_*.txt"]')
+    role: Literal["points", "joints", "both"] | None = key('"points", "joints" or "both"')
+    load: Text | None = key("the name of a load of [loads], for all of these files")
+    time_format: Text | Texts | None = key('how time_text is written, as in "%d.%m.%Y %H:%M:%S"')
+    coverage_factor: Positive | None = key("a positive number k: the sigma columns hold k sigma")
+    text: TextTable | None = key("a table")
+    columns: dict[str, Where] | None = key(COLUMNS)
+    optional: dict[str, Where] | None = key(COLUMNS + "; these may be absent")
+    names: NamesTable | None = key("a table")
+
+
+class CouplingTable(Table):
+    joint: Annotated[int, Field(ge=1)] = Field(description="the number of the joint that follows")
+    of: Annotated[int, Field(ge=1)] = Field(description="the number of the joint it follows")
+    factor: float = Field(description="a number: the joint gets factor times the other's value")
+
+
+class JointsTable(Table):
+    """From the controller's joint values to those of the robot model."""
+
+    names: Texts | None = key("the joint names of the file in the order of the robot's joints")
+    order: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] | None = key(
+        "the number of the file's joint for each joint of the robot, as in [1, 2, 4, 3, 5, 6]"
+    )
+    sign: list[float] | None = key("1 or -1 per joint")
+    offset_deg: list[float] | None = key("degrees per joint, added after the sign")
+    offset_mm: list[float] | None = key("mm per joint, added after the sign, for prismatic joints")
+    coupling: list[CouplingTable] | None = key("tables { joint = 3, of = 2, factor = 1.0 }")
+
+
+class LoadTable(Table):
+    mass_kg: NonNegative = Field(description="a number >= 0 in kg; hangs straight down")
+
+
+class JoinTable(Table):
+    """How a point finds its joint values."""
+
+    by: Literal["order", "name", "time", "standstill"] | None = key(
+        '"order", "name", "time" or "standstill"'
+    )
+    points_per_pose: Annotated[int, Field(ge=1)] | None = key(
+        "a whole number >= 1: points measured in each pose, for order"
+    )
+    tolerance_s: NonNegative | None = key("a number >= 0 in s: how far apart clocks may read")
+    offset_s: float | None = key("a number in s, added to the times of the joint log")
+    still_deg: Positive | None = key("a positive number of degrees: motion that counts as none")
+    still_mm: Positive | None = key("a positive number of mm, for prismatic joints")
+    still_s: NonNegative | None = key("a number >= 0 in s: the shortest standstill that counts")
+    unmatched: Literal["refuse", "leave_out"] | None = key('"refuse" or "leave_out"')
+    same_pose_deg: Positive | None = key("a positive number: joints this near are the same pose")
+    same_pose_mm: Positive | None = key("a positive number of mm, for prismatic joints")
+
+
+class UnitsTable(Table):
+    """Units of presets' columns where the file does not say them."""
+
+    length: Literal["mm", "m", "um", "cm", "in"] | None = key('"mm", "m", "um", "cm" or "in"')
+    angle: Literal["deg", "rad", "mrad", "gon"] | None = key('"deg", "rad", "mrad" or "gon"')
+
+
+class MappingTable(Table):
+    source: Annotated[list[SourceTable], Field(min_length=1)] | None = key("[[source]] tables")
+    units: UnitsTable | None = key("a table")
+    joints: JointsTable | None = key("a table")
+    loads: dict[Text, Vector3 | LoadTable] | None = key(
+        "forces in N in the tracker's frame by name, as in full = [0, 0, -2600], or "
+        "{ mass_kg = 265 }"
+    )
+    join: JoinTable | None = key("a table")

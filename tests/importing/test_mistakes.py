@@ -1,0 +1,249 @@
+"""Wrong mappings and data are told by file, key, line and remedy; likely mistakes of units too."""
+
+import numpy as np
+import pytest
+from support.tracker_exports import (
+    MARKERS,
+    delimited,
+    imported,
+    kr270_readings,
+    krl,
+    spatialanalyzer,
+)
+
+from elastocal.errors import InputError
+
+DATA = "name,x,y,z,a\n" + "".join(f"{i}_M1,{100 * i},{i},{i},{7 * i}\n" for i in range(1, 7))
+GOOD = """
+[[source]]
+[source.columns]
+name = "name"
+x_mm = "x"
+y_mm = "y"
+z_mm = "z"
+q1_deg = "a"
+"""
+
+
+def refused(tmp_path, match, mapping=GOOD, **files):
+    with pytest.raises(InputError, match=match):
+        imported(tmp_path, files or {"data.csv": DATA}, mapping)
+
+
+def test_the_mapping_itself_is_right(tmp_path):
+    assert len(imported(tmp_path, {"data.csv": DATA}, GOOD).table) == 6
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("[[source]]", "[[sorce]]", r"mapping.toml: unknown key .*sorce.*'source'"),
+        ("[[source]]", '[[source]]\nrole = "tracker"', r"role.*\"points\", \"joints\".*'tracker'"),
+        ("[source.columns]", "[source.colums]", r"unknown key colums.*'columns'"),
+        ('x_mm = "x"', 'x = "x"', r"'x': has no unit; write x_mm, x_m"),
+        ('x_mm = "x"', 'x_mn = "x"', r"'x_mn'"),
+        ('x_mm = "x"', 'x_mm = "xx"',
+         r"data.csv: no line.*line 1 has 'name', 'x'.*not x_mm = 'xx'"),
+        ('x_mm = "x"', 'x_mm = true', r"x_mm.*takes places in the file.*found true"),
+        ('name = "name"', "name = []", r"name.*takes places in the file"),
+        ('x_mm = "x"', 'x_mm = ["x", "y"]', "x_mm takes one column"),
+        ('x_mm = "x"', 'x_mm = "x"\nx_m = "y"', "x_mm and x_m fill the same column"),
+        ('z_mm = "z"\n', "", r"x_mm, y_mm without z"),
+        ('q1_deg = "a"', 'q2_deg = "a"', "fills q2, but not q1"),
+        ('q1_deg = "a"', "", "no joint values; map q1_deg"),
+        ('q1_deg = "a"', '"q#_deg" = 5', r"q#_deg takes a name with #.*q1_deg = 5"),
+        ("[[source]]", '[[source]]\nfiles = ["x*"]', r"no file fits files = 'x\*'.*data.csv"),
+        ("[[source]]", '[[source]]\npreset = "fargo"', r"no preset 'fargo'.*'faro'"),
+        ("[[source]]", "[[source]]\nnames = { pattern = '(' }", "no regular expression"),
+        ("[[source]]", "[[source]]\nnames = { pattern = '(.)' }", "none of the groups"),
+        (
+            "[[source]]",
+            r"[[source]]" "\nnames = { pattern = '^(?P<configuration>[1-3])_' }",
+            r"data.csv, line 5: the name '4_M1' matches no pattern.*2 others",
+        ),
+        ("[[source]]", '[loads]\nfull = [0, 0, -1]\n[[source]]', "no file says which load"),
+        ("[[source]]", '[[source]]\nload = "full"', r"line 2: load 'full' is not in \[loads\]"),
+        ("[[source]]", "[joints]\nsign = [1, 1]\n[[source]]", "sign has 2 numbers.*1 joints"),
+        ("[[source]]", "[joints]\nsign = [2]\n[[source]]", "1 or -1"),
+        ("[[source]]", "[joints]\norder = []\n[[source]]", r"joints.order takes"),
+        ("[[source]]", "[joints]\norder = [2]\n[[source]]", r"order = \[2\]"),
+        (
+            "[[source]]",
+            "[joints]\ncoupling = [{ joint = 3, of = 1, factor = 1.0 }]\n[[source]]",
+            "joint = 3 of .joints. coupling no. 1: the file has 1",
+        ),
+        ("[[source]]", "[joints]\ncoupling = [{ joint = 3 }]\n[[source]]", "key of|key factor"),
+        ("[[source]]", '[[source]]\ntext = { decimal = "," }', r"line 2|decimal"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_the_mapping(tmp_path, old, new, match):
+    data = DATA.replace("100,", "100.5,") if "decimal" in new else DATA
+    assert old in GOOD
+    refused(tmp_path, match, GOOD.replace(old, new), **{"data.csv": data})
+
+
+def test_a_header_that_contradicts_the_mapping(tmp_path):
+    data = DATA.replace("name,x,", "name,x [m],")
+    refused(
+        tmp_path, r"'x \[m\]' says m, but the mapping has x_mm; write x_m", **{"data.csv": data}
+    )
+
+
+@pytest.mark.parametrize(
+    ("cell", "match"),
+    [
+        ("abc", r"data.csv, line 3, column x: 'abc' is not a number"),
+        ("1e999", r"line 3, column x: '1e999' is too large"),
+        ("1_0", r"line 3, column x: '1_0' is not a number"),
+        ("inf", r"line 3, column x: 'inf'"),
+    ],
+)
+def test_cells_that_are_no_numbers(tmp_path, cell, match):
+    refused(tmp_path, match, **{"data.csv": DATA.replace("200,", f"{cell},")})
+
+
+def test_too_few_columns_in_a_line(tmp_path):
+    refused(tmp_path, r"data.csv, line 4: 2 columns, but q1_deg is column 5",
+            **{"data.csv": DATA.replace("3_M1,300,3,3,21", "3_M1,300")})  # fmt: skip
+
+
+def test_an_ambiguous_column_is_to_be_numbered(tmp_path):
+    data = DATA.replace("name,x,y,z,a", "name,x,x,z,a").replace("y", "y")
+    refused(tmp_path, r"x_mm = 'x' could be column 2 \(x\) or 3 \(x\)",
+            GOOD.replace('y_mm = "y"', "y_mm = 3"), **{"data.csv": data})  # fmt: skip
+
+
+def test_files_of_one_kind_need_the_same_columns(tmp_path):
+    mapping = GOOD + '[source.optional]\ntemperature_C = "T"\n'
+    other = DATA.replace("a\n", "a,T\n", 1).replace("7\n", "7,20\n")
+    other = "\n".join([other.split("\n")[0], "1_M1,1,2,3,4,20"])
+    refused(tmp_path, r"one.csv: has no temperature, but .*two.csv has", mapping,
+            **{"one.csv": DATA, "two.csv": other})  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def readings(tmp_path_factory):
+    return kr270_readings(tmp_path_factory.mktemp("cell"))
+
+
+def with_cell(tmp_path, readings, mapping="", points=None, log=None):
+    cell, degrees, measured = readings
+    files = {
+        "p.txt": spatialanalyzer(measured if points is None else points),
+        "j.dat": krl(degrees) if log is None else log,
+    }
+    return imported(tmp_path, files, mapping, ("spatialanalyzer", "kuka"), cell)
+
+
+def test_a_fit_within_millimetres_is_no_warning(tmp_path, readings):
+    moved = readings[2] + np.random.default_rng(0).normal(0, 3.0, readings[2].shape)
+    assert with_cell(tmp_path, readings, points=moved).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("sign = [1, 1, -1, 1, 1, 1]", "sign of joint 3"),
+        ("offset_deg = [0, 90, 0, 0, 0, 0]", "offset_deg -90 at joint 2"),
+        ("coupling = [{ joint = 3, of = 2, factor = 1.0 }]", "factor = -1 }"),
+    ],
+)
+def test_what_would_make_the_readings_fit_is_named(tmp_path, readings, change, words):
+    from dataclasses import replace
+
+    from elastocal.cell_reader import read_cell
+
+    cell = replace(read_cell(readings[0].path), limits={})
+    found = with_cell(tmp_path, (cell, *readings[1:]), f"[joints]\n{change}\n")
+    (warning,) = [w for w in found.warnings if "nominal arm" in w]
+    assert words in warning
+
+
+def test_poses_shifted_by_one_are_recognised(tmp_path, readings):
+    log = krl(np.roll(readings[1], 1, axis=0))
+    (warning,) = with_cell(tmp_path, readings, log=log).warnings
+    assert "one pose later" in warning
+
+
+def test_joints_beyond_the_limits_are_refused_with_their_line(tmp_path, readings):
+    found = with_cell(tmp_path, readings, "[joints]\noffset_deg = [0, 300, 0, 0, 0, 0]\n")
+    assert found.refused.startswith(str(tmp_path / "p.txt") + ", line 3: joint2")
+
+
+def test_markers_and_joints_must_be_the_cells(tmp_path, readings):
+    cell, degrees, points = readings
+    text = spatialanalyzer(points).replace("M2", "M5")
+    with pytest.raises(InputError, match=r"line 3.*'M5' is no marker of the cell.*from .*p.txt"):
+        imported(tmp_path, {"p.txt": text, "j.dat": krl(degrees)}, "",
+                 ("spatialanalyzer", "kuka"), cell)  # fmt: skip
+    with pytest.raises(InputError, match="5 joint columns"):
+        imported(tmp_path, {"p.txt": spatialanalyzer(points), "j.dat": krl(degrees[:, :5])}, "",
+                 ("spatialanalyzer", "kuka"), cell)  # fmt: skip
+
+
+UNITS = """
+[[source]]
+preset = "faro"
+files = ["p*"]
+columns = { x_LEN = "X", y_LEN = "Y", z_LEN = "Z" }
+[[source]]
+preset = "kuka"
+columns = { "q#_ANG" = "A#" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("length", "angle", "scale", "turn", "words"),
+    [
+        ("m", "deg", 1.0, 1.0, "mm read as m"),
+        ("mm", "deg", 1e-3, 1.0, "m read as mm"),
+        ("mm", "rad", 1.0, 1.0, "degrees read as radians"),
+        ("mm", "deg", 1.0, np.pi / 180, "radians read as degrees"),
+    ],
+)
+def test_units_mistaken_for_others(tmp_path, readings, length, angle, scale, turn, words):
+    _, degrees, points = readings
+    files = {
+        "p.csv": delimited(points * scale, "Feature,X,Y,Z"),
+        "j.dat": krl(degrees * turn),
+    }
+    found = imported(tmp_path, files, UNITS.replace("LEN", length).replace("ANG", angle))
+    assert any(words in w for w in found.warnings), found.warnings
+
+
+def test_deflections_need_both_states(tmp_path, readings):
+    from dataclasses import replace
+
+    cell, degrees, points = readings
+    cell = replace(cell, model=replace(cell.model, observe="deflection"))
+    name = 'load = "full"\nfiles = ["b*"]\n'
+    mapping = (
+        '[[source]]\npreset = "spatialanalyzer"\nfiles = ["a*"]\nload = "none"\n'
+        f'[[source]]\npreset = "spatialanalyzer"\n{name}'
+        '[[source]]\npreset = "kuka"\n[loads]\nfull = [0, 0, -2600]\n'
+    )
+    files = {
+        "a.txt": spatialanalyzer(points),
+        "b.txt": spatialanalyzer(points[:-2]),
+        "j.dat": krl(degrees),
+    }
+    found = imported(tmp_path, files, mapping, cell=cell)
+    assert len(found.table) == len(MARKERS) * (2 * len(degrees) - 2)
+    (warning,) = found.warnings
+    assert "2 of 10 configurations" in warning and "P09, P10" in warning
+
+
+def test_numbers_of_any_size_are_told_as_implausible(tmp_path, readings):
+    points = readings[2].copy()
+    points[3] = 1e250
+    found = with_cell(tmp_path, readings, points=points)
+    assert found.fit is None
+    assert any("from the tracker" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("text", ["²", "1.5", "x", "9" * 40])
+def test_repeats_are_whole_numbers(tmp_path, text):
+    mapping = GOOD.replace('name = "name"', 'name = "name"\nrepeat = "r"')
+    data = DATA.replace("name,x,y,z,a", "name,x,y,z,a,r").replace("\n", f",{text}\n")
+    refused(tmp_path, r"line 2: repeat '.*' is no whole number", mapping,
+            **{"data.csv": data.replace(f"r,{text}", "r", 1)})  # fmt: skip

@@ -1,0 +1,47 @@
+"""Standstills are the longest runs from the start on, whatever the sampling."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from elastocal.importing.standstill import groups_alike, standstills
+
+STEPS = st.lists(st.tuples(st.sampled_from([0.1, 0.5, 2.0]), st.integers(-2, 2),
+                           st.integers(-1, 1)), min_size=1, max_size=40)  # fmt: skip
+
+
+def plainly(time, q, still, shortest):
+    """Row by row, as the definition says."""
+    found, start = [], 0
+    while start < len(q):
+        end = start
+        while end + 1 < len(q) and (np.ptp(q[start : end + 2], axis=0) <= still).all():
+            end += 1
+        if end > start and time[end] >= time[start] + shortest:
+            found.append((start, end))
+            start = end
+        start += 1
+    return found
+
+
+@settings(max_examples=300, deadline=None)
+@given(STEPS, st.sampled_from([0.0, 1.0, 2.5]))
+def test_as_the_definition_says(steps, shortest):
+    time = np.cumsum([dt for dt, _, _ in steps])
+    q = np.cumsum([(a, b) for _, a, b in steps], axis=0).astype(float)
+    still = np.array([1.0, 0.0])
+    found = standstills(time, q, still, shortest)
+    assert [(s.first, s.last) for s in found] == plainly(time, q, still, shortest)
+    for s in found:
+        np.testing.assert_array_equal(s.q, np.median(q[s.first : s.last + 1], axis=0))
+
+
+def test_runs_longer_than_a_chunk():
+    q = np.r_[np.zeros(5000), np.ones(3000)][:, None]
+    found = standstills(np.arange(8000.0), q, np.array([0.5]), 10.0)
+    assert [(s.first, s.last) for s in found] == [(0, 4999), (5000, 7999)]
+
+
+def test_groups_by_their_first_row():
+    q = np.array([[0.0, 0], [0.9, 0], [1.8, 0], [0.0, 5], [0.1, 0.5]])
+    assert groups_alike(q, np.array([1.0, 1.0])).tolist() == [0, 0, 1, 2, 0]

@@ -1,0 +1,181 @@
+"""Results in a notebook: HTML without anybody's markup, figures, data frames."""
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from support.cells import MARKERS, kr270_chain, random_table
+from support.diagnoses import VERDICTS
+
+from elastocal.errors import InputError
+from elastocal.measurement_reader import read_measurements
+from elastocal.measurement_writer import write_measurements
+from elastocal.report.notebook import view_of
+
+VOID = {"br", "hr", "img"}
+
+
+class Balanced(HTMLParser):
+    """Tags that open and close in order, and the words between them."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.tags, self.words = [], set(), []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        assert not [name for name, _ in attrs if name.startswith("on")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def parsed(result):
+    page = Balanced()
+    page.feed(result._repr_html_())
+    assert page.open == []
+    return page
+
+
+@pytest.fixture(scope="module")
+def plan():
+    from dataclasses import replace
+
+    from support.cells import kr270_cell
+
+    from elastocal.cell import CartesianNoise, Tracker
+    from elastocal.cell_design import DesignSpec
+    from elastocal.design.design import design
+    from elastocal.design.options import DesignOptions
+
+    loads = np.array([[0, 0, 0], [0, 0, -2600.0]])
+    spec = DesignSpec(poses=4, loads=loads, candidates=30, levels={"joint2": (-0.5, -1.0)})
+    cell = kr270_cell(["joint_compliance"], observe="deflection")
+    cell = replace(cell, tracker=Tracker(noise=CartesianNoise(np.full(3, 1e-5))), design=spec)
+    return design(cell, DesignOptions(effort="quick"))
+
+
+def test_identification_shows_what_it_determined(case):
+    page = parsed(case.result)
+    text = " ".join(page.words)
+    known = [e.name for e in case.result.estimates if e.identifiable]
+    assert known and all(name in text for name in known)
+    assert "Readings:" in text
+
+
+def test_names_of_the_user_are_no_markup(hostile):
+    page = parsed(hostile.result)
+    assert page.tags <= {"table", "caption", "thead", "tbody", "tr", "th", "td", "p", "b"}
+    assert "alert(1)" in " ".join(page.words)
+    assert "\x1b" not in hostile.result._repr_html_()
+    for interactive in (False, True):
+        hostile.result.plot(interactive=interactive)
+    figure = hostile.result.plot(interactive=True).to_json()
+    assert "<script" not in figure.lower()
+
+
+def test_identification_as_a_frame(case):
+    frame = case.result.to_dataframe()
+    assert list(frame.parameter) == [e.name for e in case.result.estimates]
+    for row, e in zip(frame.itertuples(), case.result.estimates, strict=True):
+        assert row.held == e.held
+        assert row.value == e.value if e.identifiable else np.isnan(row.value)
+    kept = frame[frame.identifiable]
+    assert (kept.ci95_low < kept.value).all() and (kept.value < kept.ci95_high).all()
+
+
+def test_plan_as_html_and_frame(plan):
+    frame = plan.to_dataframe()
+    np.testing.assert_allclose(np.radians(frame.filter(regex="^q").to_numpy()), plan.q)
+    assert sorted(frame.order) != [] and set(frame.level) <= {1, 2}
+    text = " ".join(parsed(plan).words)
+    assert "q1_deg" in text and "Certificate:" in text
+
+
+@pytest.mark.parametrize("name", VERDICTS)
+def test_diagnosis_as_html_and_frame(name):
+    d = VERDICTS[name]
+    text = " ".join(parsed(d).words)
+    assert "Verdict:" in text and "noise alone" in text
+    frame = d.to_dataframe()
+    assert list(frame.effect) == [c.effect for c in d.candidates]
+    assert int(frame.found.sum()) == len(
+        {(f.effect, f.where) for f in d.effects} & {(c.effect, c.where) for c in d.candidates}
+    )
+
+
+def drawn_points(figure):
+    """Every x value of the plotted lines of a matplotlib figure."""
+    return np.concatenate(
+        [np.asarray(line.get_xdata(), float) for axes in figure.axes for line in axes.get_lines()]
+    )
+
+
+def test_figures_are_matplotlibs_and_hold_every_reading(case):
+    from matplotlib.figure import Figure
+
+    figure = case.result.plot()
+    assert isinstance(figure, Figure)
+    points = sum(
+        len(line.get_xdata()) for line in figure.axes[0].get_lines() if line.get_marker() == "."
+    )
+    assert points == len(case.result.observations.lead)
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    figure.canvas.draw()
+
+
+def test_kinds_of_figures(case, plan):
+    for result in (case.result, plan, next(iter(VERDICTS.values()))):
+        for kind in view_of(result).figures:
+            result.plot(kind).canvas.draw()
+            assert result.plot(kind, interactive=True).data
+        with pytest.raises(InputError, match="there are "):
+            result.plot("none of them")
+
+
+def test_both_libraries_draw_the_same(case):
+    still = drawn_points(case.result.plot("parameters"))
+    moving = np.concatenate(
+        [np.asarray(t.x, float) for t in case.result.plot("parameters", interactive=True).data]
+    )
+    assert set(np.round(moving, 9)) <= set(np.round(still, 9))
+
+
+def test_interactive_plan_shows_every_pose(plan):
+    names = [trace.name for trace in plan.plot(interactive=True).data]
+    assert [n for n in names if n and n.startswith("pose")] == [
+        "pose 1",
+        "pose 2",
+        "pose 3",
+        "pose 4",
+    ]
+
+
+def test_measurements_as_a_frame_are_what_is_written(tmp_path):
+    chain = kr270_chain()
+    table = random_table(chain, 3, 1, markers=tuple(MARKERS))
+    frame = table.to_dataframe(chain.kinds)
+    write_measurements(table, tmp_path / "t.csv", chain.kinds)
+    header = (tmp_path / "t.csv").read_text().split("\n")[0].split(",")
+    assert list(frame.columns) == header
+    back = read_measurements(tmp_path / "t.csv", joint_kinds=chain.kinds)
+    np.testing.assert_array_equal(frame.filter(regex=r"^q\d").to_numpy(), back.q)
+    assert re.search("<table", table._repr_html_())
+
+
+def test_importing_a_result_does_not_import_its_views():
+    code = (
+        "import sys, elastocal.identification.result, elastocal.measurements\n"
+        "print([m for m in sys.modules if m.startswith(('elastocal.report', 'matplotlib', "
+        "'plotly', 'pandas'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
