@@ -23,7 +23,7 @@ NOT_AT_HOME := not-at-home
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long bench lint clean not-at-home
+.PHONY: help demo test test-long bench lint docs docs-figures clean not-at-home
 .DELETE_ON_ERROR:
 
 help:
@@ -32,6 +32,8 @@ help:
 	@echo "make test-long  the long studies among the tests"
 	@echo "make bench      the benchmarks, to benchmarks/result.md      (BENCH_ARGS=--full: all sizes)"
 	@echo "make lint       ruff check, ruff format --check, mypy"
+	@echo "make docs       the documentation as pages in site/ (strict: a broken link is an error)"
+	@echo "make docs-figures  its figures anew"
 	@echo "make clean      remove .venv, caches and build products"
 	@echo
 	@echo "PYTHON=python3.12 chooses the interpreter a new .venv is made with (3.11 or newer);"
@@ -61,8 +63,17 @@ lint: $(TEST_TOOLS)
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy src
 
+# Not --quiet: mkdocs then counts no warning, and strict means nothing.  The theme's advertisement
+# of its successor is not a result of the build.
+docs: export NO_MKDOCS_2_WARNING = 1
+docs: $(TEST_TOOLS)
+	$(BIN)/python -m mkdocs build --strict
+
+docs-figures: $(RUN_TIME)
+	$(BIN)/python docs/figures/all.py
+
 clean:
-	rm -rf $(VENV) build dist demo_out src/elastocal.egg-info
+	rm -rf $(VENV) build dist demo_out site src/elastocal.egg-info
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find src tests experiment_design -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -86,5 +97,5 @@ $(RUN_TIME): $(HOME_FILE) pyproject.toml $(wildcard $(CONSTRAINTS))
 
 $(TEST_TOOLS): $(RUN_TIME)
 	@echo "Installing the test tools"
-	@$(PIP_INSTALL) -e ".[test,dev]"
+	@$(PIP_INSTALL) -e ".[test,dev,docs]"
 	@touch $@

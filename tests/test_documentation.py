@@ -1,15 +1,23 @@
 """What the documentation shows is what the tool accepts."""
 
 import re
+import shlex
 from pathlib import Path
 
+import pytest
+import typer
 from support.robots import KR270
 
 from elastocal.cell_reader import read_cell
+from elastocal.cli import app
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+# Made from the code when the site is built; tests/documentation/test_generated_pages.py has them.
+GENERATED = {DOCS / "reference" / f"{name}.md" for name in ("effects", "commands", "cell-keys")}
 
 
 def toml_blocks(page: str) -> list[str]:
@@ -20,8 +28,11 @@ def toml_blocks(page: str) -> list[str]:
 def test_every_cell_shown_is_a_cell(tmp_path):
     blocks = toml_blocks("README.md") + toml_blocks("docs/file-formats.md")
     assert len(blocks) == 2
+    (design,) = re.findall(
+        r"```toml design\n(.*?)```", (DOCS / "designing.md").read_text(encoding="utf-8"), re.S
+    )
     (tmp_path / "arm.urdf").write_text(KR270.read_text(encoding="utf-8"), encoding="utf-8")
-    for block in blocks:
+    for block in [*blocks, blocks[0] + design]:
         path = tmp_path / "cell.toml"
         path.write_text(block, encoding="utf-8")
         model = Model.from_cell(read_cell(path, known_effects=tuple(CATALOGUE)))
@@ -29,6 +40,57 @@ def test_every_cell_shown_is_a_cell(tmp_path):
 
 
 def test_links_between_pages_lead_somewhere():
-    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
-        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#:]+)", page.read_text(encoding="utf-8")):
+            where = (page.parent / target).resolve()
+            assert where.exists() or where in GENERATED, f"{page.name} links to {target}"
+
+
+COMMANDS = typer.main.get_command(app).commands
+
+
+def commands_shown(page: Path) -> list[list[str]]:
+    """Every `elastocal VERB …` of a page's blocks, split as a shell splits it."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    lines = re.findall(r"^(?:    |\$ )(?:.* )?elastocal ([a-z]+ .*)$", text, re.M)
+    found = [shlex.split(line.partition("#")[0].partition("&")[0]) for line in lines]
+    return [words for words in found if words[0] in COMMANDS]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_shown_has_the_options_it_is_shown_with(page):
+    for verb, *words in commands_shown(page):
+        known = {name for p in COMMANDS[verb].params for name in (*p.opts, *p.secondary_opts)}
+        options = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+        assert options <= known | {"--help"}, f"{page.name}: elastocal {verb}"
+
+
+def test_commands_are_found_on_the_pages():
+    """Guard of the guard."""
+    verbs = {words[0] for page in PAGES for words in commands_shown(page)}
+    assert {"identify", "simulate", "design", "diagnose", "study"} <= verbs
+
+
+def test_every_figure_is_there_for_light_and_for_dark_pages():
+    for page in PAGES:
+        shown = re.findall(
+            r"\(\S*images/(\w+)_(light|dark)\.svg#only-(light|dark)\)", page.read_text()
+        )
+        assert all(scheme == only for _, scheme, only in shown)
+        for name in {name for name, _, _ in shown}:
+            assert {only for other, _, only in shown if other == name} == {"light", "dark"}
+            assert (DOCS / "figures" / f"{name}.py").exists(), f"no script makes {name}"
+
+
+def test_nothing_of_the_site_comes_from_a_network():
+    settings = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert "font: false" in settings
+    assert "://" not in settings
+    style = (DOCS / "assets" / "site.css").read_text(encoding="utf-8")
+    assert "url(" not in style and "@import" not in style
+
+
+def test_the_site_is_built_strictly():
+    """Without --quiet, under which mkdocs counts no warning."""
+    assert "mkdocs build --strict\n" in (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert "make docs\n" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")

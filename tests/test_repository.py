@@ -59,7 +59,7 @@ DATASET_TABLES = {
 }
 DATASET_FOLDERS = {"ur5_wam_tsinghua", "iiwa7_payload_torque", "robotcali_irb120_cable"}
 
-GENERATED = {"__pycache__", "build", "dist", "demo_out", "node_modules"}
+GENERATED = {"__pycache__", "build", "dist", "demo_out", "node_modules", "site"}
 
 
 def repository_files() -> list[Path]:

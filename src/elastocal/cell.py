@@ -18,6 +18,11 @@ Observe = Literal["position", "deflection", "pose", "distance"]
 
 @dataclass(frozen=True)
 class Robot:
+    """A URDF with the names of its first and last link, or a DH table with its convention.
+
+    `masses`: the table of link masses of a DH robot.  Files as absolute or relative paths.
+    """
+
     urdf: Path | None = None
     base: str | None = None
     flange: str | None = None
@@ -90,6 +95,8 @@ class Nominal:
 
 @dataclass(frozen=True)
 class ModelSpec:
+    """What is observed, which effects are fitted, and what drives and settles the springs."""
+
     observe: Observe = "position"
     effects: tuple[EffectChoice, ...] = ()
     torque: Literal["computed", "measured"] = "computed"

@@ -1,0 +1,14 @@
+"""Every figure of the documentation: make docs-figures."""
+
+from __future__ import annotations
+
+import certificate
+import chain
+import coverage
+import diagnosis_distance
+import tutorial_valley
+from style import draw
+
+if __name__ == "__main__":
+    for module in (chain, tutorial_valley, coverage, certificate, diagnosis_distance):
+        draw(module.__name__, module.figure)

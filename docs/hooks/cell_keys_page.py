@@ -1,0 +1,58 @@
+"""Every key of the cell file as a page, from the schema that reads it."""
+
+from __future__ import annotations
+
+import types
+import typing
+from typing import Any
+
+from pydantic import BaseModel
+
+from elastocal.cell_schema import CellTable
+
+HEAD = """# Keys of the cell file
+
+Every key that a cell file may have, and what it takes. This page is made from the schema that reads
+the file when the site is built; an unknown key is refused with the nearest valid one. A whole cell,
+with what the keys mean, stands in [File formats](../file-formats.md).
+"""
+
+
+def page() -> str:
+    """The page, a table of keys for each table of the file."""
+    parts = [HEAD]
+    for title, table in tables():
+        parts += [f"## `{title}`\n", "| key | takes |", "|---|---|"]
+        for name, field in table.model_fields.items():
+            required = " (required)" if field.is_required() else ""
+            description = (field.description or "").replace("|", "\\|")
+            parts.append(f"| `{name}`{required} | {description} |")
+        parts.append("")
+    return "\n".join(parts)
+
+
+def tables() -> list[tuple[str, type[BaseModel]]]:
+    """Each table of the file as it is headed there, with its schema; the file itself first."""
+    return [("cell.toml", CellTable), *_inside(CellTable, "")]
+
+
+def _inside(table: type[BaseModel], above: str) -> list[tuple[str, type[BaseModel]]]:
+    found = []
+    for name, field in table.model_fields.items():
+        for inner, many in _models(field.annotation, False):
+            path = f"{above}{name}"
+            found.append((f"[[{path}]]" if many else f"[{path}]", inner))
+            found += _inside(inner, f"{path}.")
+    return found
+
+
+def _models(annotation: Any, many: bool) -> list[tuple[type[BaseModel], bool]]:
+    """The schemas in an annotation, and whether it is a list of them."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [(annotation, many)]
+    origin = typing.get_origin(annotation)
+    if origin is None:
+        return []
+    if origin in (typing.Union, types.UnionType, typing.Annotated):
+        return [m for part in typing.get_args(annotation) for m in _models(part, many)]
+    return [m for part in typing.get_args(annotation) for m in _models(part, origin is list)]

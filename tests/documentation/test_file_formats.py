@@ -1,0 +1,128 @@
+"""The page of file formats names every key that is read and every key that is written."""
+
+import json
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import cell_keys_page
+import pytest
+from typer.testing import CliRunner
+
+from elastocal.cell_reader import read_cell
+from elastocal.cli import app
+from elastocal.diagnosis.diagnose import diagnose
+from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.diagnosis.published import publish
+from elastocal.diagnosis.result import Curve, Untested
+from elastocal.diagnosis.separate_result import RivalPair
+from elastocal.identification.knowledge_schema import TABLES, KnowledgeTable
+from elastocal.identification.outlier import Outlier
+from elastocal.identification.robust.report import Finding
+from elastocal.manipulator.dh import DH_COLUMNS
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.model import Model
+from elastocal.measurement_columns import families
+from elastocal.measurement_reader import read_measurements
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "file-formats.md").read_text(encoding="utf-8")
+EXAMPLE = ROOT / "experiment_design" / "blind_diagnosis" / "example"
+# Their keys are names of parameters, places, drivers or settings of the arm at hand.
+NAMED_BY_THE_ARM = ("terms", "prior_share", "drivers", "stages", "places", "settings", "removed_by")
+
+
+def section(heading):
+    return PAGE.split(f"\n## {heading}", 1)[1].split("\n## ", 1)[0]
+
+
+def keys(value):
+    """Every key of nested JSON, those apart that the arm names."""
+    if isinstance(value, dict):
+        for key, inside in value.items():
+            yield re.sub(r"^q[2-9]_", "q1_", key)  # "q1_deg …" on the page
+            if key not in NAMED_BY_THE_ARM:
+                yield from keys(inside)
+    elif isinstance(value, list | tuple):
+        for inside in value:
+            yield from keys(inside)
+
+
+def missing(wanted, text):
+    """Keys that do not stand, as a whole word, inside `code` of a text."""
+    code = " ".join(re.findall(r"`([^`]+)`", text))
+    return sorted(k for k in set(wanted) if not re.search(rf"(?<!\w){re.escape(k)}(?!\w)", code))
+
+
+@pytest.mark.parametrize("title, table", cell_keys_page.tables())
+def test_every_key_of_the_cell_file_is_on_the_page(title, table):
+    toml = PAGE.split("\n## Measurement table", 1)[0]
+    absent = [k for k in table.model_fields if not re.search(rf"(?<!\w){k}(?!\w)", toml)]
+    assert not absent, f"{title}: {absent}"
+
+
+@pytest.mark.parametrize("table", [KnowledgeTable, *TABLES.values()])
+def test_every_key_of_the_knowledge_file_is_on_the_page(table):
+    assert not [k for k in table.model_fields if k not in section("Knowledge file")]
+
+
+def test_every_column_of_the_measurement_table_is_on_the_page():
+    text = section("Measurement table")
+    for family in families(("revolute",) * 6).values():
+        for stem in family.units:
+            of_a_joint = re.fullmatch(r"(q|torque_|approach_)[2-6]", stem)  # "…" on the page
+            assert of_a_joint or re.search(rf"(?<!\w){stem}", text), stem
+
+
+def test_every_column_of_the_dh_table_is_on_the_page():
+    text = PAGE.split("### DH table", 1)[1].split("\n## ", 1)[0]
+    for quantity in DH_COLUMNS:
+        assert quantity.name.removesuffix(" travel") + "_" in text, quantity.name
+
+
+def test_every_key_of_an_identification_is_on_the_page(course):
+    text = section("Result of `identify`")
+    rare = [*(f.name for f in fields(Outlier)), *(f.name for f in fields(Finding)), "moves_most"]
+    rare.remove("column")  # published as moves_most
+    for result in course.results:
+        assert not missing([*keys(result), *rare], text)
+
+
+def test_every_key_of_a_plan_is_on_the_page(course):
+    plan = json.loads((course.folder / "extra.json").read_text(encoding="utf-8"))
+    assert not missing(keys(plan), section("Plan of `design`: `plan.json`"))
+
+
+def test_every_key_of_a_diagnosis_is_on_the_page():
+    cell = read_cell(EXAMPLE / "cell.toml", known_effects=tuple(CATALOGUE))
+    model = Model.from_cell(cell)
+    table = read_measurements(
+        EXAMPLE / "data.csv", joint_kinds=model.chain.kinds, marker_names=tuple(cell.tool.markers)
+    )
+    cheap = tuple(name for name in CATALOGUE if name != "backlash")
+    diagnosis = diagnose(model, table, DiagnosisOptions(without=cheap))
+    rare = [f.name for kind in (Curve, Untested, RivalPair) for f in fields(kind)]
+    published = publish(diagnosis, model, "data.csv")
+    assert not missing([*keys(published), *rare], section("Diagnosis of `diagnose`"))
+    assert published["effects"], "the example's backlash is found, so that its keys are compared"
+
+
+@pytest.mark.parametrize(
+    "command, heading",
+    [
+        ("compensate cell.toml result.json targets.csv", "Targets and commands of `compensate`"),
+        ("export cell.toml result.json -o arm.urdf --load 0 0 -98", "Answer of `export`"),
+    ],
+)
+def test_every_key_of_what_is_done_with_a_result_is_on_the_page(
+    course, monkeypatch, command, heading
+):
+    monkeypatch.chdir(course.folder)
+    done = CliRunner().invoke(app, [*command.split(), "--json", "--quiet"])
+    assert done.exit_code == 0, done.output
+    assert not missing(keys(json.loads(done.stdout)), section(heading))
+
+
+def test_a_key_that_the_page_lacks_is_noticed():
+    """Guard of the guard."""
+    assert missing(["schema", "no_such_key"], section("Result of `identify`")) == ["no_such_key"]

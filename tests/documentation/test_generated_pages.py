@@ -1,0 +1,73 @@
+"""Pages that are made from the code have all of it."""
+
+import re
+from pathlib import Path
+
+import cell_keys_page
+import commands_page
+import effects_page
+import pytest
+import typer
+
+from elastocal.cli import app
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.effects.base import Effect
+
+DOCS = Path(__file__).parents[2] / "docs"
+EFFECTS = effects_page.page()
+COMMANDS = commands_page.page()
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_effect_has_text_places_and_columns(name):
+    part = EFFECTS.split(f"### `{name}` ", 1)[1].split("\n### ", 1)[0]
+    first = CATALOGUE[name].__class__.__doc__.strip().splitlines()[0]
+    assert first in part and first != Effect.__doc__.splitlines()[0]
+    assert re.search(r"- \*\*Places\*\*: `", part)
+    assert "- **Columns that it needs**: " in part
+    assert "| parameter | unit |" in part or "No parameters." in part
+
+
+def test_parameters_stand_with_unit_and_size():
+    assert "| `joint1.offset` | rad | 0 | 1 mrad | – |" in EFFECTS
+    assert "| `joint1.compliance` | rad/(N·m) | 2e-06 | 2 µrad/(N·m) | ≥ 0 |" in EFFECTS
+    assert "`time_constant_s` (default 1800, 60 to 1000000)" in EFFECTS
+    distortion = EFFECTS.split("### `tracker_distortion`")[1]
+    assert "- **Not with** `observe` = `distance`" in distortion
+
+
+def test_every_verb_and_option_is_on_the_page():
+    for name, command in typer.main.get_command(app).commands.items():
+        part = COMMANDS.split(f"\n## {name}\n", 1)[1].split("\n## ", 1)[0]
+        for parameter in command.params:
+            shown = parameter.opts[-1] if parameter.param_type_name == "option" else parameter.name
+            assert f"`{shown.upper()}`" in part or f"`{shown}`" in part, f"{name}: {shown}"
+
+
+def test_every_table_of_the_cell_file_is_on_the_page():
+    page = cell_keys_page.page()
+    for head in ("[robot]", "[model.nominal.gravity_compensator]", "[[design.test_pose]]"):
+        assert f"## `{head}`" in page
+    assert "| `urdf` |" in page and "| `workspace` |" in page
+
+
+def test_fences_with_a_word_of_ours_become_plain_ones():
+    import generated_pages as hook
+
+    text = (DOCS / "file-formats.md").read_text(encoding="utf-8")
+    assert "```toml workspace\n" in text
+    after = re.findall(r"^```(.*)$", hook.plain_fences(text), re.M)
+    assert len(after) == text.count("```") and set(after) <= {"", "toml", "text", "console"}
+
+
+def test_links_out_of_the_documentation_become_paths():
+    import generated_pages as hook
+
+    text = (
+        "[the study](../experiment_design/a/README.md#x), [files](file-formats.md#y), ![](../x.png)"
+    )
+    after = hook.links_inside(text, "exporting.md")
+    assert "the study (`experiment_design/a/README.md`)" in after
+    assert "[files](file-formats.md#y)" in after and "![](../x.png)" in after
+    inside = "[formats](../file-formats.md)"
+    assert hook.links_inside(inside, "explanation/chain.md") == inside

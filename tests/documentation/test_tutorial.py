@@ -1,0 +1,65 @@
+"""The tutorial's commands run, print what its page shows, and teach what it says they teach."""
+
+import re
+from pathlib import Path
+
+import console_blocks
+
+TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
+
+PAGE = (TUTORIAL / "index.md").read_text(encoding="utf-8")
+PIECES = console_blocks.shown(PAGE)
+TRUTH = {
+    name: float(value)
+    for name, value in re.findall(r"--set (\S+)=(\S+)", (TUTORIAL / "measure.sh").read_text())
+}
+
+
+def test_the_page_shows_what_the_commands_print(course):
+    told = [
+        f"$ {piece.command}\n{difference}"
+        for piece, output in zip(PIECES, course.printed, strict=True)
+        for difference in console_blocks.differences(piece, output)
+    ]
+    assert not told, "\n".join(told)
+
+
+def parameters(result):
+    return {p["name"]: p for p in result["parameters"]}
+
+
+def test_with_a_stretched_wrist_only_the_sum_of_joints_4_and_6_is_known(course):
+    first = course.results[0]
+    found = parameters(first)
+    assert found["joint4.compliance"]["value"] is None
+    assert found["joint4.compliance"]["combined_with"] == ["joint6.compliance"]
+    (known,) = first["combinations"]
+    true = TRUTH["joint4.compliance"] + TRUTH["joint6.compliance"]
+    assert abs(known["value"] - true) < 4 * known["std"] < 0.1 * true
+
+
+def test_one_more_pose_separates_them(course):
+    found = parameters(course.results[1])
+    assert not course.results[1]["combinations"]
+    for name in ("joint4.compliance", "joint6.compliance"):
+        assert abs(found[name]["value"] - TRUTH[name]) < 4 * found[name]["std"]
+        assert found[name]["std"] < 0.1 * TRUTH[name]
+    assert not found["joint1.compliance"]["identifiable"]
+
+
+def test_a_sideways_pull_shows_what_no_pose_does(course):
+    found = parameters(course.results[-1])
+    assert {name for name, p in found.items() if p["identifiable"]} == set(TRUTH)
+    for name, true in TRUTH.items():
+        assert abs(found[name]["value"] - true) < 4 * found[name]["std"]
+
+
+def test_the_comparison_notices_a_number_that_is_wrong():
+    """Guard of the guard: a changed number, and a line that is no longer printed, are told."""
+    output = " joint2.compliance   2.10    0.05  µrad/(N·m)\nIdentified: 3 of 6 parameters\n"
+    good = console_blocks.Shown("x", (" joint2.compliance 2.11 0.05 µrad/(N·m)", "…"))
+    assert not console_blocks.differences(good, output)
+    wrong = console_blocks.Shown("x", (" joint2.compliance 2.20 0.05 µrad/(N·m)",))
+    assert console_blocks.differences(wrong, output)
+    gone = console_blocks.Shown("x", ("Identified: 3 of 6 things",))
+    assert console_blocks.differences(gone, output)
