@@ -159,6 +159,17 @@ def test_every_noise_model_by_name(noise):
         assert 50 < sizes["common to each configuration"] < 200
 
 
+@pytest.mark.parametrize("noise", ["marker", "groups"])
+def test_variances_bear_the_names_that_the_table_gives(noise):
+    model, table, _ = campaign(2)
+    poses = tuple(f"pose {c}" for c in table.configuration_labels)
+    result = identify(model, replace(table, configuration_labels=poses), Options(noise=noise))
+    found = {v["name"].split(",")[0] for v in result.noise["variances"]}
+    used = (table.marker_names, table.marker) if noise == "marker" else (poses, table.configuration)
+    kind = "marker" if noise == "marker" else "configuration"
+    assert found == {f"{kind} {used[0][k]}" for k in np.unique(used[1])}
+
+
 def test_auto_says_what_it_chose_and_from_what():
     model, table, _ = campaign(3, effect=1e-4, stated=False)
     noise = identify(model, table).noise

@@ -255,8 +255,7 @@ def test_a_summary_counts_expressions() -> None:
     compiled = BackendReport("compiled", "cc 12", 2, True)
     text = summary([compiled, compiled, BackendReport("numpy"), BackendReport("none")])
     assert text == (
-        "2 of 3 expressions: compiled (cc 12; 2 threads); "
-        "1 of 3 expressions: numpy (1 thread)"
+        "2 of 3 expressions: compiled (cc 12; 2 threads); 1 of 3 expressions: numpy (1 thread)"
     )
 
 

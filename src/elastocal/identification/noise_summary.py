@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict
 from typing import Any
 
@@ -15,8 +16,11 @@ from elastocal.identification.noise import Weights, block_diagonal, weights_for,
 from elastocal.identification.variance.choose import NoiseFit
 from elastocal.identification.variance.judge import own_noise
 from elastocal.identification.weighting import linearised
+from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]
+
+NUMBERED = re.compile(r"^(marker|configuration) (\d+)")
 
 
 def noise_summary(found: Found, sigma: float) -> dict[str, Any]:
@@ -38,7 +42,7 @@ def noise_summary(found: Found, sigma: float) -> dict[str, Any]:
         "intervals": {"kind": covariance.kind, "description": covariance.description},
     }
     if found.noise is not None:
-        summary |= _estimated(found.noise)
+        summary |= _estimated(found.noise, found.solution.problem.observations.table)
     elif found.solution.problem.large:
         summary["reason"] = (
             "the table is too large for a choice among noise models; stated noise, or equal noise "
@@ -47,13 +51,20 @@ def noise_summary(found: Found, sigma: float) -> dict[str, Any]:
     return summary
 
 
-def _estimated(noise: NoiseFit) -> dict[str, Any]:
+def _estimated(noise: NoiseFit, table: Measurements) -> dict[str, Any]:
     fit = noise.fit
+    labels = {"marker": table.marker_names, "configuration": table.configuration_labels}
+
+    def label(numbered: re.Match[str]) -> str:
+        return f"{numbered[1]} {labels[numbered[1]][int(numbered[2])]}"
+
+    # The structure numbers markers and configurations; the user knows their names.
+    names = [NUMBERED.sub(label, name) for name in fit.structure.names]
     own = [
         {"name": name, "sigma_um": None, "factor": float(np.sqrt(v))}
         if fit.structure.name == "stated"
         else {"name": name, "sigma_um": float(np.sqrt(v)) * 1e6}
-        for name, v in zip(fit.structure.names, fit.own, strict=True)
+        for name, v in zip(names, fit.own, strict=True)
     ]
     shared = [
         {"name": f"common to each {e.name}", "sigma_um": float(np.sqrt(v)) * 1e6}
