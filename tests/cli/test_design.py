@@ -227,6 +227,9 @@ def test_a_plan_adds_to_the_measurements_done(tmp_path):
     alone = planned(cell, "--poses", "3")
     added = planned(cell, "--poses", "3", "--augment", done)
     assert added["n_poses"] == alone["n_poses"] == len(rows_of(tmp_path / "plan.csv")) == 3
+    # Numbered after those done, so that what is measured next can join the table.
+    names = [row["configuration"] for row in rows_of(tmp_path / "plan.csv")]
+    assert names == ["5", "6", "7"]
     assert added["value"] < alone["value"]
     smaller = deviations(alone)
     assert all(std < smaller[name] for name, std in deviations(added).items())

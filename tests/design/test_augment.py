@@ -12,7 +12,7 @@ from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
 from support.design_cells import FULL, all_loads, as_table, plan_cell, setup_of
 
 from elastocal.cell import Cell, PolarNoise
-from elastocal.design.augment import measured
+from elastocal.design.augment import measured, next_number
 from elastocal.design.information import PoseInformation
 from elastocal.design.readings import load_states
 from elastocal.design.reasons import predicted
@@ -139,3 +139,14 @@ def test_held_parameters_stay_where_they_are() -> None:
     done = measured(model, campaign(cell, TABLE_2, x=model.nominal * 1.2), ("joint4",))
     assert done.x[3] == model.nominal[3]
     assert done.x[5] != pytest.approx(model.nominal[5], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("labels", "number"), [(("1", "2"), 3), (("7+", "7-"), 8), (("warm-up", "12", "3b"), 13)]
+)
+def test_new_poses_are_numbered_after_those_measured(labels, number):
+    class Table:
+        configuration_labels = labels
+
+    assert next_number(Table()) == number
+    assert next_number(None) == 1

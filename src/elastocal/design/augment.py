@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,14 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
     weights = _weights(model, seen)
     B = weights.apply(model.regressor(table, x, None, seen).B)
     return Done(x, B.T @ B, len(B), note)
+
+
+def next_number(table: Measurements | None) -> int:
+    """The number after those of the table's configurations, so that what is measured next can
+    join it: 9 after "8", "8-" and "warm-up"; 1 where there is no table or no number."""
+    labels = () if table is None else table.configuration_labels
+    numbers = [int(m[0]) for m in (re.match(r"[0-9]+", label) for label in labels) if m]
+    return max(numbers, default=0) + 1
 
 
 def _weights(model: Model, seen: Observations) -> Weights:

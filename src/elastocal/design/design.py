@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell import Cell
-from elastocal.design.augment import Done, measured
+from elastocal.design.augment import Done, measured, next_number
 from elastocal.design.candidates import draw
 from elastocal.design.checkpoint import Checkpoint
 from elastocal.design.checks import check_cell
@@ -244,6 +244,7 @@ class _Design:
             curve=curve,
             bound_reported=None if bound is None else setup.criterion.reported(bound)[0],
             warnings=tuple(self.warnings),
+            first=next_number(self.options.done),
         )  # fmt: skip
 
 

@@ -57,7 +57,8 @@ class SizePoint:
 @dataclass(frozen=True)
 class Plan(ForNotebooks):
     """q (N, n) in SI units, numbered by configuration; `load` (N,) the load state or −1 for all;
-    `group` (N,) into `levels`.  `value` is Φ, `reported` what the user knows it by, in `unit`."""
+    `group` (N,) into `levels`.  `value` is Φ, `reported` what the user knows it by, in `unit`;
+    `first` is the number of the first configuration: after those that were measured already."""
 
     model: Model
     criterion: str
@@ -81,10 +82,11 @@ class Plan(ForNotebooks):
     curve: tuple[SizePoint, ...] = ()
     bound_reported: float | None = None
     warnings: tuple[str, ...] = field(default=())
+    first: int = 1
 
     @property
     def configurations(self) -> tuple[str, ...]:
-        return tuple(str(k + 1) for k in range(len(self.q)))
+        return tuple(str(self.first + k) for k in range(len(self.q)))
 
     @property
     def group_names(self) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> Table:
     order = first_stops(plan)
     rows: list[tuple[str, ...]] = []
     for k, reason in enumerate(plan.reasons):
-        row = [str(k + 1)]
+        row = [plan.configurations[k]]
         row += [joint_text(v, kind, decimals) for v, kind in zip(plan.q[k], kinds, strict=True)]
         if loads:
             row.append(force_text(plan, int(plan.load[k])))
@@ -50,7 +50,9 @@ def force_text(plan: Plan, load: int) -> str:
 
 def reason_rows(plan: Plan) -> Table:
     """What each pose is there for."""
-    rows: list[tuple[str, ...]] = [(str(k + 1), served(r)) for k, r in enumerate(plan.reasons)]
+    rows: list[tuple[str, ...]] = [
+        (name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)
+    ]
     return Table(("pose", SERVES), rows, (1,))
 
 
@@ -111,7 +113,7 @@ def stop_rows(plan: Plan) -> Table:
         rows.append(
             (
                 str(k + 1),
-                str(stop.pose + 1),
+                plan.configurations[stop.pose],
                 force_text(plan, stop.load),
                 "by hand" if stop.change_after is not None else "",
                 str(len(stop.via)),
