@@ -7,10 +7,6 @@ import os
 # It must be said before numpy is loaded, and the user's own setting wins.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# New containers between two searches for garbage in cycles.  Python's own 700 has every import and
-# every fit walked through all that is loaded, 0.07 s each time, and finds nothing.
-COLLECT_AFTER = 20_000
-
 # Importing a command registers it.
 from elastocal.cli import (  # noqa: F401
     compensate,
@@ -24,6 +20,10 @@ from elastocal.cli import (  # noqa: F401
     study,
 )
 from elastocal.cli.app import app
+
+# New containers between two searches for garbage in cycles.  Python's own 700 has every import and
+# every fit walked through all that is loaded, 0.07 s each time, and finds nothing.
+COLLECT_AFTER = 20_000
 
 
 def main() -> None:
