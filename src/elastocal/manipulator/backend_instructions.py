@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import casadi as ca
 import numpy as np
@@ -41,6 +41,42 @@ def instructions(function: TapeFunction) -> tuple[NDArray[np.int32], NDArray, in
     np.savez(data, table=table, constants=constants, registers=registers)
     store(key, SUFFIX, data.getvalue())
     return table, constants, registers
+
+
+def of_columns(
+    table: NDArray[np.int32], output: int, width: int, columns: Sequence[int]
+) -> NDArray[np.int32]:
+    """The instructions of `table` that make the `columns` of its last output, `output`.
+
+    That output has `width` columns; the others stay whole.  What remains is in the same order, so
+    the values are the same to the last digit.
+    """
+    position = {c: k for k, c in enumerate(columns)}
+    live: set[int] = set()
+    kept: list[int] = []
+    places: list[int] = []
+    rows = zip(*(column.tolist() for column in table[::-1].T), strict=True)
+    for back, (kind, _, register, a, b) in enumerate(rows):
+        if kind == WRITE:
+            if a == output:
+                row, column = divmod(b, width)
+                if column not in position:
+                    continue
+                b = row * len(columns) + position[column]
+            live.add(register)
+        elif register in live:
+            live.remove(register)
+            if kind >= UNARY_OP:
+                live.add(a)
+                if kind == BINARY_OP:
+                    live.add(b)
+        else:
+            continue
+        kept.append(len(table) - 1 - back)
+        places.append(b)
+    chosen = table[kept[::-1]]
+    chosen[:, 4] = places[::-1]
+    return chosen
 
 
 def _extracted(function: TapeFunction) -> tuple[NDArray[np.int32], NDArray, int]:

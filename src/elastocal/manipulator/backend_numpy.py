@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.manipulator.backend_function import TapeFunction
-from elastocal.manipulator.backend_instructions import instructions
+from elastocal.manipulator.backend_instructions import instructions, of_columns
 from elastocal.manipulator.backend_plan import Plan
 
 
@@ -25,8 +25,18 @@ class Replay:
     operation that numpy has no counterpart for.
     """
 
-    def __init__(self, function: TapeFunction) -> None:
-        self._table, self._constants, self.n_registers = instructions(function)
+    def __init__(
+        self, function: TapeFunction, whole: Replay | None = None, columns: Sequence[int] = ()
+    ) -> None:
+        """`whole`, where given, replays the same with more columns in its last output: of its
+        instructions, those for `columns` are taken instead of asking CasADi again."""
+        self.shapes = function.shapes
+        if whole is None:
+            self._table, self._constants, self.n_registers = instructions(function)
+        else:
+            output, (_, width) = len(whole.shapes) - 1, whole.shapes[-1]
+            self._table = of_columns(whole._table, output, width, columns)
+            self._constants, self.n_registers = whole._constants, whole.n_registers
         widths = [*function.sizes, *[rows * columns for rows, columns in function.shapes]]
         self._ends = [int(end) for end in np.cumsum([0, *widths])]
         self._plans: dict[tuple[bool, ...], Plan] = {}

@@ -37,10 +37,11 @@ class Plan:
         varies = [False] * unplaced  # of inputs and of values in common; results all do
         for k, rows in enumerate(by_row):
             varies[ends[k] : ends[k + 1]] = [rows] * (ends[k + 1] - ends[k])
-        value = [0] * (1 + max(table[:, 2], default=0))  # what a register of the table holds now
+        value = [0] * (1 + int(table[:, 2].max(initial=0)))  # what a register holds now
         home: dict[int, int] = {}  # the output's slot where a result is put out
         copies: list[Step] = []
-        for kind, code, out, a, b in table.tolist():
+        # Column by column: a list per instruction is garbage that the collector would count.
+        for kind, code, out, a, b in zip(*(column.tolist() for column in table.T), strict=True):
             if kind >= UNARY_OP:
                 first, second = value[a], -1
                 per_row = first >= unplaced or varies[first]

@@ -152,16 +152,29 @@ class SymbolicArm:
             if self._linear:
                 frames = [ca.reshape(self._linearised(ca.vec(f)), *f.shape) for f in frames]
             return Tape(inputs, frames, self.backend)
-        h = self._linearised(self._reading) if self._linear else self._reading
+        h = self._settled_reading
         if name == "reading":
             return Tape(inputs, [h], self.backend)
         if name == "slopes":
             return Tape(inputs, [ca.jacobian(h, theta)], self.backend)
-        if not self.implicit:
-            return Tape(inputs, [h, ca.jacobian(h, p)[:, columns]], self.backend)
-        # Adjoint of the equilibrium: with λ = F_θ⁻ᵀ h_θᵀ the total derivative of component c is
-        # the partial one of h_c − λ_cᵀ F, a few reverse sweeps instead of all of ∂F/∂X.
-        adjoint = ca.SX.sym("adjoint", h.shape[0], theta.shape[0])
-        lagrangian = h - adjoint @ self.residual
-        B = ca.jacobian(lagrangian, p)[:, columns]
-        return Tape([*inputs, ca.vec(adjoint.T)], [h, B], self.backend)
+        whole = self._tapes.get(("B", tuple(range(len(self.parameters)))))
+        adjoint, B = self._derivative
+        more = [ca.vec(adjoint.T)] if self.implicit else []
+        return Tape([*inputs, *more], [h, B[:, columns]], self.backend, whole, columns)
+
+    @cached_property
+    def _settled_reading(self) -> ca.SX:
+        """The reading, by eq. (3) where the model is linear, else in X and θ."""
+        return self._linearised(self._reading) if self._linear else self._reading
+
+    @cached_property
+    def _derivative(self) -> tuple[ca.SX, ca.SX]:
+        """Symbols λ (components, springs), none without an equilibrium, and B of every column.
+
+        Adjoint of the equilibrium: with λ = F_θ⁻ᵀ h_θᵀ the total derivative of component c is the
+        partial one of h_c − λ_cᵀ F, a few reverse sweeps instead of all of ∂F/∂X.
+        """
+        h = self._settled_reading
+        adjoint = ca.SX.sym("adjoint", h.shape[0], self.arm.theta.shape[0] if self.implicit else 0)
+        lagrangian = h - adjoint @ self.residual if self.implicit else h
+        return adjoint, ca.jacobian(lagrangian, self.p)

@@ -35,12 +35,21 @@ class Tape:
     input is.  `backend` is "auto", "numpy" or "compiled"; None follows `set_default_backend`.
     Complex numbers are always replayed.
 
+    `whole`, where given, is a tape of the same inputs and outputs whose last output has more
+    columns, and `columns` says which of them this one's are: where its instructions are known
+    already, they serve here too.
+
     A call raises NotImplementedError where it replays an operation that numpy lacks, ValueError
     for arrays of other shapes, InputError where `backend` is "compiled" and nothing can compile.
     """
 
     def __init__(
-        self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], backend: str | None = None
+        self,
+        inputs: Sequence[ca.SX],
+        outputs: Sequence[ca.SX],
+        backend: str | None = None,
+        whole: Tape | None = None,
+        columns: Sequence[int] = (),
     ) -> None:
         self._asked = None if backend is None else checked(backend, "backend")
         self._function = TapeFunction(inputs, outputs)
@@ -48,9 +57,14 @@ class Tape:
         self._sizes = self._function.sizes
         self.n_instructions = self._function.n_instructions
         self._forget()
+        self._whole, self._columns = whole, tuple(columns)
+
+    _whole: Tape | None
+    _columns: tuple[int, ...]
 
     def _forget(self) -> None:
         self._lock = threading.Lock()
+        self._whole, self._columns = None, ()
         self._work = Work(self.n_instructions)
         self._compiled: Compiled | None = None
         self._looked = False
@@ -68,7 +82,8 @@ class Tape:
 
     @cached_property
     def _replay(self) -> Replay:
-        return Replay(self._function)
+        known = None if self._whole is None else self._whole.__dict__.get("_replay")
+        return Replay(self._function, known, self._columns)
 
     @property
     def report(self) -> BackendReport:
