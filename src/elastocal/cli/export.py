@@ -113,7 +113,6 @@ def export(
 
 def _tell(done: Exported) -> None:
     """What the file holds and what not, for people."""
-    from elastocal.report.units import length
     from elastocal.report.words import printable
 
     screen = console()
@@ -132,11 +131,11 @@ def _tell(done: Exported) -> None:
         ),
         (
             done.checked is not None,
-            f"Read back with {done.checked_with}: {length(done.checked or 0.0)} at most.",
+            f"Read back with {done.checked_with}: {_rounding(done.checked)} at most.",
         ),
         (
             done.without_beta is not None,
-            f"Without the column beta_rad: {length(done.without_beta or 0.0)} at most.",
+            f"Without the column beta_rad: {_rounding(done.without_beta)} at most.",
         ),
         (
             held,
@@ -152,6 +151,13 @@ def _tell(done: Exported) -> None:
     ):
         if wanted:
             screen.print(printable(sentence), markup=False)
+
+
+def _rounding(metres: float | None) -> str:
+    """A length; what is below a nanometre is rounding and no number to read."""
+    from elastocal.report.units import length
+
+    return "< 0.001 µm" if not metres or metres < 1e-9 else length(metres)
 
 
 def _cost_table(title: str, cost: Cost) -> Table:
