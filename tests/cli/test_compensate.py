@@ -160,6 +160,33 @@ def test_a_result_of_another_robot_is_refused_although_its_parameters_have_the_s
     assert "the nominal robot is another one" in outcome.stderr and "10 mm" in outcome.stderr
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"covariance": [[1, 2], [3]]},
+        {"covariance": [["a"]]},
+        {"covariance": None},
+        {"covariance_of": None},
+        {"covariance_of": 5},
+        {"nominal_flange": "abc"},
+        {"nominal_flange": [[1, 2]]},
+    ],
+    ids=str,
+)
+def test_a_damaged_result_is_refused(folder, damage):
+    path = folder / "result.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | damage))
+    outcome = run(folder, folder / "targets.csv")
+    assert outcome.exit_code == 2
+    assert "result.json" in outcome.stderr and "write the result anew" in outcome.stderr
+
+
+def test_a_result_of_brackets_is_refused(folder):
+    (folder / "result.json").write_text("[" * 100_000)
+    outcome = run(folder, folder / "targets.csv")
+    assert outcome.exit_code == 2 and "give the file that identify -o wrote" in outcome.stderr
+
+
 def test_names_of_markers_are_no_markup(folder):
     cell = folder / "cell.toml"
     cell.write_text(CELL.replace("M2 =", '"[bold]M2" ='))

@@ -64,18 +64,12 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
     model = Model.from_cell(cell, markers)
     _check_same(model, held, cell_path, result_path)
     _check_robot(model, result.get("nominal_flange"), cell_path, result_path)
-    determined = tuple(str(name) for name in result.get("covariance_of", ()))
-    covariance = np.asarray(result.get("covariance", ()), dtype=float)
-    if not set(determined) <= set(held) or covariance.size != len(determined) ** 2:
-        raise InputError(
-            f"{result_path}: covariance of {covariance.size} numbers for {len(determined)} names "
-            "in covariance_of; write the result anew with identify -o"
-        )
+    determined, covariance = _covariance(result, held, result_path)
     return Calibrated(
         model,
         np.array([held[name] for name in model.names]),
         determined,
-        covariance.reshape(len(determined), len(determined)),
+        covariance,
         str(result_path),
     )
 
@@ -122,6 +116,10 @@ def _read_result(path: Path) -> dict[str, Any]:
             f"{path}, line {error.lineno}: not JSON ({error.msg}); "
             "give the file that identify -o wrote"
         ) from None
+    except RecursionError:
+        raise InputError(
+            f"{path}: lists within lists without end; give the file that identify -o wrote"
+        ) from None
     found = result.get("schema") if isinstance(result, dict) else None
     if found != SCHEMA:
         raise InputError(
@@ -150,6 +148,27 @@ def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
             raise InputError(f"{path}: parameter '{name}' is listed twice")
         held[name] = value
     return held
+
+
+def _covariance(
+    result: dict[str, Any], held: dict[str, float], path: str | Path
+) -> tuple[tuple[str, ...], Array]:
+    """Names of what was determined, and its covariance (determined, determined)."""
+    names, rows = result.get("covariance_of", []), result.get("covariance", [])
+    try:
+        determined = tuple(map(str, names))
+        covariance = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{path}: covariance is no table of numbers, or covariance_of no list of names; "
+            "write the result anew with identify -o"
+        ) from None
+    if not set(determined) <= set(held) or covariance.size != len(determined) ** 2:
+        raise InputError(
+            f"{path}: covariance of {covariance.size} numbers for {len(determined)} names "
+            "in covariance_of; write the result anew with identify -o"
+        )
+    return determined, covariance.reshape(len(determined), len(determined))
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:
