@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from elastocal.cell_reader import read_cell
 from elastocal.cli import app
+from elastocal.manipulator.calibrated import nominal_flange_rows
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
 
@@ -133,6 +134,72 @@ def test_a_target_out_of_reach_ends_with_1_and_writes_nothing_unless_partial(fol
     rows = list(csv.DictReader(out.open()))
     assert rows[3]["q1_deg"] == "" and rows[3]["status"] == "not reached"
     assert rows[0]["status"] == "reached"
+
+
+def test_a_refused_table_leaves_no_commands_behind(folder):
+    commands, table = folder / "commands.csv", folder / "table.csv"
+    outcome = run(folder, folder / "targets.csv", "-o", commands, "--table", table,
+                  "--box", "9000,0,0,9100,100,100", "--grid", "2")  # fmt: skip
+    assert outcome.exit_code == 1 and "Nothing was written" in outcome.stderr
+    assert not commands.exists() and not table.exists()
+
+
+def test_a_result_of_another_robot_is_refused_although_its_parameters_have_the_same_names(folder):
+    path = folder / "result.json"
+    result = json.loads(path.read_text())
+    model = Model.from_cell(read_cell(folder / "cell.toml", known_effects=tuple(CATALOGUE)))
+    result["nominal_flange"] = nominal_flange_rows(model.chain)
+    path.write_text(json.dumps(result))
+    assert run(folder, folder / "targets.csv").exit_code == 0
+    longer = URDF.read_text().replace('xyz="1.250 0.000 0.000"', 'xyz="1.260 0.000 0.000"')
+    assert longer != URDF.read_text()
+    (folder / "arm.urdf").write_text(longer)
+    (folder / "cell.toml").write_text(CELL.replace(str(URDF), "arm.urdf"))
+    outcome = run(folder, folder / "targets.csv")
+    assert outcome.exit_code == 2
+    assert "the nominal robot is another one" in outcome.stderr and "10 mm" in outcome.stderr
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"covariance": [[1, 2], [3]]},
+        {"covariance": [["a"]]},
+        {"covariance": None},
+        {"covariance_of": None},
+        {"covariance_of": 5},
+        {"nominal_flange": "abc"},
+        {"nominal_flange": [[1, 2]]},
+    ],
+    ids=str,
+)
+def test_a_damaged_result_is_refused(folder, damage):
+    path = folder / "result.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | damage))
+    outcome = run(folder, folder / "targets.csv")
+    assert outcome.exit_code == 2
+    assert "result.json" in outcome.stderr and "write the result anew" in outcome.stderr
+
+
+def test_a_result_of_brackets_is_refused(folder):
+    (folder / "result.json").write_text("[" * 100_000)
+    outcome = run(folder, folder / "targets.csv")
+    assert outcome.exit_code == 2 and "give the file that identify -o wrote" in outcome.stderr
+
+
+def test_names_of_markers_are_no_markup(folder):
+    cell = folder / "cell.toml"
+    cell.write_text(CELL.replace("M2 =", '"[bold]M2" ='))
+    outcome = run(folder, folder / "targets.csv", "--point", "[bold]M2")
+    assert outcome.exit_code == 0, outcome.stderr
+    assert "[bold]M2" in " ".join(outcome.stdout.split())
+
+
+def test_a_forgotten_load_is_mentioned(folder):
+    outcome = run(folder, "--target", "1800,300,1500")
+    assert "no load is stated" in " ".join(outcome.stdout.split())
+    outcome = run(folder, "--target", "1800,300,1500", "--load", "0", "0", "-2600")
+    assert "no load is stated" not in " ".join(outcome.stdout.split())
 
 
 @pytest.mark.parametrize(

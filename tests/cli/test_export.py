@@ -84,9 +84,9 @@ BAD = [
     (("-o", "a"), "tells no format"),
     (("-o", "a.urdf", "--format", "urd"), "did you mean"),
     (("-o", "no/folder/a.urdf"), "does not exist; create it first"),
-    (("-o", "arm.urdf"), "is an input of this export"),
-    (("-o", "cell.toml", "--format", "dh"), "is an input of this export"),
-    (("-o", "result.json"), "is an input of this export"),
+    (("-o", "arm.urdf"), "is read and would be written over"),
+    (("-o", "cell.toml", "--format", "dh"), "is read and would be written over"),
+    (("-o", "result.json"), "is read and would be written over"),
     (("-o", "a.urdf", "--load", "nan", "0", "0"), "--load takes three finite numbers"),
     (("-o", "a.urdf", "--temperature-c", "inf"), "--temperature-c takes a finite number"),
 ]

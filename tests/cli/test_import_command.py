@@ -91,7 +91,7 @@ def test_what_is_left_out_is_said(campaign, tmp_path):
         ([], "needs files"),
         (["points.txt", *PRESETS[:2]], "needs -o data.csv"),
         (["points.txt", "-o", "d.csv"], "needs --map mapping.toml, or --preset"),
-        (["points.txt", "-o", "points.txt", *PRESETS[:2]], "read as well as written"),
+        (["points.txt", "-o", "points.txt", *PRESETS[:2]], "read and would be written over"),
         (["none.txt", "-o", "d.csv", *PRESETS[:2]], "none.txt: no such file"),
         (["points.txt", "-o", "d.csv", "--preset", "kukka"], "'kukka'.*'kuka'"),
         (["points.txt", "-o", "d.csv", *PRESETS], "one preset per file"),

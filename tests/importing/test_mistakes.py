@@ -165,6 +165,12 @@ def test_poses_shifted_by_one_are_recognised(tmp_path, readings):
     assert "one pose later" in warning
 
 
+@pytest.mark.parametrize("order", [[1, 0, 2], [2, 1, 0], [0, 2, 1]])
+def test_swapped_columns_of_positions_are_recognised(tmp_path, readings, order):
+    (warning,) = with_cell(tmp_path, readings, points=readings[2][..., order]).warnings
+    assert "two columns of the positions swapped" in warning
+
+
 def test_joints_beyond_the_limits_are_refused_with_their_line(tmp_path, readings):
     found = with_cell(tmp_path, readings, "[joints]\noffset_deg = [0, 300, 0, 0, 0, 0]\n")
     assert found.refused.startswith(str(tmp_path / "p.txt") + ", line 3: joint2")

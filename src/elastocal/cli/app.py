@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError
@@ -18,9 +19,27 @@ from elastocal.errors import ElastocalError, InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from elastocal.cell import Array
+
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 
+# The order of the work, in which --help lists the verbs.
+VERBS = (
+    "design", "simulate", "import", "identify", "diagnose", "compensate", "export", "study", "demo",
+)  # fmt: skip
+
+
+class InOrder(TyperGroup):
+    """Commands in the order of the work, not of their registration."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names of the commands; one that VERBS does not know comes last."""
+        known = super().list_commands(ctx)
+        return sorted(known, key=lambda name: VERBS.index(name) if name in VERBS else len(VERBS))
+
+
 app = typer.Typer(
+    cls=InOrder,
     help="Calibrate industrial robot arms and explain what is left over.",
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -30,7 +49,7 @@ app = typer.Typer(
 
 CellFile = Annotated[Path, typer.Argument(help="Cell file (TOML): robot, tool, tracker, model.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout.")]
-Seed = Annotated[int, typer.Option(help="Seed of all random draws.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all random draws.")]
 
 
 def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
@@ -106,6 +125,16 @@ def options(
     if backend is not None:
         os.environ[VARIABLE] = backend
     chosen_backend()
+
+
+def checked_force(load: tuple[float, float, float] | None) -> Array | None:
+    """--load as a force (3,) in N, None where it is not given; InputError unless it is finite."""
+    import numpy as np
+
+    if load is not None and not np.isfinite(load).all():
+        found = " ".join(f"{value:g}" for value in load)
+        raise InputError(f"--load takes three finite numbers in N; found {found}")
+    return None if load is None else np.array(load)
 
 
 def check_outputs(*paths: Path | None) -> None:

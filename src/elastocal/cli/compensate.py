@@ -15,12 +15,13 @@ from elastocal.cli.app import (
     Seed,
     app,
     check_outputs,
+    checked_force,
     console,
     progress_line,
     reporting_errors,
 )
-from elastocal.cli.plan_files import check_apart
-from elastocal.errors import InputError, require
+from elastocal.cli.plan_files import check_apart, files_of
+from elastocal.errors import require
 
 if TYPE_CHECKING:
     from elastocal.cell import Array
@@ -86,12 +87,10 @@ def compensate(
 
     Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
     """
-    import numpy as np
-
-    from elastocal.cli.compensate_files import read_near, read_table_grid, write_commands
-    from elastocal.cli.compensate_files import write_table as write
+    from elastocal.cli.compensate_files import commands_of, read_near, read_table_grid, table_of
     from elastocal.compensation.point import tool_point
     from elastocal.compensation.targets import FRAMES
+    from elastocal.files import atomic_write_text
     from elastocal.manipulator.calibrated import read_calibrated
 
     # What can be wrong with the options is told before any file is read.
@@ -113,16 +112,15 @@ def compensate(
         "--grid, --box and --rotation belong to a correction table; give --table FILE",
     )
     require(rotation is None or box is not None, "--rotation belongs to --box")
-    force = None if load is None else np.array(load)
-    if force is not None and not np.isfinite(force).all():
-        raise InputError("--load takes three finite numbers in N")
+    force = checked_force(load)
     written = [path for path in (output, table) if path is not None]
     check_outputs(*written)
-    check_apart(written, [path for path in (cell, result, targets) if path is not None])
-    content = {}
+    content, texts = {}, {}
     with progress_line(quiet) as progress:
         progress("reading")
         arm = read_calibrated(cell, result)
+        used = [cell, result, targets, *files_of(arm.model.cell)]
+        check_apart(written, [path for path in used if path is not None])
         where = tool_point(arm.model.cell, point)
         start = read_near(arm, near)
         lines = read_table_grid(arm, grid, box, rotation) if table is not None else None
@@ -131,12 +129,17 @@ def compensate(
             from elastocal.compensation.compensate import compensate as run
 
             found = run(arm, wanted, where, start, seed, progress)
-            content["commands"] = write_commands(found, arm, output, partial)
+            content["commands"], text = commands_of(found, arm, output is None, partial)
+            if output is not None:
+                texts[output] = text
         if table is not None and lines is not None:
             from elastocal.compensation.table import correction_table
 
             corrections = correction_table(arm, lines, where, force, start, seed, progress)
-            content["table"] = write(corrections, arm, table, partial)
+            content["table"], texts[table] = table_of(corrections, arm, partial)
+        # Nothing is written before every answer is there: a refused table leaves no commands.
+        for path, text in texts.items():
+            atomic_write_text(path, text)
     if as_json:
         both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
         typer.echo(json.dumps(both, indent=1, allow_nan=False))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.files import atomic_write_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -73,21 +71,18 @@ def read_table_grid(arm: Calibrated, grid: str, box: str | None, rotation: str |
     return box_grid(corners[:3], corners[3:], counts, turned)
 
 
-def write_commands(
-    found: Compensation, arm: Calibrated, output: Path | None, partial: bool
-) -> dict[str, Any]:
-    """Write the commands and return their summary.
+def commands_of(
+    found: Compensation, arm: Calibrated, listed: bool, partial: bool
+) -> tuple[dict[str, Any], str]:
+    """Summary of the commands, with each of them where `listed`, and their table as CSV.
 
-    Raises InsufficientDataError, with nothing written, where rows are not reached and `partial`
-    does not allow for that.
+    Raises InsufficientDataError where rows are not reached and `partial` does not allow for that.
     """
     from elastocal.compensation.commands_file import commands_csv, summary
 
     _refuse(found.targets.table.source, found.targets.table.row, found.status, "reached", partial)
     kinds = arm.model.chain.kinds
-    if output is not None:
-        atomic_write_text(output, commands_csv(found, kinds))
-    return summary(found, kinds, commands=output is None)
+    return summary(found, kinds, commands=listed), commands_csv(found, kinds)
 
 
 def _refuse(source: str, lines: Any, status: tuple[str, ...], good: str, partial: bool) -> None:
@@ -104,10 +99,8 @@ def _refuse(source: str, lines: Any, status: tuple[str, ...], good: str, partial
     )
 
 
-def write_table(
-    found: CorrectionTable, arm: Calibrated, path: Path, partial: bool
-) -> dict[str, Any]:
-    """Write the correction table and return its summary; refused as `write_commands` is."""
+def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[dict[str, Any], str]:
+    """Summary of the correction table, and the table as CSV; refused as `commands_of` is."""
     import numpy as np
 
     from elastocal.compensation.commands_file import in_file_units, joint_columns, spread
@@ -134,7 +127,6 @@ def write_table(
     for i in order:
         cells = [f"{v + 0.0:.7f}" if np.isfinite(v) else "" for v in values[i]]
         writer.writerow([*(f"{v + 0.0:.9g}" for v in points[i]), *cells, found.status[i]])
-    atomic_write_text(path, text.getvalue())
     content: dict[str, Any] = {
         "points": len(found.status),
         "exact": found.status.count(EXACT),
@@ -147,7 +139,7 @@ def write_table(
     if found.oriented:
         content["rotation_without_urad"] = spread(found.before[:, 1])
         content["rotation_with_urad"] = spread(found.between[:, 1])
-    return content
+    return content, text.getvalue()
 
 
 def print_summaries(screen: Console, content: dict[str, Any]) -> None:
@@ -165,7 +157,8 @@ def print_summaries(screen: Console, content: dict[str, Any]) -> None:
             screen.print(f"target {k + 1}: {joints or command['status']}")
         screen.print(
             f"{commands['reached']} of {commands['n']} targets reached by the {commands['point']}; "
-            f"targets in the {commands['frame']} frame."
+            f"targets in the {commands['frame']} frame.",
+            markup=False,  # a marker may be called [red]
         )
         for told in commands["warnings"]:
             screen.print(f"Warning: {told}", markup=False)

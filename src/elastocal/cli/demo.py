@@ -11,7 +11,7 @@ import typer
 from elastocal.cli.app import Json, Seed, app, console, progress_line, reporting_errors
 
 
-@app.command()
+@app.command(short_help="See a KR 270 simulated and calibrated (Klimchik et al. 2013).")
 @reporting_errors
 def demo(
     folder: Annotated[
@@ -19,6 +19,7 @@ def demo(
     ] = Path("demo_out"),
     seed: Seed = 2013,
     as_json: Json = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
 
@@ -27,7 +28,7 @@ def demo(
     from elastocal.cli.results import write_results
     from elastocal.demo import run_demo
 
-    with progress_line(quiet=False) as progress:
+    with progress_line(quiet) as progress:
         done = run_demo(folder, seed, progress)
         report = folder / "report.html"
         inputs = [done.cell, done.plan, done.data]

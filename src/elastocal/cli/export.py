@@ -14,10 +14,12 @@ from elastocal.cli.app import (
     Seed,
     app,
     check_outputs,
+    checked_force,
     console,
     progress_line,
     reporting_errors,
 )
+from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from elastocal.export.export import Exported
 
 
-@app.command()
+@app.command(short_help="How do others get the calibrated arm: URDF, MuJoCo, DH table?")
 @reporting_errors
 def export(
     cell: CellFile,
@@ -86,9 +88,8 @@ def export(
     for name, value in (("--temperature-c", temperature_c), ("--time-s", time_s)):
         if value is not None and not np.isfinite(value):
             raise InputError(f"{name} takes a finite number; found {value}")
-    force = np.zeros(3) if load is None else np.array(load)
-    if not np.isfinite(force).all():
-        raise InputError(f"--load takes three finite numbers in N; found {force.tolist()}")
+    given = checked_force(load)
+    force = np.zeros(3) if given is None else given
     wish = Wish(
         format=chosen,
         frames=Frames(tool=frames, base=base_frame),
@@ -99,7 +100,8 @@ def export(
     with progress_line(quiet) as progress:
         progress("reading")
         calibrated = read_calibrated(cell, result)
-        _keep_inputs(output, cell, result, calibrated.model.cell.robot)
+        used = [path for path in files_of(calibrated.model.cell) if path is not None]
+        check_apart([output], [cell, result, *used])
         done = run(calibrated, wish, progress)
     atomic_write_text(output, done.text)
     if as_json:
@@ -109,21 +111,8 @@ def export(
     typer.echo(f"wrote {output}")
 
 
-def _keep_inputs(output: Path, *inputs: object) -> None:
-    """Refuse to write over what the calibration was read from."""
-    for given in inputs:
-        paths = [given] if isinstance(given, Path) else [given.urdf, given.dh]  # type: ignore[attr-defined]
-        for path in paths:
-            if path is not None and output.exists() and output.samefile(path):
-                raise InputError(
-                    f"{output}: is an input of this export; write to another file, so that the "
-                    "nominal robot is kept"
-                )
-
-
 def _tell(done: Exported) -> None:
     """What the file holds and what not, for people."""
-    from elastocal.report.units import length
     from elastocal.report.words import printable
 
     screen = console()
@@ -142,11 +131,11 @@ def _tell(done: Exported) -> None:
         ),
         (
             done.checked is not None,
-            f"Read back with {done.checked_with}: {length(done.checked or 0.0)} at most.",
+            f"Read back with {done.checked_with}: {_rounding(done.checked)} at most.",
         ),
         (
             done.without_beta is not None,
-            f"Without the column beta_rad: {length(done.without_beta or 0.0)} at most.",
+            f"Without the column beta_rad: {_rounding(done.without_beta)} at most.",
         ),
         (
             held,
@@ -162,6 +151,13 @@ def _tell(done: Exported) -> None:
     ):
         if wanted:
             screen.print(printable(sentence), markup=False)
+
+
+def _rounding(metres: float | None) -> str:
+    """A length; what is below a nanometre is rounding and no number to read."""
+    from elastocal.report.units import length
+
+    return "< 0.001 µm" if not metres or metres < 1e-9 else length(metres)
 
 
 def _cost_table(title: str, cost: Cost) -> Table:

@@ -19,6 +19,7 @@ from elastocal.cli.app import (
     progress_line,
     reporting_errors,
 )
+from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError
 
 if TYPE_CHECKING:
@@ -127,14 +128,18 @@ def identify(
     )
     known = _read_knowledge(knowledge, physical)
     check_outputs(output, report, residuals)
+    inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
+    written = [p for p in (output, report, residuals) if p is not None]
+    check_apart(written, inputs)
     with progress_line(quiet) as progress:
         progress("reading")
         model, tables = load_inputs(cell, [data] if test is None else [data, test])
+        used = [path for path in files_of(model.cell) if path is not None]
+        check_apart(written, used)
         if known is not None:
             constraints, prior = known.of(model)
             chosen = replace(chosen, constraints=constraints, prior=prior)
         result = run(model, tables[0], chosen, None if test is None else tables[1], progress)
-        inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
         write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
         typer.echo(json.dumps(result.to_json(), indent=1))
@@ -142,9 +147,8 @@ def identify(
     from elastocal.report.tables import print_result
 
     print_result(console(), result)
-    for path in (output, report, residuals):
-        if path is not None:
-            typer.echo(f"wrote {path}")
+    for path in written:
+        typer.echo(f"wrote {path}")
 
 
 def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from elastocal.cli.app import Json, app, check_outputs, console, reporting_errors
+from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError, require
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, kuka, abb, ros"
 
 
-@app.command("import")
+@app.command("import", short_help="How do tracker exports and joint logs become the table?")
 @reporting_errors
 def import_(
     files: Annotated[
@@ -75,7 +76,8 @@ def import_(
         f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}",
     )
     check_outputs(output)
-    _check_apart(output, [*paths, mapping, cell])
+    written = [] if output is None else [output]
+    check_apart(written, [p for p in (*paths, mapping, cell) if p is not None])
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
     found = _import(paths, read, cell, output)
     if as_json:
@@ -113,12 +115,6 @@ def _import(paths: list[Path], read: Any, cell: Path | None, output: Path | None
         from elastocal.manipulator.effects import CATALOGUE
 
         known = read_cell(cell, known_effects=tuple(CATALOGUE))
+        written = [] if output is None else [output]
+        check_apart(written, [path for path in files_of(known) if path is not None])
     return import_files(paths, read, known, str(output or "the table"))
-
-
-def _check_apart(output: Path | None, inputs: list[Path | None]) -> None:
-    if output is None:
-        return
-    for path in inputs:
-        if path is not None and path.resolve() == output.resolve():
-            raise InputError(f"{output}: is read as well as written; name another file to write")

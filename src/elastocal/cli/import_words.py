@@ -15,7 +15,8 @@ def left_out(found: Imported) -> list[str]:
     for seen in found.understood:
         if seen.ignored:
             rows = listed((f"line {line} ({reason})" for line, reason in seen.ignored), 8)
-            lines.append(f"{seen.path}: passed over {len(seen.ignored)} lines: {rows}")
+            count = f"{len(seen.ignored)} line{'s' if len(seen.ignored) > 1 else ''}"
+            lines.append(f"{seen.path}: passed over {count}: {rows}")
     if found.joined is not None and found.joined.left_out:
         rows = listed(found.joined.left_out, 12)
         lines.append(f"left out, without joint values: {len(found.joined.left_out)} points: {rows}")

@@ -8,11 +8,20 @@ from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import CellFile, Json, Seed, app, check_outputs, reporting_errors
-from elastocal.errors import InputError
+from elastocal.cli.app import (
+    CellFile,
+    Json,
+    Seed,
+    app,
+    check_outputs,
+    checked_force,
+    reporting_errors,
+)
+from elastocal.cli.plan_files import check_apart, files_of
+from elastocal.errors import InputError, require
 
 
-@app.command()
+@app.command(short_help="What would I measure, if …?")
 @reporting_errors
 def simulate(
     cell: CellFile,
@@ -54,15 +63,21 @@ def simulate(
     from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
     from elastocal.simulation.simulate import simulate as run
 
+    force = checked_force(load)
+    require(
+        0 <= draw < float("inf"),
+        f"--draw takes a factor of the typical sizes, 0 or more; found {draw:g}",
+    )
     check_outputs(output, truth)
     model = Model.from_cell(read_cell(cell, known_effects=tuple(CATALOGUE)))
+    used = [path for path in files_of(model.cell) if path is not None]
+    check_apart([p for p in (output, truth) if p is not None], [cell, plan, *used])
     poses = read_plan(plan, joint_kinds=model.chain.kinds)
     check_limits(model, poses)
     rng = np.random.default_rng(seed)
     values = draw_errors(model, draw, rng) if draw else {}
     values |= dict(_assignment(text) for text in set_ or ())
     x = values_from(model, values)
-    force = None if load is None else np.array(load)
     rows = expand_plan(poses, tuple(model.cell.tool.markers), repeats, force)
     table = run(model, rows, x, rng, noise=not no_noise)
     write_measurements(table, output, model.chain.kinds)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from elastocal.studies.stopping import Stop
 
 
-@app.command()
+@app.command(short_help="What happens in a thousand simulated campaigns?")
 @reporting_errors
 def study(
     folder: Annotated[Path, typer.Argument(help="Folder with study.py and study.toml.")],
@@ -39,7 +39,12 @@ def study(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Results; default: FOLDER/results.")
     ] = None,
-    progress: Annotated[bool, typer.Option(help="Show rate and time left.")] = True,
+    progress: Annotated[
+        bool,
+        typer.Option(
+            "--progress/--no-progress", " /--quiet", " /-q", help="Show rate and time left."
+        ),
+    ] = True,
     only: Annotated[int | None, typer.Option(min=1, help="Run the first N tasks alone.")] = None,
     restart: Annotated[bool, typer.Option(help="Discard the results that are there.")] = False,
     retry_failed: Annotated[

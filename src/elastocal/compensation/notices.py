@@ -15,6 +15,7 @@ AT_LIMIT = 1e-9  # rad or m
 FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
 LARGE = np.radians(2.0)
 LEVEL_SLACK = 0.01  # rad or m
+ELASTIC = ("joint_compliance", "off_axis_compliance", "link_bending", "base_compliance")
 WORTH_TELLING = 10e-6  # m
 
 
@@ -67,6 +68,7 @@ def notices_of(
                 f"{before[far].max() * 1e3:.0f} mm from its target; check --frame, --point and "
                 "units"
             )
+    told += _without_load(cell, targets)
     told += _beyond_levels(cell, targets, q, reached)
     unknown = uncertainty.unknown[reached]
     rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
@@ -79,6 +81,18 @@ def notices_of(
             "(--point), or measure what is missing"
         )
     return tuple(told)
+
+
+def _without_load(cell: Cell, targets: Targets) -> list[str]:
+    """A load that was forgotten: the commands are then those of the arm without it."""
+    spec = cell.model
+    elastic = any(choice.name in ELASTIC for choice in spec.effects)
+    if not elastic or targets.table.force.any() or spec.link_gravity or spec.torque != "computed":
+        return []
+    return [
+        f"{targets.table.source}: no load is stated, so no compliance is compensated; where the "
+        "tool carries one, give --load or force_x_N, force_y_N, force_z_N"
+    ]
 
 
 def _beyond_levels(cell: Cell, targets: Targets, q: Array, reached: NDArray[np.bool_]) -> list[str]:

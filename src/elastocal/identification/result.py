@@ -12,6 +12,7 @@ from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.outlier import Outlier
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.robust.report import OutlierReport
+from elastocal.manipulator.calibrated import nominal_flange_rows
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import COMPONENTS, Observations
 from elastocal.notebook import ForNotebooks
@@ -189,6 +190,7 @@ class IdentificationResult(ForNotebooks):
         return {
             "schema": SCHEMA,
             "robot": self.model.chain.name,
+            "nominal_flange": nominal_flange_rows(self.model.chain),
             "cell": self.model.cell.name,
             "data": self.observations.table.source,
             "method": self.method,

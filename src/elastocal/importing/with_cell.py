@@ -132,6 +132,12 @@ def _corrections(table: Measurements) -> Iterator[tuple[str, Measurements]]:
                           (25.4, "inches read as mm"),
                                                     (1 / 25.4, "mm read as inches")):  # fmt: skip
         yield f"if positions were {words}", replace(table, position=position * factor)
+    # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
+    yield (
+        "with two columns of the positions swapped, or the sign of one turned round (now they "
+        "make a left-handed frame),",
+        replace(table, position=position[:, [1, 0, 2]]),
+    )
     yield "if joints were degrees read as radians", other(np.radians(table.q))
     yield "if joints were radians read as degrees", other(np.degrees(table.q))
     n = table.q.shape[1]

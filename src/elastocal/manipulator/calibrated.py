@@ -8,16 +8,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from elastocal.cell_reader import read_cell
 from elastocal.errors import InputError
 from elastocal.files import read_text
-from elastocal.manipulator.chain import Array
+from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
+from elastocal.manipulator.rigid import nominal_flange
 
 SCHEMA = "elastocal/identification/1"
+SAME = 1e-6  # m, and of directions: two arms of one design differ by nothing
 MOST_BYTES = 200_000_000  # a covariance of 3000 parameters
 
 
@@ -60,20 +63,49 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
     )
     model = Model.from_cell(cell, markers)
     _check_same(model, held, cell_path, result_path)
-    determined = tuple(str(name) for name in result.get("covariance_of", ()))
-    covariance = np.asarray(result.get("covariance", ()), dtype=float)
-    if not set(determined) <= set(held) or covariance.size != len(determined) ** 2:
-        raise InputError(
-            f"{result_path}: covariance of {covariance.size} numbers for {len(determined)} names "
-            "in covariance_of; write the result anew with identify -o"
-        )
+    _check_robot(model, result.get("nominal_flange"), cell_path, result_path)
+    determined, covariance = _covariance(result, held, result_path)
     return Calibrated(
         model,
         np.array([held[name] for name in model.names]),
         determined,
-        covariance.reshape(len(determined), len(determined)),
+        covariance,
         str(result_path),
     )
+
+
+def nominal_flange_rows(chain: Chain) -> list[list[float]]:
+    """Upper rows (3, 4) of T_base_flange of the nominal arm, all joints at 0.5 rad or 0.5 m.
+
+    It stands in every result, so that one is told apart from that of another robot, whose
+    parameters have the same names.
+    """
+    q = ca.SX(np.full(chain.n_joints, 0.5))
+    T = np.asarray(ca.evalf(nominal_flange(chain, q)), dtype=float)
+    return [[round(float(v), 9) + 0.0 for v in row] for row in T[:3]]
+
+
+def _check_robot(model: Model, stated: Any, cell: str | Path, result: str | Path) -> None:
+    """Results that state no nominal flange, as older ones, are believed."""
+    if stated is None:
+        return
+    here = np.array(nominal_flange_rows(model.chain))
+    try:
+        there = np.array(stated, dtype=float)
+    except (TypeError, ValueError):
+        there = np.zeros(0)
+    if there.shape != here.shape or not np.isfinite(there).all():
+        raise InputError(
+            f"{result}: nominal_flange is no table of 3 rows with 4 numbers; "
+            "write the result anew with identify -o"
+        )
+    if np.abs(here - there).max() > SAME:
+        off = np.linalg.norm(here[:, 3] - there[:, 3])
+        raise InputError(
+            f"{result} was not identified with {cell}: the nominal robot is another one (with "
+            f"every joint at 0.5 rad the flange is {off * 1e3:.4g} mm away); give the cell that "
+            "identify was run with, or identify anew"
+        )
 
 
 def _read_result(path: Path) -> dict[str, Any]:
@@ -83,6 +115,10 @@ def _read_result(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path}, line {error.lineno}: not JSON ({error.msg}); "
             "give the file that identify -o wrote"
+        ) from None
+    except RecursionError:
+        raise InputError(
+            f"{path}: lists within lists without end; give the file that identify -o wrote"
         ) from None
     found = result.get("schema") if isinstance(result, dict) else None
     if found != SCHEMA:
@@ -112,6 +148,27 @@ def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
             raise InputError(f"{path}: parameter '{name}' is listed twice")
         held[name] = value
     return held
+
+
+def _covariance(
+    result: dict[str, Any], held: dict[str, float], path: str | Path
+) -> tuple[tuple[str, ...], Array]:
+    """Names of what was determined, and its covariance (determined, determined)."""
+    names, rows = result.get("covariance_of", []), result.get("covariance", [])
+    try:
+        determined = tuple(map(str, names))
+        covariance = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{path}: covariance is no table of numbers, or covariance_of no list of names; "
+            "write the result anew with identify -o"
+        ) from None
+    if not set(determined) <= set(held) or covariance.size != len(determined) ** 2:
+        raise InputError(
+            f"{path}: covariance of {covariance.size} numbers for {len(determined)} names "
+            "in covariance_of; write the result anew with identify -o"
+        )
+    return determined, covariance.reshape(len(determined), len(determined))
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:

@@ -1,0 +1,93 @@
+"""What every verb owes: its line in --help, inputs that are kept, options that are checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from support.exports import write_result
+from support.files import write_campaign
+from typer.testing import CliRunner
+
+from elastocal.cli import app
+from elastocal.cli.app import VERBS
+
+SIMULATE = ("simulate", "cell.toml", "plan.csv", "-o", "out.csv")
+IDENTIFY = ("identify", "cell.toml", "data.csv", "-q")
+COMPENSATE = ("compensate", "cell.toml", "result.json", "--target", "500,0,800", "-q")
+EXPORT = ("export", "cell.toml", "result.json", "-q", "-o", "out.urdf")
+DESIGN = ("design", "cell.toml", "-o", "out.csv", "-q")
+DIAGNOSE = ("diagnose", "cell.toml", "data.csv", "-q")
+
+
+def run(*arguments: str):
+    return CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    write_campaign(tmp_path)
+    write_result(tmp_path, 'urdf = "arm.urdf"')
+    header, first, *_ = (tmp_path / "data.csv").read_text().splitlines()
+    keep = [k for k, name in enumerate(header.split(",")) if name.startswith("q")]
+    lines = [",".join(line.split(",")[k] for k in keep) for line in (header, first)]
+    rows = (tmp_path / "data.csv").read_text().splitlines()
+    marked = [f"marker,{rows[0]}", *(f"M1,{row}" for row in rows[1:])]
+    (tmp_path / "data.csv").write_text("\n".join(marked) + "\n")
+    (tmp_path / "plan.csv").write_text("\n".join(lines) + "\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_help_lists_every_verb_in_the_order_of_the_work_with_a_whole_sentence():
+    shown = run("--help").stdout.partition("Commands:")[2].strip().splitlines()
+    assert [line.split()[0] for line in shown] == list(VERBS)
+    for line in shown:
+        assert len(line.split()) > 3 and not line.endswith("..."), line
+
+
+@pytest.mark.parametrize("verb", [SIMULATE, IDENTIFY, COMPENSATE, EXPORT, DESIGN, DIAGNOSE])
+def test_a_negative_seed_is_a_usage_error(folder: Path, verb: tuple[str, ...]) -> None:
+    outcome = run(*verb, "--seed", "-1")
+    assert outcome.exit_code == 2 and "--seed" in outcome.stderr
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        (*SIMULATE[:-1], "plan.csv"),
+        (*SIMULATE[:-1], "cell.toml"),
+        (*SIMULATE[:-1], "arm.urdf"),
+        (*SIMULATE, "--truth", "out.csv"),
+        (*IDENTIFY, "-o", "data.csv"),
+        (*IDENTIFY, "--report", "cell.toml"),
+        (*IDENTIFY, "--residuals", "arm.urdf"),
+        (*IDENTIFY, "-o", "out.json", "--report", "out.json"),
+        (*COMPENSATE, "-o", "arm.urdf"),
+        (*COMPENSATE, "-o", "result.json"),
+        (*EXPORT[:-1], "arm.urdf"),
+        ("import", "data.csv", "--preset", "leica", "--cell", "cell.toml", "-o", "arm.urdf"),
+    ],
+    ids=lambda verb: f"{verb[0]}-{verb[-1]}",
+)
+def test_no_verb_writes_over_its_inputs_or_two_outputs_into_one(
+    folder: Path, verb: tuple[str, ...]
+) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    outcome = run(*verb)
+    assert outcome.exit_code == 2
+    assert "written over" in outcome.stderr or "two outputs" in outcome.stderr
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("verb", [SIMULATE, COMPENSATE, EXPORT], ids=lambda verb: verb[0])
+def test_a_load_that_is_no_number_is_told_as_such(folder: Path, verb: tuple[str, ...]) -> None:
+    outcome = run(*verb, "--load", "0", "0", "nan")
+    assert outcome.exit_code == 2
+    assert "--load takes three finite numbers in N; found 0 0 nan" in outcome.stderr
+
+
+@pytest.mark.parametrize("draw", ["-1", "nan", "inf"])
+def test_simulate_draws_a_finite_share_of_the_typical_sizes(folder: Path, draw: str) -> None:
+    outcome = run(*SIMULATE, "--draw", draw)
+    assert outcome.exit_code == 2 and "--draw takes a factor" in outcome.stderr
