@@ -21,16 +21,17 @@ import extra_poses
 import one_world
 import records
 import score
-import study
 import suites
 import worker
 from calibration import calibration_error, draw_reliability, reliability
 from draw import ALIKE, Recipe, draw_world
+from support.study_scripts import study_of
 from visits import draw_poses
 from world_files import write_world
 
 from elastocal.studies.conduct import prepare
 
+study = study_of(FOLDER)
 ECCENTRIC, MASS, SCALE = (
     ("gear_eccentricity", "joint2"),
     ("link_mass_error", "link2"),

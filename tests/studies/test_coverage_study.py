@@ -15,7 +15,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "coverage"
 sys.path.insert(0, str(FOLDER))
 
 import scenarios
-import study
+from support.study_scripts import study_of
 
 from elastocal.cell_reader import read_cell
 from elastocal.demo import LOAD_N, published_compliances
@@ -24,6 +24,7 @@ from elastocal.manipulator.model import Model
 from elastocal.measurement_reader import read_plan
 from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
+study = study_of(FOLDER)
 NAMES = {s.key: s for s in scenarios.SCENARIOS}
 
 

@@ -88,9 +88,10 @@ class Weighted:
         return cls(root, X, r, flat.T @ flat, flat.T @ r.ravel(), alone)
 
     def prior(self, precision: Array) -> Array:
-        """Λ's diagonal (p,), and a little more: what no reading shows and the prior leaves wide
-        must not drown in rounding."""
-        return precision + ROUNDING * np.diag(self.M).max(initial=0.0)
+        """Λ's diagonal (p,), and a little more: what others show as well and the prior leaves wide
+        must not drown in rounding.  By each column's own size: a prior must not tighten because
+        another column is large."""
+        return precision + ROUNDING * np.diag(self.M)
 
     def factored(self, precision: Array) -> tuple[Array, Array, float]:
         """L of LLᵀ = M + Λ, L⁻¹z, and ℓ, for a prior of precision Λ (p,)."""
