@@ -161,7 +161,7 @@ OPTIONS = {
     "knowledge": (("--knowledge", "{}/none.toml"), 2, ("none.toml", "no such file")),
     "augment": (("--augment", "{}/none.csv"), 2, ("none.csv", "no such file")),
     "fix": (("--fix", "joint2.complance"), 2, ("joint2.complance", "did you mean")),
-    "seed": (("--seed", "-1"), 2, ("seed", "negative", "-1")),
+    "seed": (("--seed", "-1"), 2, ("--seed", "greater than or equal to 0")),
     "jobs": (("--jobs", "0"), 2, ("jobs", "found 0")),
     "poses": (("--poses", "0"), 2, ("--poses",)),
     "candidates": (("--candidates", "0"), 2, ("--candidates",)),
