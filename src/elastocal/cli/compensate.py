@@ -119,8 +119,7 @@ def compensate(
     with progress_line(quiet) as progress:
         progress("reading")
         arm = read_calibrated(cell, result)
-        used = [cell, result, targets, *files_of(arm.model.cell)]
-        check_apart(written, [path for path in used if path is not None])
+        check_apart(written, [cell, result, targets, *files_of(arm.model.cell)])
         where = tool_point(arm.model.cell, point)
         start = read_near(arm, near)
         lines = read_table_grid(arm, grid, box, rotation) if table is not None else None

@@ -86,8 +86,7 @@ def diagnose(
     with progress_line(quiet) as progress:
         progress("reading")
         model, (table,) = load_inputs(cell, [data])
-        read = [cell, data, *(path for path in files_of(model.cell) if path is not None)]
-        check_apart(outputs.wanted, read)
+        check_apart(outputs.wanted, [cell, data, *files_of(model.cell)])
         found = run(model, table, options, progress)
         if plan is not None and found.verdict in OPEN:
             most = MOST_POSES if poses is None else poses

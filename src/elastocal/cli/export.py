@@ -100,8 +100,7 @@ def export(
     with progress_line(quiet) as progress:
         progress("reading")
         calibrated = read_calibrated(cell, result)
-        used = [path for path in files_of(calibrated.model.cell) if path is not None]
-        check_apart([output], [cell, result, *used])
+        check_apart([output], [cell, result, *files_of(calibrated.model.cell)])
         done = run(calibrated, wish, progress)
     atomic_write_text(output, done.text)
     if as_json:

@@ -134,8 +134,7 @@ def identify(
     with progress_line(quiet) as progress:
         progress("reading")
         model, tables = load_inputs(cell, [data] if test is None else [data, test])
-        used = [path for path in files_of(model.cell) if path is not None]
-        check_apart(written, used)
+        check_apart(written, files_of(model.cell))
         if known is not None:
             constraints, prior = known.of(model)
             chosen = replace(chosen, constraints=constraints, prior=prior)

@@ -76,8 +76,7 @@ def import_(
         f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}",
     )
     check_outputs(output)
-    written = [] if output is None else [output]
-    check_apart(written, [p for p in (*paths, mapping, cell) if p is not None])
+    check_apart([output], [*paths, mapping, cell])
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
     found = _import(paths, read, cell, output)
     if as_json:
@@ -115,6 +114,5 @@ def _import(paths: list[Path], read: Any, cell: Path | None, output: Path | None
         from elastocal.manipulator.effects import CATALOGUE
 
         known = read_cell(cell, known_effects=tuple(CATALOGUE))
-        written = [] if output is None else [output]
-        check_apart(written, [path for path in files_of(known) if path is not None])
+        check_apart([output], files_of(known))
     return import_files(paths, read, known, str(output or "the table"))

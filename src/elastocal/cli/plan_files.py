@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,11 +49,13 @@ def check_programs(cell: Cell, programs: tuple[Path, ...]) -> None:
             _program(path, nothing, chain)
 
 
-def check_apart(written: list[Path], read: list[Path]) -> None:
-    """Refuse to write over an input, or two outputs into one file."""
-    inputs = {path.resolve() for path in read}
+def check_apart(written: Iterable[Path | None], read: Iterable[Path | None]) -> None:
+    """Refuse to write over an input, or two outputs into one file; None where none was named."""
+    inputs = {path.resolve() for path in read if path is not None}
     seen: set[Path] = set()
     for path in written:
+        if path is None:
+            continue
         require(
             path.resolve() not in inputs,
             f"{path} is read and would be written over; name another output",

@@ -70,8 +70,7 @@ def simulate(
     )
     check_outputs(output, truth)
     model = Model.from_cell(read_cell(cell, known_effects=tuple(CATALOGUE)))
-    used = [path for path in files_of(model.cell) if path is not None]
-    check_apart([p for p in (output, truth) if p is not None], [cell, plan, *used])
+    check_apart([output, truth], [cell, plan, *files_of(model.cell)])
     poses = read_plan(plan, joint_kinds=model.chain.kinds)
     check_limits(model, poses)
     rng = np.random.default_rng(seed)

@@ -114,7 +114,7 @@ def summary(reports: Iterable[BackendReport]) -> str:
     total = sum(len(group) for group in groups.values())
     lines = []
     for group in groups.values():
-        threads, cached = max(r.threads for r in group), all(r.cached for r in group)
+        threads = max(r.threads for r in group)
         share = f"{len(group)} of {total} expressions: " if len(groups) > 1 else ""
-        lines.append(f"{share}{replace(group[0], threads=threads, cached=cached)}")
+        lines.append(f"{share}{replace(group[0], threads=threads)}")
     return "; ".join(lines) or "nothing evaluated yet"
