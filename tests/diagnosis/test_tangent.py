@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.cells import random_poses
 from support.diagnosis_data import FAULTS, campaign, diagnosed
 
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.columns import compute_columns
 from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.result import NoiseFloor
+from elastocal.diagnosis.scene import scene_of
+from elastocal.diagnosis.separate_pool import pool_of
+from elastocal.diagnosis.separate_rows import campaign_of
 
 COMPENSATOR = "gravity_compensator:joint2"
 
@@ -39,6 +44,28 @@ def test_the_columns_explain_a_spring_anchored_elsewhere(remaining) -> None:
     """At the example's anchor the stiffness alone hardly does; its neighbours are zero there."""
     X, r, C = remaining
     assert left(np.hstack([X, C]), r) < 0.5 * left(X, r)
+
+
+def test_poses_not_measured_yet_do_not_change_what_the_data_say() -> None:
+    """They have no residual: counted as zero, they would make the spring weaker, and the lengths
+    of its geometry, whose columns are as large as it is stiff, more expensive."""
+    model, table = campaign(COMPENSATOR)
+    base = fit_baseline(model, table)
+    key = ("gravity_compensator", "joint2")
+    spring = [h for h in possible(model, table)[0] if (h.name, h.where) == key]
+    force = np.unique(table.force, axis=0)
+    late = np.linspace(1e5, 2e5, 100)
+    q = random_poses(model.chain, 100, 5)
+    pool = pool_of(model, base.x, table, q, np.ones((100, 6)), late, force)
+    noise = NoiseFloor(True, 1.0, 2e-5, (5e-6,) * 6, 0.0, None)
+    diagnosis = type("Found", (), {"noise": noise})
+    whole = campaign_of(base, pool, spring, diagnosis).scene  # type: ignore
+    alone = scene_of(base, spring)
+    np.testing.assert_allclose(whole.sizes[key], alone.sizes[key], rtol=1e-9)
+    here, there = (scene.packed(spring[0], np.zeros(0)) for scene in (alone, whole))
+    same = there[: len(here), : here.shape[1]]
+    size = np.abs(here).max(axis=(0, 1))
+    assert (np.abs(same - here).max(axis=(0, 1)) < 1e-6 * size).all()
 
 
 @pytest.mark.long

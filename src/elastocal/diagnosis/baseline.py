@@ -31,6 +31,8 @@ class Baseline:
     `x` (parameters,) is the fit, `sizes` typical deviations, `nominal` (rows,) the residual of
     the nominal arm with only base and markers placed, NaN where the fit began elsewhere.
     `stated` (N, size, size) is the noise that cell or table state, None where they state none.
+    The last `planned` of the N observations are candidates not yet measured: their residual is
+    zero and says nothing about what may be at work.
     """
 
     model: Model
@@ -40,6 +42,12 @@ class Baseline:
     residual: Array
     nominal: Array
     stated: Array | None
+    planned: int = 0
+
+    @property
+    def n_measured(self) -> int:
+        """Observations that were measured; they come first."""
+        return len(self.seen.lead) - self.planned
 
     @property
     def blocks(self) -> Blocks:

@@ -111,7 +111,8 @@ class Scene:
     def _sizes(self, h: Hypothesis) -> Array:
         if is_driven(h):
             return np.array([p.typical or 0.0 for p in h.parameters])
-        return typical_sizes(h, self.columns.observed(self.columns.of(h)))
+        measured = self.columns.observed(self.columns.of(h))[: self.base.n_measured]
+        return typical_sizes(h, measured)
 
     @cached_property
     def drives(self) -> dict[tuple[str, str], Drive]:

@@ -66,7 +66,7 @@ def campaign_of(
     later = seen.table.marker[seen.lead[n:]]
     whole = replace(
         base, seen=seen, stated=np.concatenate([stated, usual[later]]),
-        residual=np.concatenate([base.residual, np.zeros(size * len(later))]),
+        residual=np.concatenate([base.residual, np.zeros(size * len(later))]), planned=len(later),
     )  # fmt: skip
     lines = [f.line for f in diagnosis.noise.faulty]
     faulty = np.isin(seen.table.row[seen.lead], lines)

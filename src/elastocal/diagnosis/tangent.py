@@ -45,7 +45,9 @@ def _tangent(
     names = {name: k for k, name in enumerate(whole.names)}
     fitted = [names[name] for name in model.names]
     X = base.seen.apply(B[:, :, fitted]).reshape(len(base.residual), -1) * base.sizes
-    rows = np.unique(np.linspace(0, len(X) - 1, min(ROWS, len(X))).astype(int))
+    # What is only planned has no residual yet that a spring could answer for.
+    last = base.n_measured * base.seen.size - 1
+    rows = np.unique(np.linspace(0, last, min(ROWS, last + 1)).astype(int))
     best, columns = np.inf, B[:, :, own]
     for start in h.effect.starts(h.where, model.chain, model.cell) or ({},):
         at = x.copy()
