@@ -19,8 +19,8 @@ from elastocal.diagnosis.projection import likelihood, posterior
 
 Array = NDArray[np.float64]
 
-STRIDE, STRIDES = 1.5, 6  # of the logarithms
-ENOUGH = 0.01  # change of −2ℓ at which a search ends
+STRIDE, ROUNDS = 1.5, 10  # of the logarithms
+ENOUGH, LEVEL = 1e-3, 3e-3  # change of −2ℓ, and its slope, at which a search ends
 
 
 def fit_noise(data: NoisyData, start: NoiseValues | None = None) -> NoiseValues:
@@ -69,14 +69,17 @@ def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
     theta = np.clip(start.logs(), lower, upper)
     ftol = ENOUGH / max(abs(cost(theta)[0]), 1.0)
     # Step by step: one long stride of the line search ends where V is singular to rounding.
-    for _ in range(STRIDES):
+    # A round ends at the first small gain, often that of a poor first direction: the search is
+    # over when a whole round gains nothing.
+    gain = np.inf
+    for _ in range(ROUNDS):
         low, high = np.maximum(lower, theta - STRIDE), np.minimum(upper, theta + STRIDE)
         found = optimize.minimize(
             cost, theta, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-            options={"maxiter": 60, "ftol": ftol, "gtol": 3e-2},
+            options={"maxiter": 60, "ftol": ftol, "gtol": LEVEL},
         )  # fmt: skip
-        theta = found.x
+        gain, theta = cost(theta)[0] - float(found.fun), found.x
         inside = (theta > low) & (theta < high) | (theta == lower) | (theta == upper)
-        if inside.all():
+        if inside.all() and gain < ENOUGH:
             break
     return NoiseValues.of_logs(theta)
