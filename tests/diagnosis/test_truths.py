@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from support.cells import kr270_chain
-from support.diagnosis_data import FAULTS, campaign, cell, measured
+from support.diagnosis_data import FAULTS, Fault, campaign, cell, measured, plan
 
 from elastocal.diagnosis.alike import signal_of
 from elastocal.diagnosis.baseline import fit_baseline
@@ -23,6 +23,7 @@ from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scan import Scan
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.truths import DRAWN, NOISES, Confirmation
+from elastocal.manipulator.model import Model
 
 SILENT = 1e-9
 
@@ -101,6 +102,22 @@ def test_a_constant_at_its_bound_has_the_slope_of_one_beside_it(bound: float) ->
 def test_a_change_time_has_no_slope() -> None:
     found, item = confirmation("encoder_jump:joint4")
     assert of_one(found, item).spread.shape[2] == len(found.fitted.x)
+
+
+def test_a_large_effect_is_not_held_to_be_smaller_than_it_was_found() -> None:
+    """A stiff spring, dozens of times the size that a first guess gives: what may be true must
+    lie about the fit, and not between it and nothing."""
+    stiff = Fault("gravity_compensator", "joint2", {"compensator_stiffness": 2e5})
+    chain, plain = kr270_chain(), cell(sigma=5e-5)
+    table = measured(chain, plain, [stiff], plan(chain, 40, 1), 1)
+    base = fit_baseline(Model(chain, plain), table)
+    scene = scene_of(base, [h for h in possible(base.model, table)[0] if h.name == stiff.effect])
+    item = Item(scene.hypotheses[0], np.zeros(0), 0.0)
+    found = Confirmation.of(_found(scene, (item,)), base, np.random.default_rng(3))
+    truth = of_one(found, item)
+    assert found.chosen.scales[0] > 1
+    moved = np.linalg.norm(truth.spread, axis=2)
+    assert rms(truth.after) < 0.3 * float(np.sqrt((moved**2).sum(axis=1).mean()))
 
 
 def test_readings_are_numbered_by_fresh_pose() -> None:

@@ -93,18 +93,19 @@ class Confirmation:
         )
         out = []
         for item, share in other_settings(self.scene, self.chosen, k):
-            known = _known((*self.chosen.items[:k], item, *self.chosen.items[k + 1 :]))
-            at = replace(self.fitted, model=extended(self.plain.model, known))
-            out += self._truth(at, known, item, before, rivals[0][1] * share)
+            like = replace(self.chosen, items=self._with(k, item))
+            at = replace(self.fitted, model=extended(self.plain.model, _known(like.items)))
+            out += self._truth(at, like, item, before, rivals[0][1] * share)
         for item, share in rivals[1:]:
             if share < WORTH_A_DRAW or not item.known:
                 continue
-            items = (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
-            rival = fit_set(self.scene, items, self.chosen.noise)
-            known = _known(items)
-            at = fit_extended(self.scene, rival, known)
-            out += self._truth(at, known, item, before, share)
+            rival = fit_set(self.scene, self._with(k, item), self.chosen.noise)
+            at = fit_extended(self.scene, rival, _known(rival.items))
+            out += self._truth(at, rival, item, before, share)
         return out
+
+    def _with(self, k: int, item: Item) -> tuple[Item, ...]:
+        return (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
 
     @cached_property
     def unnamed(self) -> float:
@@ -127,12 +128,12 @@ class Confirmation:
         return base.model.predict(self.seen.table, base.x, self.seen)
 
     def _truth(
-        self, base: Baseline, known: list[Item], item: Item, before: Array, probability: float
+        self, base: Baseline, true: ModelSet, item: Item, before: Array, probability: float
     ) -> list[Truth]:
-        """If that model is true, under each of the noises."""
-        measured, fresh = self._by_constant(base, known, item)
+        """If that set is true, fitted as `base`, under each of the noises."""
+        measured, fresh = self._by_constant(base, _known(true.items), item)
         here, at = self._regressions(base)
-        linear = Linear.of(self.scene, base, measured, self._prior(known), here)
+        linear = Linear.of(self.scene, base, measured, self._prior(true), here)
         B = np.hstack([at.B, fresh])
         start = np.append(base.x, np.zeros(measured.shape[1]))
         size = self.seen.size
@@ -144,11 +145,11 @@ class Confirmation:
         out = []
         for noise in self.noise:
             fit = linear.posterior(noise)
-            true = at.prediction + B @ (fit.x - start)
+            readings = at.prediction + B @ (fit.x - start)
             out.append(
                 Truth(
-                    lengths(before - true),
-                    lengths(self._after - true),
+                    lengths(before - readings),
+                    lengths(self._after - readings),
                     lengths(B @ fit.spread),
                     self.seen.configuration,
                     probability / len(self.noise),
@@ -156,14 +157,16 @@ class Confirmation:
             )
         return out
 
-    def _prior(self, known: list[Item]) -> dict[str, float]:
-        """Prior deviations of the effects' parameters: their typical sizes."""
+    def _prior(self, true: ModelSet) -> dict[str, float]:
+        """Prior deviations of the set's parameters: their typical sizes, times the scale that the
+        readings prefer where the effect is larger than usual; a tie to the usual size would
+        make the truth smaller than what was found."""
         out = {}
-        for item in known:
-            assert isinstance(item.what, Hypothesis)
-            size = self.scene.sizes[item.what.name, item.what.where]
-            for p, s in zip(item.what.parameters, size, strict=True):
-                out[f"{item.what.where}.{p.key}"] = float(s)
+        for item, scale in zip(true.items, true.scales, strict=True):
+            if isinstance(item.what, Hypothesis):
+                size = self.scene.sizes[item.what.name, item.what.where] * max(scale, 1.0)
+                for p, s in zip(item.what.parameters, size, strict=True):
+                    out[f"{item.what.where}.{p.key}"] = float(s)
         return out
 
     def _by_constant(self, base: Baseline, known: list[Item], item: Item) -> list[Array]:
