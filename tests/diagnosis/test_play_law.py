@@ -5,15 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
+import numpy as np
 import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import FITTED, Fault, cell, measured, plan
 
 from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.play_law import with_likelier_play
+from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
+from elastocal.diagnosis.play_law import doubt, under_other_law, with_likelier_play
 from elastocal.diagnosis.recorded_drivers import with_recorded_drivers
+from elastocal.diagnosis.scan import Scan
 from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.diagnosis.truths import NOISES, Confirmation
 from elastocal.manipulator.model import Model
 
 PLAY = Fault("backlash", "joint3", {"backlash": 3e-4})
@@ -57,3 +62,47 @@ def test_nothing_is_asked_where_no_side_is_recorded() -> None:
 def test_play_in_the_cell_keeps_its_law() -> None:
     first = scene("load", (*FITTED, "backlash:joint2"))
     assert with_likelier_play(first) is first
+
+
+def set_of(law: str, told: Scene) -> ModelSet:
+    model = told.base.model
+    if model.cell.model.play_side != law:
+        model = under_other_law(model)
+    under = scene_of(replace(told.base, model=model), list(told.hypotheses))
+    (play,) = [h for h in under.hypotheses if (h.name, h.where) == PLAY.key]
+    return fit_set(under, (Item(play, np.zeros(0), 0.0),), told.noise)
+
+
+def test_a_few_readings_in_the_dead_zone_leave_less_doubt_of_the_law() -> None:
+    assert with_likelier_play(scene("load_and_approach")).other_play < 0.25
+
+
+def test_laws_that_say_the_same_are_as_likely() -> None:
+    told = with_likelier_play(scene("load"))
+    same = set_of("load", told)
+    assert doubt(same, same) == pytest.approx(0.5)
+
+
+def test_one_configuration_alone_does_not_settle_the_law() -> None:
+    """However far off the other law is there: it may be off for a reason of its own."""
+    told = with_likelier_play(scene("load"))
+    right = set_of("load", told)
+    r = right.data.r.copy()
+    r[4] += 1e-3
+    assert doubt(right, replace(right, data=replace(right.data, r=r))) > 0.1
+
+
+def test_play_by_either_law_may_be_true_at_fresh_poses() -> None:
+    """As probable as each law is; nothing else is drawn under another law."""
+    told = replace(with_likelier_play(scene("load")), other_play=0.3)
+    (play,) = [h for h in told.hypotheses if (h.name, h.where) == PLAY.key]
+    item = Item(play, np.zeros(0), 0.0)
+    plain, chosen = fit_set(told, ()), fit_set(told, (item,))
+    nothing: Scan = None  # type: ignore[assignment]
+    found = Found(told, chosen, (), (), plain, nothing, nothing)
+    truths = Confirmation.of(found, told.base, np.random.default_rng(1)).truths(0, ((item, 1.0),))
+    assert [t.probability for t in truths] == pytest.approx(
+        [0.7 / NOISES] * NOISES + [0.3 / NOISES] * NOISES
+    )
+    own, other = (float(np.sqrt((t.after**2).mean())) for t in (truths[0], truths[-1]))
+    assert other > 3 * own

@@ -10,16 +10,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit
+from scipy.stats import norm
 
-from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.gram import Grams, scales_of
-from elastocal.diagnosis.model_set import Item, fit_set
+from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
 from elastocal.diagnosis.noise import NoiseValues
 from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.manipulator.model import Model
 
 EFFECT, BY_LOAD, BY_BOTH = "backlash", "load", "load_and_approach"
+LAWS = {BY_LOAD: BY_BOTH, BY_BOTH: BY_LOAD}
 
 
 def with_likelier_play(scene: Scene) -> Scene:
@@ -32,27 +34,50 @@ def with_likelier_play(scene: Scene) -> Scene:
     if spec.play_side != BY_BOTH or not play:
         return scene
     noise = scene.noise
-    other = _under(scene.base, BY_LOAD)
+    other = replace(scene.base, model=under_other_law(scene.base.model))
     under_other = scene_of(other, play)
     under_other = replace(under_other, data=replace(under_other.data, left_out=scene.data.left_out))
-    if _best(under_other, noise) <= _best(scene, noise):
-        return scene
+    here, there = _likeliest(scene, noise), _likeliest(under_other, noise)
+    if there.score <= here.score:
+        return replace(scene, other_play=doubt(here, there))
     rows = scene.columns.rows.copy()
     for h in play:
         rows[:, :, scene.columns.places[h.name, h.where]] = under_other.columns.of(h)
-    return replace(scene, base=other, columns=replace(scene.columns, base=other, rows=rows))
+    return replace(
+        scene, base=other, columns=replace(scene.columns, base=other, rows=rows),
+        other_play=doubt(there, here),
+    )  # fmt: skip
 
 
-def _under(base: Baseline, law: str) -> Baseline:
-    model = base.model
-    spec = replace(model.cell.model, play_side=law)  # type: ignore[arg-type]
-    return replace(base, model=Model(model.chain, replace(model.cell, model=spec)))
+def under_other_law(model: Model) -> Model:
+    """The model with play under the law that it does not have."""
+    spec = model.cell.model
+    spec = replace(spec, play_side=LAWS[spec.play_side])  # type: ignore[arg-type]
+    return Model(model.chain, replace(model.cell, model=spec))
 
 
-def _best(scene: Scene, noise: NoiseValues) -> float:
-    """Log evidence of play in the joint where it is likeliest, the noise fitted beside it."""
+def _likeliest(scene: Scene, noise: NoiseValues) -> ModelSet:
+    """Play in the joint where it is likeliest, the noise fitted beside it."""
     play = [h for h in scene.hypotheses if h.name == EFFECT]
     grams = Grams(scene, scene.data, project(scene.data, noise))
     evidence = [float(grams.of_hypothesis(h).evidence(scales_of(h)).max()) for h in play]
     likeliest = play[int(np.argmax(evidence))]
-    return fit_set(scene, (Item(likeliest, np.zeros(0), 0.0),), noise).score
+    return fit_set(scene, (Item(likeliest, np.zeros(0), 0.0),), noise)
+
+
+def doubt(better: ModelSet, other: ModelSet) -> float:
+    """Probability of the less likely law: the larger of 1/(1 + exp Σ d) and Φ(−Σ d / √Σ d²).
+
+    d (configurations,) is what each adds to the log likelihood ratio under the noise of `better`.
+    Both laws idealise what happens in the dead zone, so that one or two configurations there may
+    speak loudly for the wrong one; by the test of Vuong (1989, Econometrica 57) for laws of which
+    none is quite true, their ratio counts against its own scatter.
+    """
+    spent = []
+    for chosen in (better, other):
+        at = project(chosen.data, better.noise)
+        left = chosen.data.masked(chosen.data.r - chosen.data.X @ at.beta)
+        spent.append((left * at.u).sum(axis=1))
+    d = (spent[1] - spent[0]) / 2
+    odds, scatter = max(float(d.sum()), 0.0), max(float(np.linalg.norm(d)), 1e-300)
+    return float(max(expit(-odds), norm.cdf(-odds / scatter)))

@@ -57,6 +57,7 @@ def relinearised(scene: Scene, chosen: ModelSet) -> Scene:
     return replace(
         fresh,
         base=replace(moved, residual=fitted.residual + back.ravel()),
+        other_play=scene.other_play,
         data=replace(
             fresh.data,
             r=fresh.data.r + fresh.blocks.pack(back)[:, :, 0],

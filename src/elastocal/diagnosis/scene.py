@@ -56,7 +56,8 @@ class Scene:
 
     `data` holds the residual at the prior's centre, linearised at the fit, the fitted columns
     (scaled to their prior deviations) and noise shapes; `load_point` (C, m, 3) what a shift of the
-    hook does, per m, None without a load.
+    hook does, per m, None without a load.  `other_play` is the probability that play follows the
+    law that the base's model does not have.
     """
 
     base: Baseline
@@ -67,6 +68,7 @@ class Scene:
     data: NoisyData
     fitted: FittedColumns
     load_point: Array | None = None
+    other_play: float = 0.0
 
     @cached_property
     def _packed(self) -> dict[EntryKey | tuple[str, str], Array]:

@@ -20,6 +20,7 @@ from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, beside, fit_set
 from elastocal.diagnosis.noise import NoiseValues
 from elastocal.diagnosis.noise_draws import noise_draws
+from elastocal.diagnosis.play_law import EFFECT, under_other_law
 from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.refit import Linear, Posterior
 from elastocal.diagnosis.scene import Scene
@@ -96,6 +97,7 @@ class Confirmation:
             like = replace(self.chosen, items=self._with(k, item))
             at = replace(self.fitted, model=extended(self.plain.model, _known(like.items)))
             out += self._truth(at, like, item, before, rivals[0][1] * share)
+        out = self._under_both_laws(k, before, out)
         for item, share in rivals[1:]:
             if share < WORTH_A_DRAW or not item.known:
                 continue
@@ -103,6 +105,17 @@ class Confirmation:
             at = fit_extended(self.scene, rival, _known(rival.items))
             out += self._truth(at, rival, item, before, share)
         return out
+
+    def _under_both_laws(self, k: int, before: Array, truths: list[Truth]) -> list[Truth]:
+        """What is true if item k, where it is play, follows its law, and if it follows another."""
+        doubt, item = self.scene.other_play, self.chosen.items[k]
+        if not (isinstance(item.what, Hypothesis) and item.what.name == EFFECT and doubt):
+            return truths
+        held = [replace(t, probability=t.probability * (1 - doubt)) for t in truths]
+        other = extended(under_other_law(self.plain.model), _known(self.chosen.items))
+        share = doubt * sum(t.probability for t in truths)
+        at = replace(self.fitted, model=other)
+        return held + self._truth(at, self.chosen, item, before, share)
 
     def _with(self, k: int, item: Item) -> tuple[Item, ...]:
         return (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
