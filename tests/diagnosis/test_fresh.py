@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis.fresh import fresh_table
+from elastocal.diagnosis.fresh import _box, _raked, fresh_table
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
 from elastocal.measurements import Measurements
@@ -44,10 +44,39 @@ def test_every_joint_has_been_at_its_angle_and_no_arm_in_its_pose() -> None:
     assert not {tuple(q) for q in fresh.q} & {tuple(q) for q in table.q}
 
 
-def test_markers_stay_where_they_were_measured() -> None:
+def test_markers_stay_about_where_they_were_measured() -> None:
+    """Beyond the outermost configuration by no more than it is from the one before it."""
     model, table, fresh = drawn()
     was, now = (model.target_poses(t)[1] for t in (table, fresh))
-    assert (now >= was.min(axis=0)).all() and (now <= was.max(axis=0)).all()
+    codes = np.unique(table.configuration)
+    second, last = np.sort([was[table.configuration == c].max(axis=0) for c in codes], axis=0)[-2:]
+    assert (now <= last + (last - second)).all()
+    last, second = np.sort([was[table.configuration == c].min(axis=0) for c in codes], axis=0)[:2]
+    assert (now >= last - (second - last)).all()
+
+
+def test_as_much_of_the_room_is_beyond_the_ends_as_draws_leave_on_average() -> None:
+    rng = np.random.default_rng(4)
+    ends = np.array([_box(rng.random((60, 3)), np.arange(60)) for _ in range(2000)])
+    np.testing.assert_allclose(ends.mean(axis=0), [[0.0] * 3, [1.0] * 3], atol=2e-3)
+
+
+def test_no_joint_is_drawn_to_its_middle_by_the_ends_of_the_room() -> None:
+    """Poses with an outstretched arm leave the box most often, and would be missing."""
+    model, table, _ = drawn()
+    fresh = fresh_table(model, table, 400, np.random.default_rng(6))
+    was, now = (t.q[np.unique(t.configuration, return_index=True)[1]] for t in (table, fresh))
+    np.testing.assert_allclose(now.std(axis=0), was.std(axis=0), rtol=0.08)
+
+
+def test_raked_poses_have_every_donor_as_often() -> None:
+    """Where half of those with a joint at one of its angles are missing."""
+    rng = np.random.default_rng(2)
+    donors = rng.integers(5, size=(4000, 3))
+    donors = donors[(donors[:, 1] != 2) | (rng.random(4000) < 0.5)]
+    weight = _raked(donors)
+    for of_joint in donors.T:
+        np.testing.assert_allclose(np.bincount(of_joint, weight), 0.2, rtol=1e-6)
 
 
 def test_times_are_the_campaigns_and_one_per_visit() -> None:

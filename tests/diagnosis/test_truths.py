@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from support import diagnosis_data
 from support.cells import kr270_chain
 from support.diagnosis_data import FAULTS, Fault, campaign, cell, measured, plan
 
@@ -58,9 +59,12 @@ def of_one(found: Confirmation, item: Item) -> Truth:
 
 
 @pytest.mark.parametrize("name", ["encoder_scale:joint3", "payload_error:load"])
-def test_the_errors_expected_are_those_of_fresh_readings(name: str) -> None:
+def test_the_errors_expected_are_those_of_fresh_readings(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Before: the effect that the plain fit could not absorb.  After: what noise left."""
     found, item = confirmation(name)
+    monkeypatch.setattr(diagnosis_data, "REPEATABILITY", 0.0)  # of the fresh readings
     truth = of_one(found, item)
     fresh = found.seen.table
     plain = cell(sigma=SILENT)
@@ -70,8 +74,9 @@ def test_the_errors_expected_are_those_of_fresh_readings(name: str) -> None:
         for fit in (found.plain, found.fitted)
     )
     spread = float(np.sqrt((truth.spread**2).sum(axis=(1, 2)).mean()))
-    assert np.hypot(rms(truth.before), spread) == pytest.approx(before, rel=0.25)
-    assert np.hypot(rms(truth.after), spread) == pytest.approx(after, rel=0.5)
+    assert np.hypot(rms(truth.before), spread) == pytest.approx(before, rel=0.1)
+    # One campaign's few dozen fitted numbers make its error, which scatters by a third.
+    assert 0.6 < after / np.hypot(rms(truth.after), spread) < 1.6
     assert after < 0.5 * before
 
 
