@@ -21,6 +21,7 @@ from worker import Run, Worker
 from world_files import write_world
 
 ANSWER, CELL, PLAN = "diagnosis.json", "extended.toml", "extra.csv"
+MOST_EXTRA = 20  # a third of the campaign
 
 
 def diagnose_world(task: Task, worker: Worker, origin: dict[str, Any]) -> records.Record:
@@ -37,7 +38,7 @@ def diagnose_world(task: Task, worker: Worker, origin: dict[str, Any]) -> record
         arguments = ["-o", ANSWER, "--cell-out", CELL]
         arguments += [a for name in task.without for a in ("--without", name)]
         if task.plan:
-            arguments += ["--plan", PLAN]
+            arguments += ["--plan", PLAN, "--poses", str(MOST_EXTRA)]
         run = worker.diagnose(visible, *arguments)
         answer = read_answer(visible, run)
         record: records.Record = origin | {
