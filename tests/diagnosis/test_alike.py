@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
 from support.diagnosis_data import campaign, dense_noise, used_rows
 
-from elastocal.diagnosis.alike import PLAUSIBLE, distances, signal_of
+from elastocal.diagnosis.alike import PLAUSIBLE, distances, settings_to_try, signal_of
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_set, packed_columns
@@ -72,3 +73,34 @@ def test_a_weight_on_the_second_link_is_near_and_other_joints_are_far() -> None:
     assert min(each, key=lambda key: each[key]) == ("link_mass_error", "link2")
     assert each["link_mass_error", "link2"] < 2.0 < each["gear_eccentricity", "joint3"]
     assert each["gear_eccentricity", "joint5"] > 0.9 * nothing
+
+
+def test_a_rival_with_a_constant_of_the_same_kind_may_have_the_items_own() -> None:
+    """A joint's drift at a time constant between the grid's is imitated by the base's at the same;
+    a large one would be told from it by the grid alone."""
+    model, table = campaign(n=16)
+    hypotheses = [h for h in possible(model, table)[0] if h.name in ("joint_drift", "base_drift")]
+    scene = scene_of(fit_baseline(model, table), hypotheses)
+    known = {(h.name, h.where): h for h in scene.hypotheses}
+    base, joint = known["base_drift", "base"], known["joint_drift", "joint1"]
+    grid = scene.grids["base_drift", "base"].values
+    between = np.sqrt(grid[3] * grid[4])
+    item = Item(joint, between, 0.0)
+    both = fit_set(scene, (item,))
+    size = 5.0
+    large = replace(both, data=replace(both.data, r=both.data.masked(
+        size * packed_columns(scene, item)[:, :, 0]
+    )))  # fmt: skip
+    assert distances(scene, large, 0)[1]["base_drift", "base"] < 1.0
+    assert settings_to_try(scene, base, item)[-1] == pytest.approx(between)
+    np.testing.assert_array_equal(scene.grids["base_drift", "base"].values, grid)
+
+
+def test_a_constant_beyond_the_rivals_bounds_is_not_tried() -> None:
+    model, table = campaign(n=16)
+    known = {(h.name, h.where): h for h in possible(model, table)[0]}
+    scene = scene_of(fit_baseline(model, table), [known["base_drift", "base"]])
+    rival = scene.hypotheses[0]
+    far = Item(known["joint_drift", "joint1"], np.array([2 * rival.settings[0].upper]), 0.0)
+    tried = settings_to_try(scene, rival, far)
+    np.testing.assert_array_equal(tried, scene.grids["base_drift", "base"].values)

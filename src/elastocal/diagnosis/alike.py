@@ -39,11 +39,28 @@ def distances(scene: Scene, chosen: ModelSet, k: int) -> tuple[float, dict[tuple
     for h in scene.hypotheses:
         if h is chosen.items[k].what:
             continue
-        found = grams.of_hypothesis(h)
+        found = grams.of_hypothesis(h, settings_to_try(scene, h, chosen.items[k]))
         s = PLAUSIBLE * float(scales_of(h).max())
         explained = float(found.explained(s).max())
         out[h.name, h.where] = float(np.sqrt(max(whole - explained, 0.0)))
     return float(np.sqrt(max(whole, 0.0))), out
+
+
+def settings_to_try(scene: Scene, rival: Hypothesis, item: Item) -> Array | None:
+    """Settings (G, …) at which a rival may imitate an item: those of the search and, where both
+    have the same kind of constant, the item's own, which was refined between them.  None where
+    the rival has none."""
+    what = item.what
+    if not rival.settings:
+        return None
+    values = scene.grids[rival.name, rival.where].values
+    if not isinstance(what, Hypothesis):
+        return values
+    alike = [s.kind for s in rival.settings] == [s.kind for s in what.settings]
+    within = alike and all(
+        s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True)
+    )
+    return np.vstack([values, item.settings]) if within else values
 
 
 def item_key(item: Item) -> tuple[str, str]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.diagnosis.alike import settings_to_try
 from elastocal.diagnosis.gram import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, packed_columns, with_items
@@ -44,7 +45,11 @@ def best_imitations(
         signal = C @ at.beta[data.X.shape[2] :]
         grams = Grams(scene, data, project(replace(data, r=signal), noise))
         for b, h in others.items():
-            explained = grams.of_hypothesis(h).explained(float(contest.rivals[b].scales.max()))
-            best = scene.grids[h.name, h.where].values[int(np.argmax(explained))]
+            tried = settings_to_try(scene, h, item)
+            assert tried is not None  # it has settings
+            explained = grams.of_hypothesis(h, tried).explained(
+                float(contest.rivals[b].scales.max())
+            )
+            best = tried[int(np.argmax(explained))]
             out[a, b] = replace(contest.rivals[b], settings=best)
     return out
