@@ -144,6 +144,14 @@ def test_a_refused_table_leaves_no_commands_behind(folder):
     assert not commands.exists() and not table.exists()
 
 
+def test_a_refused_table_speaks_of_its_grid_and_not_of_targets(folder):
+    outcome = run(folder, "--table", folder / "table.csv",
+                  "--box", "9000,0,0,9100,100,100", "--grid", "2")  # fmt: skip
+    assert outcome.exit_code == 1
+    assert "8 of 8 grid points are not reached: x_mm, y_mm, z_mm = 9000, 0, 0" in outcome.stderr
+    assert "smaller --box" in outcome.stderr and "target" not in outcome.stderr
+
+
 def test_a_result_of_another_robot_is_refused_although_its_parameters_have_the_same_names(folder):
     path = folder / "result.json"
     result = json.loads(path.read_text())

@@ -108,7 +108,7 @@ def compensate(
     found = search.commands(nominal, every)
     lost = np.flatnonzero(~found.reached)
     if targets.q is None and len(lost):
-        progress(f"other postures for {len(lost)} targets")
+        progress(f"other postures for {len(lost)} points")
         nominal = _other_postures(
             search, chain, in_base, flange, place[0], limits, lost, nominal, seed
         )
