@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +21,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import require
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from elastocal.cell import Array
@@ -141,7 +141,7 @@ def compensate(
             atomic_write_text(path, text)
     if as_json:
         both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
-        typer.echo(json.dumps(both, indent=1, allow_nan=False))
+        typer.echo(json_text(both))
         return
     from elastocal.cli.compensate_files import print_summaries
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +20,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -104,7 +104,7 @@ def export(
         done = run(calibrated, wish, progress)
     atomic_write_text(output, done.text)
     if as_json:
-        typer.echo(json.dumps({"output": str(output)} | done.to_json(), indent=1, allow_nan=False))
+        typer.echo(json_text({"output": str(output)} | done.to_json()))
         return
     _tell(done)
     typer.echo(f"wrote {output}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -21,6 +20,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from elastocal.identification.knowledge import Knowledge
@@ -141,7 +141,7 @@ def identify(
         result = run(model, tables[0], chosen, None if test is None else tables[1], progress)
         write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
-        typer.echo(json.dumps(result.to_json(), indent=1))
+        typer.echo(json_text(result.to_json()))
         return
     from elastocal.report.tables import print_result
 

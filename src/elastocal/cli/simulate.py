@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +18,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError, require
+from elastocal.json_text import json_text
 
 
 @app.command(short_help="What would I measure, if …?")
@@ -82,10 +82,10 @@ def simulate(
     write_measurements(table, output, model.chain.kinds)
     named = dict(zip(model.names, (float(v) for v in x), strict=True))
     if truth is not None:
-        atomic_write_text(truth, json.dumps(named, indent=1) + "\n")
+        atomic_write_text(truth, json_text(named) + "\n")
     if as_json:
         summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
-        typer.echo(json.dumps(summary | {"seed": seed, "truth": named}, indent=1))
+        typer.echo(json_text(summary | {"seed": seed, "truth": named}))
         return
     typer.echo(f"wrote {len(table)} readings of {len(poses)} poses to {output}")
 
