@@ -207,3 +207,10 @@ def test_shortened_expression() -> None:
     c = Combination(terms, "m", 0.0, 1.0, (-2.0, 2.0))
     assert shortened(c) == "a + c + 5.00·d - 2.50·e + 2 more"
     assert shortened(c, 6) == "a - 0.0123·b + c + 5.00·d - 2.50·e + 0.00100·f"
+
+
+def test_a_member_held_off_zero_is_told_as_its_deviation() -> None:
+    terms = {"x": 1.0, "y": 0.5, "z": -1.0, "u": 2.0}
+    c = Combination(terms, "m", 0.0, 1.0, (-2.0, 2.0), {"y": 0.001234567, "z": -3e-7, "u": 0.0})
+    assert c.expression == "x + 0.5·(y - 0.00123457) - (z + 3e-07) + 2·u"
+    assert shortened(c) == "x + 0.500·(y - 0.001235) - (z + 3e-07) + 2.00·u"
