@@ -58,7 +58,7 @@ def diagnose(
     ] = None,
     without: Annotated[
         list[str] | None,
-        typer.Option(help="Take an effect out of the catalogue; repeatable."),
+        typer.Option(metavar="EFFECT", help="Take an effect out of the catalogue; repeatable."),
     ] = None,
     seed: Seed = 0,
     as_json: Json = False,

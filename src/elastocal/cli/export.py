@@ -46,7 +46,10 @@ def export(
     ] = None,
     load: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Force in N at the load point (tracker's axes) to state costs under."),
+        typer.Option(
+            metavar="X Y Z",
+            help="Force in N at the load point (tracker's axes) to state costs under.",
+        ),
     ] = None,
     frames: Annotated[
         bool,

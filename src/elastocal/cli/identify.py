@@ -72,7 +72,9 @@ def identify(
     ] = None,
     fix: Annotated[
         list[str] | None,
-        typer.Option(help="Hold a parameter, place or effect at its start; repeatable."),
+        typer.Option(
+            metavar="NAME", help="Hold a parameter, place or effect at its start; repeatable."
+        ),
     ] = None,
     bounded: Annotated[
         bool, typer.Option("--bounded", help="Keep parameters inside their physical bounds.")

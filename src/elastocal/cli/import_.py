@@ -33,7 +33,7 @@ def import_(
     ] = None,
     preset: Annotated[
         list[str] | None,
-        typer.Option(help=f"One for all files, or one per file: {PRESET_NAMES}."),
+        typer.Option(metavar="NAME", help=f"One for all files, or one per file: {PRESET_NAMES}."),
     ] = None,
     show_preset: Annotated[
         str | None,

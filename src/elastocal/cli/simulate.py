@@ -29,17 +29,22 @@ def simulate(
     output: Annotated[Path, typer.Option("-o", "--output", help="Measurements to write (CSV).")],
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="True value NAME=VALUE in SI units; repeatable."),
+        typer.Option("--set", metavar="NAME=VALUE", help="True value in SI units; repeatable."),
     ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="Write the true values used, as JSON {name: value}.")
     ] = None,
     draw: Annotated[
-        float, typer.Option(help="Draw true values: typical size times this, at random.")
+        float,
+        typer.Option(
+            metavar="FACTOR", help="Draw true values: typical size times this, at random."
+        ),
     ] = 0.0,
     load: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Measure every pose unloaded and under this force in N."),
+        typer.Option(
+            metavar="X Y Z", help="Measure every pose unloaded and under this force in N."
+        ),
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Readings per pose and load state.")] = 1,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Exact readings.")] = False,
