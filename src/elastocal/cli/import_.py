@@ -15,7 +15,7 @@ from elastocal.json_text import json_text
 if TYPE_CHECKING:
     from elastocal.importing.import_files import Imported
 
-PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, kuka, abb, ros"
+PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, kuka, abb, ros"
 
 
 @app.command("import", short_help="How do tracker exports and joint logs become the table?")
