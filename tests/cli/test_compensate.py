@@ -72,6 +72,8 @@ def test_targets_become_commands(folder):
     outcome = run(folder, folder / "targets.csv", "-o", out, "--json")
     assert outcome.exit_code == 0, outcome.stderr
     told = json.loads(outcome.stdout)
+    spoken = run(folder, folder / "targets.csv", "-o", out)
+    assert "Next: run the commands of commands.csv" in spoken.stdout
     assert told["schema"] == "elastocal/compensation/1"
     assert told["n"] == told["reached"] == 3
     assert told["error_before_um"]["rms"] > 1000 > 0.1 > told["error_after_um"]["max"]

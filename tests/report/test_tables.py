@@ -24,6 +24,7 @@ from elastocal.report.tables import (
     print_result,
     summary_lines,
 )
+from elastocal.report.trust import SECTIONS, judgement, without_sections
 from elastocal.report.words import (
     combination_truth,
     inside,
@@ -130,6 +131,16 @@ def test_what_is_not_determined_is_told_in_one_line_each(case: Any) -> None:
     absorbed = [n for n, s in standings(case.result).items() if s == "absorbed"]
     assert "held at nominal (not visible in these data): joint1.compliance" in text
     assert f"held at nominal, absorbed in a combination: {', '.join(absorbed)}" in text
+
+
+def test_the_terminal_ends_with_the_verdict_of_the_page_and_what_to_do(case: Any) -> None:
+    judged = judgement(case.result)
+    words = " ".join(printed(100, case.result).split())
+    assert f"Verdict: {judged.headline}" in words
+    assert judged.steps
+    assert words.count("Next: ") == len(judged.steps)
+    assert all(without_sections(step) in words for step in judged.steps)
+    assert not any(section in words for section in SECTIONS)
 
 
 def test_summary_in_words(case: Any) -> None:

@@ -163,6 +163,11 @@ def compensate(
     print_summaries(console(), content)
     for path in written:
         typer.echo(f"wrote {path}")
+    if output is not None:
+        typer.echo(
+            f"Next: run the commands of {output.name} (its q columns) and measure some of them; the "
+            "tool should lie within two or three std_um of its targets, and the tracker's noise."
+        )
 
 
 def _targets(

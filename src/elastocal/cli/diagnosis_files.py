@@ -67,6 +67,9 @@ def write_diagnosis(
         write_extended_cell(cell, outputs.cell, diagnosis.effects, diagnosis.model_keys)
         added = ", ".join(f"{f.effect}:{f.where}" for f in diagnosis.effects)
         told.append(f"wrote {outputs.cell} with {added or 'no further effect'}")
+        if added:
+            again = shlex.join(["elastocal", "identify", str(outputs.cell), str(data)])
+            told.append(f"to go on: {again} -o result.json")
     return told
 
 

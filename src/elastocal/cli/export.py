@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from elastocal.export.export import Exported
 
 
+WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
+
+
 @app.command(short_help="How do others get the calibrated arm: URDF, MuJoCo, DH table?")
 @reporting_errors
 def export(
@@ -148,6 +151,11 @@ def _tell(done: Exported) -> None:
             done.of_the_measurement,
             f"Of the measurement, not of the arm, and left out: "
             f"{', '.join(done.of_the_measurement)}.",
+        ),
+        (
+            cost.total is not None and cost.total.marker_rms > WORTH_TELLING,
+            "Next: where that much matters, elastocal compensate corrects it with the same cell "
+            "and result.",
         ),
         *((True, f"Note: {warning}.") for warning in done.warnings),
     ):
