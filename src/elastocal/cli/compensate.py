@@ -165,8 +165,8 @@ def compensate(
         typer.echo(f"wrote {path}")
     if output is not None:
         typer.echo(
-            f"Next: run the commands of {output.name} (its q columns) and measure some of them; the "
-            "tool should lie within two or three std_um of its targets, and the tracker's noise."
+            f"Next: run the commands of {output.name} (its q columns) and measure some: the tool "
+            "should lie within two or three std_um, and the tracker's noise, of its targets."
         )
 
 
