@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from elastocal.measurements import Measurements
 
 
+MOST_BYTES = 1_000_000_000  # of a covariance as text: 6000 rows
+
+
 @app.command()
 @reporting_errors
 def identify(
@@ -188,11 +191,13 @@ def _read_knowledge(path: Path | None, physical: bool) -> Knowledge | None:
 def _read_covariance(path: Path) -> Any:
     import numpy as np
 
+    from elastocal.files import open_input, read_text
+
     try:
         if path.suffix == ".npy":
-            return np.load(path, allow_pickle=False)
-        return np.loadtxt(path, delimiter=",", ndmin=2)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; --covariance needs a CSV or .npy matrix") from None
+            with open_input(path, "noise covariance") as handle:
+                return np.load(handle, allow_pickle=False)
+        text = read_text(path, "noise covariance", MOST_BYTES)
+        return np.loadtxt(text.splitlines(), delimiter=",", ndmin=2)
     except ValueError as error:
         raise InputError(f"{path}: not a matrix of numbers ({error})") from None
