@@ -152,12 +152,12 @@ def _tell(done: Exported) -> None:
             f"Of the measurement, not of the arm, and left out: "
             f"{', '.join(done.of_the_measurement)}.",
         ),
+        *((True, f"Note: {warning}.") for warning in done.warnings),
         (
             cost.total is not None and cost.total.marker_rms > WORTH_TELLING,
             "Next: where that much matters, elastocal compensate corrects it with the same cell "
             "and result.",
         ),
-        *((True, f"Note: {warning}.") for warning in done.warnings),
     ):
         if wanted:
             screen.print(printable(sentence), markup=False)
