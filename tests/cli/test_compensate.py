@@ -150,7 +150,8 @@ def test_a_refused_table_speaks_of_its_grid_and_not_of_targets(folder):
     outcome = run(folder, "--table", folder / "table.csv",
                   "--box", "9000,0,0,9100,100,100", "--grid", "2")  # fmt: skip
     assert outcome.exit_code == 1
-    assert "8 of 8 grid points are not reached: x_mm, y_mm, z_mm = 9000, 0, 0" in outcome.stderr
+    told = "8 of 8 grid points (x_mm, y_mm, z_mm) are not reached: (9000, 0, 0) (not reached)"
+    assert told in outcome.stderr
     assert "smaller --box" in outcome.stderr and "target" not in outcome.stderr
 
 

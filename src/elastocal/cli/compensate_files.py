@@ -131,8 +131,9 @@ def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[di
     known = np.all(np.isfinite(found.correction), axis=1).tolist()
     plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
     # A grid point has no line in any file of the user's: it is named by where it lies.
-    named = [f"{', '.join(heads)} = {', '.join(f'{v:.5g}' for v in p + 0.0)}" for p in points]
-    _refuse("--table: %d of %d grid points", named, plain, EXACT, GRID_REMEDIES, partial)
+    named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
+    what = f"--table: %d of %d grid points ({', '.join(heads)})"
+    _refuse(what, named, plain, EXACT, GRID_REMEDIES, partial)
     heads += ["dx_mm", "dy_mm", "dz_mm"]
     columns = [found.correction[:, :3] * 1e3]
     if found.oriented:
