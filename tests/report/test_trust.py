@@ -70,3 +70,10 @@ def test_faulty_readings_are_pointed_at(fine: Any, hostile: Any) -> None:
     steps = judgement(replace(fine, excluded=hostile.result.excluded)).steps
     assert any("beyond the noise" in step for step in steps)
     assert not any("beyond the noise" in step for step in judgement(fine).steps)
+
+
+def test_without_stated_noise_it_asks_for_it(fine: Any) -> None:
+    unstated = replace(fine, noise=fine.noise | {"ratio_to_stated": None})
+    steps = " ".join(judgement(unstated).steps)
+    assert "State the tracker's noise ([tracker] sigma_um" in steps and "diagnose" in steps
+    assert "State the tracker's noise" not in " ".join(judgement(fine).steps)

@@ -113,6 +113,12 @@ def _steps(result: IdentificationResult, fine: bool) -> tuple[str, ...]:
             "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it "
             "finds nothing, the excess is the robot's repeatability, or noise larger than stated."
         )
+    elif result.noise.get("ratio_to_stated") is None:
+        steps.append(
+            "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only "
+            "beside it does the residual say whether the model lacks something. elastocal diagnose "
+            "looks for that either way."
+        )
     held, few = result.heldout_rms, result.heldout_rms > FLATTERS * result.residual_rms
     if not math.isfinite(held) or few:
         steps.append("Measure more poses: elastocal design --augment plans what these data lack.")
