@@ -8,6 +8,7 @@ from typing import Literal
 
 from scipy import stats
 
+from elastocal.identification.advice import MANY
 from elastocal.identification.result import IdentificationResult
 from elastocal.report.noise import LACK_OF_FIT
 from elastocal.report.units import length, significant
@@ -16,6 +17,7 @@ from elastocal.report.words import ABSORBED, INVISIBLE, names_of
 
 Tone = Literal["good", "care", "poor"]
 SECTIONS = FAULTY, OPEN = ("Faulty readings", "What is not determined")  # of the page
+LITTLE = 1.25  # times better than the nominal arm, below which little was gained
 WORSE = 1.5  # test data this much worse than held-out poses lie where the calibration was not made
 
 
@@ -101,6 +103,14 @@ def _doubts(result: IdentificationResult) -> list[str]:
         doubts.append("configurations scatter more than repeats of one explain")
     if math.isfinite(held) and held > FLATTERS * result.residual_rms:
         doubts.append(f"unseen poses are worse than fitted ones ({length(result.residual_rms)})")
+    if result.nominal_rms < LITTLE * held < math.inf:
+        doubts.append("that is hardly better than the nominal arm")
+    fitted = len(result.observations.lead)
+    if len(result.outliers) > MANY * fitted:
+        doubts.append(
+            f"{len(result.outliers)} of the {fitted} readings fitted lie beyond what the noise "
+            "explains"
+        )
     if result.test is not None and result.test.rms > WORSE * held:
         doubts.append(f"test data are off by {length(result.test.rms)} rms")
     return doubts
