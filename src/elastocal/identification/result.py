@@ -72,7 +72,8 @@ class Combination:
         first, *rest = self.terms.items()
         text = first[0]
         for name, factor in rest:
-            size = "" if abs(abs(factor) - 1) < 1e-6 else f"{abs(factor):.4g}·"
+            number = f"{abs(factor):.4g}"
+            size = "" if number == "1" else f"{number}·"
             text += f" {'-' if factor < 0 else '+'} {size}{deviation(name, self.held.get(name))}"
         return text
 
