@@ -294,6 +294,19 @@ def test_fixing_what_is_not_there(campaign):
     refused(2, "joint2.ofset", "joint2.offset", campaign=campaign, extra=("--fix", "joint2.ofset"))
 
 
+@pytest.mark.parametrize("name", ["noise.csv", "noise.npy"])
+def test_covariance_that_is_no_file_of_numbers(campaign, name):
+    path = campaign[0].parent / name
+    extra = ("--covariance", path)
+    refused(2, name, "no such file; check the path of the noise", campaign=campaign, extra=extra)
+    path.mkdir()
+    refused(2, name, "is a directory; give the noise covariance", campaign=campaign, extra=extra)
+    path.rmdir()
+    path.write_bytes("1,2\n3,ä\n".encode("latin-1"))
+    told = "line 2: not UTF-8 text" if name.endswith("csv") else "not a matrix of numbers"
+    refused(2, name, told, campaign=campaign, extra=extra)
+
+
 def test_covariance_of_the_wrong_size(campaign):
     path = campaign[0].parent / "covariance.csv"
     path.write_text("1,0\n0,1\n")

@@ -72,6 +72,8 @@ def test_targets_become_commands(folder):
     outcome = run(folder, folder / "targets.csv", "-o", out, "--json")
     assert outcome.exit_code == 0, outcome.stderr
     told = json.loads(outcome.stdout)
+    spoken = run(folder, folder / "targets.csv", "-o", out)
+    assert "Next: run the commands of commands.csv" in spoken.stdout
     assert told["schema"] == "elastocal/compensation/1"
     assert told["n"] == told["reached"] == 3
     assert told["error_before_um"]["rms"] > 1000 > 0.1 > told["error_after_um"]["max"]
@@ -142,6 +144,15 @@ def test_a_refused_table_leaves_no_commands_behind(folder):
                   "--box", "9000,0,0,9100,100,100", "--grid", "2")  # fmt: skip
     assert outcome.exit_code == 1 and "Nothing was written" in outcome.stderr
     assert not commands.exists() and not table.exists()
+
+
+def test_a_refused_table_speaks_of_its_grid_and_not_of_targets(folder):
+    outcome = run(folder, "--table", folder / "table.csv",
+                  "--box", "9000,0,0,9100,100,100", "--grid", "2")  # fmt: skip
+    assert outcome.exit_code == 1
+    told = "8 of 8 grid points (x_mm, y_mm, z_mm) are not reached: (9000, 0, 0) (not reached)"
+    assert told in outcome.stderr
+    assert "smaller --box" in outcome.stderr and "target" not in outcome.stderr
 
 
 def test_a_result_of_another_robot_is_refused_although_its_parameters_have_the_same_names(folder):

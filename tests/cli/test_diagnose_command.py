@@ -112,6 +112,7 @@ def test_identify_takes_the_cell_that_diagnose_writes(campaign, engine):
     new = cell.parent / "next" / "cell.toml"
     told = run(campaign, "--cell-out", new)
     assert "gear_eccentricity:joint2" in told.stdout
+    assert f"to go on: elastocal identify {new} {data} -o result.json" in told.stdout
     result = CliRunner().invoke(app, ["identify", str(new), str(data), "--json", "-q"])
     assert result.exit_code == 0, result.stderr
     names = {p["name"] for p in json.loads(result.stdout)["parameters"]}
@@ -129,7 +130,7 @@ def test_without_a_finding_the_model_stays_as_it_is(campaign, engine):
     engine.answer = VERDICTS["nothing"]
     new = campaign[0].parent / "new.toml"
     told = run(campaign, "--cell-out", new)
-    assert "with no further effect" in told.stdout
+    assert "with no further effect" in told.stdout and "to go on" not in told.stdout
     assert read_cell(new).model == read_cell(campaign[0]).model
 
 

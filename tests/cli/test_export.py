@@ -43,8 +43,10 @@ def test_the_ending_tells_the_format(campaign, tmp_path: Path, name: str, starts
     assert f"wrote {output}" in result.output
     if name not in ("a.xml", "a.mjcf"):
         assert "joint compliance" in result.output and "(0, 0, -200) N" in result.output
+        assert "Next: where that much matters, elastocal compensate" in result.output
     else:
         assert "The MJCF holds all of the calibrated model." in result.output
+        assert "Next:" not in result.output
         assert "[model] link_gravity" in result.output  # no markup swallows it
 
 

@@ -14,7 +14,7 @@ import pytest
 from support.exports import write_result
 from support.robots import KR270
 
-PROGRAM = "import sys; from elastocal.cli import main; sys.argv[0] = 'elastocal'; main()"
+PROGRAM = "import sys; from elastocal.__main__ import main; sys.argv[0] = 'elastocal'; main()"
 # What a shell's completion script sets, for "elastocal exp".
 ASKED = {
     "bash": {"COMP_WORDS": "elastocal exp", "COMP_CWORD": "1"},
@@ -91,3 +91,21 @@ def test_ctrl_c_ends_an_export_cleanly(tmp_path: Path) -> None:
     assert process.returncode == 130
     assert told.endswith(b"elastocal: interrupted\n") and b"Traceback" not in told
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("module", ["typer", "elastocal.cli.study", "elastocal.manipulator"])
+def test_ctrl_c_while_the_command_is_loaded_ends_it_with_one_line(module: str) -> None:
+    pressed = f"""
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+class Pressing:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Pressing())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", pressed + PROGRAM, "demo"], capture_output=True, text=True
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "elastocal: interrupted\n"

@@ -46,6 +46,14 @@ def test_help_lists_every_verb_in_the_order_of_the_work_with_a_whole_sentence():
         assert len(line.split()) > 3 and not line.endswith("..."), line
 
 
+@pytest.mark.parametrize("verb", VERBS)
+def test_no_help_text_shows_what_only_a_programmer_knows(verb: str) -> None:
+    options = run(verb, "--help").stdout.partition("Options:")[2]
+    assert "list[" not in options and "float,float" not in options
+    assert all(line.split()[0].startswith("--frames") for line in options.splitlines()
+               if " / " in line.partition("  ")[2])  # fmt: skip
+
+
 @pytest.mark.parametrize("verb", [SIMULATE, IDENTIFY, COMPENSATE, EXPORT, DESIGN, DIAGNOSE])
 def test_a_negative_seed_is_a_usage_error(folder: Path, verb: tuple[str, ...]) -> None:
     outcome = run(*verb, "--seed", "-1")

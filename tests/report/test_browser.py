@@ -238,6 +238,31 @@ def test_dark_print_and_narrow(opened: dict[str, Opened], kind: str) -> None:
         page.set_viewport_size({"width": 1100, "height": 800})
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_page_breaks_cut_no_short_table_and_heads_are_repeated(
+    opened: dict[str, Opened], kind: str
+) -> None:
+    page = opened[kind].page
+    try:
+        page.emulate_media(media="print")
+        page.set_viewport_size({"width": 718, "height": 1000})  # A4 without margins of 1 cm
+        tables = page.locator("table.data").all()
+        lengths = [table.locator("tbody tr").count() for table in tables]
+        for table, rows in zip(tables, lengths, strict=True):
+            expected = "avoid" if rows <= 12 else "auto"
+            assert table.evaluate("e => getComputedStyle(e).breakInside") == expected
+        assert min(lengths) <= 12
+        # A button's own box is not painted where Chromium repeats a head.
+        shown = page.evaluate(
+            "[...document.querySelectorAll('button.sort')].map(e => getComputedStyle(e).display)"
+        )
+        assert set(shown) == {"contents"}
+        assert page.evaluate("document.documentElement.scrollWidth") <= 718
+    finally:
+        page.emulate_media(media="screen")
+        page.set_viewport_size({"width": 1100, "height": 800})
+
+
 def paper(page: Any) -> float:
     """Luminance of the page's background, 0 to 1."""
     text = page.evaluate("getComputedStyle(document.body).backgroundColor")

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -179,3 +180,52 @@ def test_importing_a_result_does_not_import_its_views():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+# --- commands ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def commands():
+    """Three targets, one of them out of reach, whose names are markup."""
+    from support.cells import kr270_cell
+    from support.commands import calibrated, erring
+
+    from elastocal.compensation.compensate import compensate
+    from elastocal.compensation.point import tool_point
+    from elastocal.compensation.targets import targets_at
+    from elastocal.manipulator.model import Model
+
+    cell = kr270_cell(("joint_offset", "joint_compliance"))
+    x = erring(Model(kr270_chain(), cell), np.random.default_rng(1), 0.5)
+    arm = calibrated(kr270_chain(), cell, x, std=0.01)
+    places = np.array([[1.8, 0.3, 1.5], [9.0, 0.0, 0.0], [1.8, -0.3, 1.5]])
+    targets = targets_at("targets.csv", places, None, "base", np.array([0, 0, -2600.0]))
+    named = replace(targets.table, configuration_labels=("<b>1", "NA", "3"))
+    return compensate(arm, replace(targets, table=named), tool_point(cell, "M1"))
+
+
+def test_commands_as_a_frame_are_those_of_the_file(commands):
+    frame = commands.to_dataframe()
+    assert list(frame["configuration"]) == ["<b>1", "NA", "3"]
+    assert list(frame["status"]) == ["reached", "not reached", "reached"]
+    q = frame[[f"q{k}_deg" for k in range(1, 7)]].to_numpy()
+    np.testing.assert_allclose(q[[0, 2]], np.degrees(commands.q[[0, 2]]), rtol=0, atol=1e-9)
+    assert np.isnan(q[1]).all()
+    np.testing.assert_allclose(frame["std_um"][0], commands.uncertainty.std[0] * 1e6, rtol=1e-3)
+
+
+def test_commands_as_html_say_what_is_reached_and_escape_names(commands):
+    page = parsed(commands)
+    words = " ".join(page.words)
+    assert "2 of 3 targets reached by the marker M1" in words
+    assert "<b>1" in words
+    assert "not reached" in words and "nan" not in words
+
+
+def test_figures_of_commands_hold_every_target_reached(commands):
+    reached = commands.before[commands.reached] * 1e6
+    np.testing.assert_allclose(commands.plot(interactive=True).data[0].x, reached)
+    std = commands.uncertainty.std[commands.reached] * 1e6
+    np.testing.assert_allclose(commands.plot("uncertainty", interactive=True).data[0].x, std)
+    commands.plot("errors").canvas.draw()

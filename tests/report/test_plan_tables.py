@@ -62,10 +62,29 @@ def test_every_key_figure_is_told_within_the_width(plan, width):
 
 
 def test_without_a_bound_it_says_why(plan):
-    other = replace(plan, criterion="O2", unit="", certificate=Certificate(30, None, None))
+    other = replace(
+        plan,
+        criterion="O2",
+        unit="",
+        certificate=Certificate(30, None, None),
+        chance=replace(plan.chance, efficiency=None),
+    )
     lines = [text for label, text in plan_lines(other) if label == "Certificate"]
     assert lines == ["none: O2 is not convex, so no bound is known."]
     assert "efficiency" not in words(printed(other, 80))
+
+
+def test_what_chance_would_have_given(plan):
+    def told(**changes) -> str:
+        other = replace(plan, chance=replace(plan.chance, **changes))
+        return dict(plan_lines(other))["Chance"]
+
+    text = told(median=9.876, best=8.0, worst=None, efficiency=0.254, determined=18, drawn=20)
+    assert "median of 20 random plans" in text and "ρ₀ = 9.876 µm (best 8, worst no value)" in text
+    assert "efficiency of 0.25 against this plan" in text
+    assert "2 of 20 random plans of as many feasible poses leave parameters open" in text
+    text = told(median=None, best=8.0, worst=None, efficiency=None, determined=3, drawn=20)
+    assert text.startswith("17 of 20 random plans") and "median" not in text
 
 
 def test_a_pose_that_carries_a_parameter_alone_says_so(plan):

@@ -24,6 +24,7 @@ from elastocal.report.tables import (
     print_result,
     summary_lines,
 )
+from elastocal.report.trust import SECTIONS, judgement, without_sections
 from elastocal.report.words import (
     combination_truth,
     inside,
@@ -132,6 +133,16 @@ def test_what_is_not_determined_is_told_in_one_line_each(case: Any) -> None:
     assert f"held at nominal, absorbed in a combination: {', '.join(absorbed)}" in text
 
 
+def test_the_terminal_ends_with_the_verdict_of_the_page_and_what_to_do(case: Any) -> None:
+    judged = judgement(case.result)
+    words = " ".join(printed(100, case.result).split())
+    assert f"Verdict: {judged.headline}" in words
+    assert judged.steps
+    assert words.count("Next: ") == len(judged.steps)
+    assert all(without_sections(step) in words for step in judged.steps)
+    assert not any(section in words for section in SECTIONS)
+
+
 def test_summary_in_words(case: Any) -> None:
     lines = summary_lines(case.result, case.truth)
     text = "\n".join(lines)
@@ -207,3 +218,10 @@ def test_shortened_expression() -> None:
     c = Combination(terms, "m", 0.0, 1.0, (-2.0, 2.0))
     assert shortened(c) == "a + c + 5.00·d - 2.50·e + 2 more"
     assert shortened(c, 6) == "a - 0.0123·b + c + 5.00·d - 2.50·e + 0.00100·f"
+
+
+def test_a_member_held_off_zero_is_told_as_its_deviation() -> None:
+    terms = {"x": 1.0, "y": 0.5, "z": -1.0, "u": 2.0}
+    c = Combination(terms, "m", 0.0, 1.0, (-2.0, 2.0), {"y": 0.001234567, "z": -3e-7, "u": 0.0})
+    assert c.expression == "x + 0.5·(y - 0.00123457) - (z + 3e-07) + 2·u"
+    assert shortened(c) == "x + 0.500·(y - 0.001235) - (z + 3e-07) + 2.00·u"

@@ -37,6 +37,25 @@ class InOrder(TyperGroup):
         known = super().list_commands(ctx)
         return sorted(known, key=lambda name: VERBS.index(name) if name in VERBS else len(VERBS))
 
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """As inherited; Ctrl-C is told of, which typer passes over."""
+        with _telling_of_ctrl_c():
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: Any) -> Any:
+        """As inherited; Ctrl-C before the command itself begins is told of."""
+        with _telling_of_ctrl_c():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _telling_of_ctrl_c() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        _complain("interrupted")
+        raise typer.Exit(130) from None
+
 
 app = typer.Typer(
     cls=InOrder,
@@ -58,13 +77,11 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
         try:
-            command(*args, **kwargs)
+            with _telling_of_ctrl_c():
+                command(*args, **kwargs)
         except ElastocalError as error:
             _complain(str(error))
             raise typer.Exit(error.exit_code) from None
-        except KeyboardInterrupt:
-            _complain("interrupted")
-            raise typer.Exit(130) from None
         except BrokenPipeError:
             # The reader of stdout went away (… | head): nothing is wrong with the input.
             sys.stderr.close()

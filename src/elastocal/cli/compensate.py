@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +21,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import require
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from elastocal.cell import Array
@@ -44,22 +44,31 @@ def compensate(
         Path | None, typer.Option("-o", "--output", help="Commands to write (CSV).")
     ] = None,
     target: Annotated[
-        str | None, typer.Option(help="One target instead: x,y,z[,rx,ry,rz] in mm and degrees.")
+        str | None,
+        typer.Option(metavar="X,Y,Z[,RX,RY,RZ]", help="One target instead, in mm and degrees."),
     ] = None,
     frame: Annotated[
         str, typer.Option(help="Frame of targets and forces: base (as identified) or tracker.")
     ] = "base",
     point: Annotated[
         str | None,
-        typer.Option(help="Point of the tool: a marker, or x,y,z in m in the flange frame."),
+        typer.Option(
+            metavar="POINT",
+            help="Point of the tool: a marker, or x,y,z in m in the flange frame.",
+        ),
     ] = None,
     load: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Force in N at the load point where the table states none."),
+        typer.Option(
+            metavar="X Y Z", help="Force in N at the load point where the table states none."
+        ),
     ] = None,
     near: Annotated[
         str | None,
-        typer.Option(help="Joints in degrees (mm where prismatic) whose posture to begin near."),
+        typer.Option(
+            metavar="Q1,Q2,…",
+            help="Joints in degrees (mm where prismatic) whose posture to begin near.",
+        ),
     ] = None,
     partial: Annotated[
         bool, typer.Option("--partial", help="Write what is reached; leave other rows empty.")
@@ -68,13 +77,19 @@ def compensate(
         Path | None, typer.Option(help="Correction table to write (CSV), over --grid.")
     ] = None,
     grid: Annotated[
-        str, typer.Option(help="Levels per joint (or of x, y, z): 5 or 9,7,7,3,3,1.")
+        str,
+        typer.Option(metavar="N[,N…]", help="Levels per joint (or of x, y, z): 5 or 9,7,7,3,3,1."),
     ] = "5",
     box: Annotated[
-        str | None, typer.Option(help="Grid over x0,y0,z0,x1,y1,z1 in mm, base frame, not joints.")
+        str | None,
+        typer.Option(
+            metavar="X0,Y0,Z0,X1,Y1,Z1",
+            help="Grid over this box in mm in the base frame, not over the joints.",
+        ),
     ] = None,
     rotation: Annotated[
-        str | None, typer.Option(help="Rotation vector of the tool in --box: rx,ry,rz in degrees.")
+        str | None,
+        typer.Option(metavar="RX,RY,RZ", help="Rotation vector of the tool in --box, in degrees."),
     ] = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -141,13 +156,18 @@ def compensate(
             atomic_write_text(path, text)
     if as_json:
         both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
-        typer.echo(json.dumps(both, indent=1, allow_nan=False))
+        typer.echo(json_text(both))
         return
     from elastocal.cli.compensate_files import print_summaries
 
     print_summaries(console(), content)
     for path in written:
         typer.echo(f"wrote {path}")
+    if output is not None:
+        typer.echo(
+            f"Next: run the commands of {output.name} (its q columns) and measure some: the tool "
+            "should lie within two or three std_um, and the tracker's noise, of its targets."
+        )
 
 
 def _targets(

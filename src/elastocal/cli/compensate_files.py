@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from elastocal.errors import InputError, InsufficientDataError
@@ -22,6 +23,12 @@ REMEDIES = {
     "not reached": "out of reach, or beside a singular posture: move the target, or give q1_deg … "
     "of another posture",
     "no equilibrium": "no static equilibrium under this load: check force_*_N",
+}
+GRID_REMEDIES = {
+    "limit": "joint limits prevent it: widen [limits], or give a smaller --box or another --near",
+    "not reached": "out of reach, or beside a singular posture: give a smaller --box, another "
+    "--rotation or another --near",
+    "no equilibrium": "no static equilibrium under this load: check --load",
 }
 NAMED = 8  # rows that a message names
 
@@ -80,21 +87,31 @@ def commands_of(
     """
     from elastocal.compensation.commands_file import commands_csv, summary
 
-    _refuse(found.targets.table.source, found.targets.table.row, found.status, "reached", partial)
+    table = found.targets.table
+    rows = [f"line {line}" for line in table.row]
+    _refuse(f"{table.source}: %d of %d targets", rows, found.status, "reached", REMEDIES, partial)
     kinds = arm.model.chain.kinds
     return summary(found, kinds, commands=listed), commands_csv(found, kinds)
 
 
-def _refuse(source: str, lines: Any, status: tuple[str, ...], good: str, partial: bool) -> None:
-    lost = [(int(line), s) for line, s in zip(lines, status, strict=True) if s != good]
+def _refuse(
+    what: str,
+    rows: Sequence[str],
+    status: Sequence[str],
+    good: str,
+    remedies: Mapping[str, str],
+    partial: bool,
+) -> None:
+    """Raise InsufficientDataError for rows of another status than `good`; `what` counts them."""
+    lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]
     if not lost or partial:
         return
-    rows = ", ".join(f"line {line} ({s})" for line, s in lost[:NAMED])
+    named = ", ".join(f"{row} ({s})" for row, s in lost[:NAMED])
     more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
     kinds = dict.fromkeys(s for _, s in lost)
     raise InsufficientDataError(
-        f"{source}: {len(lost)} of {len(status)} targets are not reached: {rows}{more}. "
-        + "; ".join(f"{kind}: {REMEDIES[kind]}" for kind in kinds)
+        f"{what % (len(lost), len(status))} are not reached: {named}{more}. "
+        + "; ".join(f"{kind}: {remedies[kind]}" for kind in kinds)
         + ". Nothing was written; --partial writes the others"
     )
 
@@ -106,14 +123,17 @@ def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[di
     from elastocal.compensation.commands_file import in_file_units, joint_columns, spread
     from elastocal.compensation.table import EXACT, FIRST_ORDER
 
-    known = np.all(np.isfinite(found.correction), axis=1).tolist()
-    plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
-    _refuse("--table", range(1, len(plain) + 1), plain, EXACT, partial)
     kinds = arm.model.chain.kinds
     if found.grid.joints:
         heads, points = joint_columns(kinds), in_file_units(found.points, kinds)
     else:
         heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
+    known = np.all(np.isfinite(found.correction), axis=1).tolist()
+    plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
+    # A grid point has no line in any file of the user's: it is named by where it lies.
+    named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
+    what = f"--table: %d of %d grid points ({', '.join(heads)})"
+    _refuse(what, named, plain, EXACT, GRID_REMEDIES, partial)
     heads += ["dx_mm", "dy_mm", "dz_mm"]
     columns = [found.correction[:, :3] * 1e3]
     if found.oriented:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from elastocal.cli.app import Json, Seed, app, console, progress_line, reporting_errors
+from elastocal.json_text import json_text
 
 
 @app.command(short_help="See a KR 270 simulated and calibrated (Klimchik et al. 2013).")
@@ -37,7 +37,7 @@ def demo(
             done.published,
         )  # fmt: skip
     if as_json:
-        typer.echo(json.dumps(done.result.to_json() | {"truth": done.truth}, indent=1))
+        typer.echo(json_text(done.result.to_json() | {"truth": done.truth}))
         return
     from elastocal.report.tables import print_result
 

@@ -49,11 +49,13 @@ def design(
     target: Annotated[
         float | None,
         typer.Option(
-            help="Find the smallest number of poses that reaches this, in µm (test_pose, I, G)."
+            metavar="µm",
+            help="Find the smallest number of poses that reaches this, in µm (test_pose, I, G).",
         ),
     ] = None,
     curve: Annotated[
-        str | None, typer.Option(help="Compare numbers of poses, as in 10,15,20,30.")
+        str | None,
+        typer.Option(metavar="N,N,…", help="Compare numbers of poses, as in 10,15,20,30."),
     ] = None,
     augment: Annotated[
         Path | None, typer.Option(help="Measurements already done (CSV), which the plan adds to.")
@@ -63,7 +65,9 @@ def design(
     ] = None,
     fix: Annotated[
         list[str] | None,
-        typer.Option(help="Hold a parameter, place or effect as known; repeatable."),
+        typer.Option(
+            metavar="NAME", help="Hold a parameter, place or effect as known; repeatable."
+        ),
     ] = None,
     candidates: Annotated[
         int | None, typer.Option(min=1, help="Feasible candidates to choose from, over all levels.")
@@ -71,7 +75,10 @@ def design(
     effort: Annotated[str, typer.Option(help="quick, normal or thorough.")] = "normal",
     program: Annotated[
         list[Path] | None,
-        typer.Option(help="Robot program to write: NAME.src (KRL), NAME.script (URScript)."),
+        typer.Option(
+            metavar="FILE",
+            help="Robot program to write: NAME.src (KRL), NAME.script (URScript); repeatable.",
+        ),
     ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="Picture of the poses to write (PNG, SVG).")

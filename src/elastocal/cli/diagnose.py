@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,6 +22,7 @@ from elastocal.cli.diagnosis_files import Outputs, write_diagnosis
 from elastocal.cli.identify import load_inputs
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import require
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -58,7 +58,7 @@ def diagnose(
     ] = None,
     without: Annotated[
         list[str] | None,
-        typer.Option(help="Take an effect out of the catalogue; repeatable."),
+        typer.Option(metavar="EFFECT", help="Take an effect out of the catalogue; repeatable."),
     ] = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -94,7 +94,7 @@ def diagnose(
         content = publish(found, model, str(data))
         told = write_diagnosis(outputs, found, content, model, cell, data, seed)
     if as_json:
-        typer.echo(json.dumps(content, indent=1, allow_nan=False))
+        typer.echo(json_text(content))
         return
     from elastocal.report.diagnosis_tables import print_diagnosis
 

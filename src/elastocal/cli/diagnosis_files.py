@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from collections import Counter
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from elastocal.files import atomic_write_text
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.result import Diagnosis
@@ -48,7 +48,7 @@ def write_diagnosis(
     """
     told = []
     if outputs.json is not None:
-        atomic_write_text(outputs.json, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        atomic_write_text(outputs.json, json_text(content) + "\n")
         told.append(f"wrote {outputs.json}")
     if outputs.report is not None:
         from elastocal.report.diagnosis_page import write_diagnosis_report
@@ -67,6 +67,9 @@ def write_diagnosis(
         write_extended_cell(cell, outputs.cell, diagnosis.effects, diagnosis.model_keys)
         added = ", ".join(f"{f.effect}:{f.where}" for f in diagnosis.effects)
         told.append(f"wrote {outputs.cell} with {added or 'no further effect'}")
+        if added:
+            again = shlex.join(["elastocal", "identify", str(outputs.cell), str(data)])
+            told.append(f"to go on: {again} -o result.json")
     return told
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,12 +20,16 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from elastocal.export.cost import Cost
     from elastocal.export.export import Exported
+
+
+WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
 
 
 @app.command(short_help="How do others get the calibrated arm: URDF, MuJoCo, DH table?")
@@ -46,7 +49,10 @@ def export(
     ] = None,
     load: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Force in N at the load point (tracker's axes) to state costs under."),
+        typer.Option(
+            metavar="X Y Z",
+            help="Force in N at the load point (tracker's axes) to state costs under.",
+        ),
     ] = None,
     frames: Annotated[
         bool,
@@ -104,7 +110,7 @@ def export(
         done = run(calibrated, wish, progress)
     atomic_write_text(output, done.text)
     if as_json:
-        typer.echo(json.dumps({"output": str(output)} | done.to_json(), indent=1, allow_nan=False))
+        typer.echo(json_text({"output": str(output)} | done.to_json()))
         return
     _tell(done)
     typer.echo(f"wrote {output}")
@@ -147,6 +153,11 @@ def _tell(done: Exported) -> None:
             f"{', '.join(done.of_the_measurement)}.",
         ),
         *((True, f"Note: {warning}.") for warning in done.warnings),
+        (
+            cost.total is not None and cost.total.marker_rms > WORTH_TELLING,
+            "Next: where that much matters, elastocal compensate corrects it with the same cell "
+            "and result.",
+        ),
     ):
         if wanted:
             screen.print(printable(sentence), markup=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -21,11 +20,15 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from elastocal.identification.knowledge import Knowledge
     from elastocal.manipulator.model import Model
     from elastocal.measurements import Measurements
+
+
+MOST_BYTES = 1_000_000_000  # of a covariance as text: 6000 rows
 
 
 @app.command()
@@ -72,7 +75,9 @@ def identify(
     ] = None,
     fix: Annotated[
         list[str] | None,
-        typer.Option(help="Hold a parameter, place or effect at its start; repeatable."),
+        typer.Option(
+            metavar="NAME", help="Hold a parameter, place or effect at its start; repeatable."
+        ),
     ] = None,
     bounded: Annotated[
         bool, typer.Option("--bounded", help="Keep parameters inside their physical bounds.")
@@ -141,7 +146,7 @@ def identify(
         result = run(model, tables[0], chosen, None if test is None else tables[1], progress)
         write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
-        typer.echo(json.dumps(result.to_json(), indent=1))
+        typer.echo(json_text(result.to_json()))
         return
     from elastocal.report.tables import print_result
 
@@ -186,11 +191,13 @@ def _read_knowledge(path: Path | None, physical: bool) -> Knowledge | None:
 def _read_covariance(path: Path) -> Any:
     import numpy as np
 
+    from elastocal.files import open_input, read_text
+
     try:
         if path.suffix == ".npy":
-            return np.load(path, allow_pickle=False)
-        return np.loadtxt(path, delimiter=",", ndmin=2)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; --covariance needs a CSV or .npy matrix") from None
+            with open_input(path, "noise covariance") as handle:
+                return np.load(handle, allow_pickle=False)
+        text = read_text(path, "noise covariance", MOST_BYTES)
+        return np.loadtxt(text.splitlines(), delimiter=",", ndmin=2)
     except ValueError as error:
         raise InputError(f"{path}: not a matrix of numbers ({error})") from None

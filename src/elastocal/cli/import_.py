@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,11 +10,12 @@ import typer
 from elastocal.cli.app import Json, app, check_outputs, console, reporting_errors
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError, require
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from elastocal.importing.import_files import Imported
 
-PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, kuka, abb, ros"
+PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, kuka, abb, ros"
 
 
 @app.command("import", short_help="How do tracker exports and joint logs become the table?")
@@ -33,7 +33,7 @@ def import_(
     ] = None,
     preset: Annotated[
         list[str] | None,
-        typer.Option(help=f"One for all files, or one per file: {PRESET_NAMES}."),
+        typer.Option(metavar="NAME", help=f"One for all files, or one per file: {PRESET_NAMES}."),
     ] = None,
     show_preset: Annotated[
         str | None,
@@ -80,7 +80,7 @@ def import_(
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
     found = _import(paths, read, cell, output)
     if as_json:
-        typer.echo(json.dumps(summary(found, output), indent=1, allow_nan=False))
+        typer.echo(json_text(summary(found, output)))
     elif preview:
         from elastocal.cli.import_preview import print_preview
 

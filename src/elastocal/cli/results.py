@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import shlex
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from elastocal.files import atomic_write_text
 from elastocal.identification.result import IdentificationResult
+from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
     from elastocal.report.html import Published
@@ -33,7 +33,7 @@ def write_results(
     beside the estimates.
     """
     if output is not None:
-        atomic_write_text(output, json.dumps(result.to_json(), indent=1) + "\n")
+        atomic_write_text(output, json_text(result.to_json()) + "\n")
     if residuals is not None:
         rows = result.residual_table()
         text = io.StringIO()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +18,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError, require
+from elastocal.json_text import json_text
 
 
 @app.command(short_help="What would I measure, if …?")
@@ -29,17 +29,22 @@ def simulate(
     output: Annotated[Path, typer.Option("-o", "--output", help="Measurements to write (CSV).")],
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="True value NAME=VALUE in SI units; repeatable."),
+        typer.Option("--set", metavar="NAME=VALUE", help="True value in SI units; repeatable."),
     ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="Write the true values used, as JSON {name: value}.")
     ] = None,
     draw: Annotated[
-        float, typer.Option(help="Draw true values: typical size times this, at random.")
+        float,
+        typer.Option(
+            metavar="FACTOR", help="Draw true values: typical size times this, at random."
+        ),
     ] = 0.0,
     load: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Measure every pose unloaded and under this force in N."),
+        typer.Option(
+            metavar="X Y Z", help="Measure every pose unloaded and under this force in N."
+        ),
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Readings per pose and load state.")] = 1,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Exact readings.")] = False,
@@ -82,10 +87,10 @@ def simulate(
     write_measurements(table, output, model.chain.kinds)
     named = dict(zip(model.names, (float(v) for v in x), strict=True))
     if truth is not None:
-        atomic_write_text(truth, json.dumps(named, indent=1) + "\n")
+        atomic_write_text(truth, json_text(named) + "\n")
     if as_json:
         summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
-        typer.echo(json.dumps(summary | {"seed": seed, "truth": named}, indent=1))
+        typer.echo(json_text(summary | {"seed": seed, "truth": named}))
         return
     typer.echo(f"wrote {len(table)} readings of {len(poses)} poses to {output}")
 

@@ -27,26 +27,29 @@ def study(
     ] = None,
     cluster: Annotated[
         str | None,
-        typer.Option(help="Dask scheduler, as in tcp://HOST:8786, or 'config' for Dask's own."),
+        typer.Option(
+            metavar="ADDRESS",
+            help="Dask scheduler, as in tcp://HOST:8786, or 'config' for Dask's own.",
+        ),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed; default: that of study.toml.")
     ] = None,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Option KEY=VALUE of the study; repeatable."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Option of the study; repeatable."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Results; default: FOLDER/results.")
+        Path | None,
+        typer.Option("-o", "--output", help="Folder of the results; default: FOLDER/results."),
     ] = None,
-    progress: Annotated[
-        bool,
-        typer.Option(
-            "--progress/--no-progress", " /--quiet", " /-q", help="Show rate and time left."
-        ),
-    ] = True,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", "--no-progress", help="No progress.")
+    ] = False,
     only: Annotated[int | None, typer.Option(min=1, help="Run the first N tasks alone.")] = None,
-    restart: Annotated[bool, typer.Option(help="Discard the results that are there.")] = False,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Discard the results that are there.")
+    ] = False,
     retry_failed: Annotated[
         bool, typer.Option("--retry-failed", help="Run tasks that failed again.")
     ] = False,
@@ -70,7 +73,7 @@ def study(
     with opened(results) as dataset:
         if restart:
             dataset.clear()
-        with Stop() as stop, StudyProgress(progress) as shown:
+        with Stop() as stop, StudyProgress(not quiet) as shown:
             runner = _runner(prepared, jobs, cluster, stop, shown.tell)
             ending = conduct(prepared, dataset, runner, stop, shown, only, retry_failed)
         typer.echo(_told(ending, results))

@@ -24,13 +24,14 @@ from elastocal.manipulator.inverse_kinematics import inverse_kinematics
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.reaching import Reaching
 from elastocal.manipulator.tape import Tape
+from elastocal.notebook import ForNotebooks
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
 
 
 @dataclass(frozen=True)
-class Compensation:
+class Compensation(ForNotebooks):
     """Commands for n targets.
 
     `q` and `nominal` (n, joints) rad or m; `before` and `after` (n,) m: predicted distance of the
@@ -108,7 +109,7 @@ def compensate(
     found = search.commands(nominal, every)
     lost = np.flatnonzero(~found.reached)
     if targets.q is None and len(lost):
-        progress(f"other postures for {len(lost)} targets")
+        progress(f"other postures for {len(lost)} points")
         nominal = _other_postures(
             search, chain, in_base, flange, place[0], limits, lost, nominal, seed
         )

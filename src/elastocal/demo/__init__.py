@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
@@ -11,10 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from elastocal.errors import InputError
+from elastocal.files import atomic_write_text
 from elastocal.identification.result import IdentificationResult
 
 LOAD_N = (0.0, 0.0, -2600.0)  # 265 kg: the paper hung 250 to 280 kg
 REPEATS = 6
+MARK = "table3_compliances.csv"  # by which an earlier demo's folder is known
+MADE = ("data.csv", "result.json", "report.html")
 SEED = 2013
 UNSEEN_COMPLIANCE = 0.35e-6  # rad/(N m); joint 1, which a vertical load cannot show
 
@@ -38,7 +41,8 @@ def run_demo(
 
     Writes cell, robot, plan and data into `folder`, so that every step can be repeated by hand.
     Table 1 states the spread of deflections, the difference of two readings, so each reading
-    gets 1/√2 of it.
+    gets 1/√2 of it.  Raises InputError where the folder cannot be written, or holds files of the
+    same names that are not the example's.
     """
     from elastocal.cell_reader import read_cell
     from elastocal.identification.identify import identify
@@ -64,12 +68,30 @@ def run_demo(
 
 
 def _copy_example(folder: Path) -> tuple[Path, Path]:
-    folder.mkdir(parents=True, exist_ok=True)
+    """Copy the example's files; InputError where that is impossible or would lose others' work."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise InputError(f"{folder}: is or lies in a file; name a folder for the demo") from None
+    except PermissionError:
+        raise InputError(f"{folder}: no permission to make this folder; name another") from None
     with as_file(files("elastocal.demo")) as source:
-        for path in source.iterdir():
-            if path.suffix in (".toml", ".urdf", ".csv"):
-                shutil.copyfile(path, folder / path.name)
+        own = [path for path in source.iterdir() if path.suffix in (".toml", ".urdf", ".csv")]
+        _check_own(folder, [path.name for path in own])
+        for path in own:
+            atomic_write_text(folder / path.name, path.read_text(encoding="utf-8"))
     return folder / "cell.toml", folder / "plan.csv"
+
+
+def _check_own(folder: Path, copied: list[str]) -> None:
+    """Refuse a folder with somebody's own campaign: one has a cell and data, but not Table 3."""
+    if (folder / MARK).is_file():
+        return
+    for name in (*copied, *MADE):
+        if (folder / name).exists():
+            raise InputError(
+                f"{folder / name} is not the demo's and would be written over; name another folder"
+            )
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -88,7 +110,7 @@ def published_compliances(folder: Path) -> tuple[dict[str, float], dict[str, tup
     """True values in rad/(N m), and the published OLS value with its ±3σ, by parameter name."""
     truth = {"joint1.compliance": UNSEEN_COMPLIANCE}
     published = {}
-    for row in _rows(folder / "table3_compliances.csv"):
+    for row in _rows(folder / MARK):
         key = row["parameter"]
         joint, level = key[1], key[2:]
         name = f"joint{joint}.compliance" + (f"_level{level}" if level else "")

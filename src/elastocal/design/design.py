@@ -19,8 +19,9 @@ from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space
 from elastocal.design.options import EFFORTS, DesignOptions
 from elastocal.design.ordered import ordered
-from elastocal.design.plan import Candidates, Plan, SizePoint
+from elastocal.design.plan import Candidates, Chance, Plan, SizePoint
 from elastocal.design.polish.searches import Searches
+from elastocal.design.random_plans import RandomPlans, random_plans
 from elastocal.design.readings import load_states, readings_each
 from elastocal.design.reasons import predicted, reasons
 from elastocal.design.select import Selection, select
@@ -105,7 +106,9 @@ class _Design:
         curve, shares, begun = self._sizes(setup, pool, shares)
         searches = Searches(setup.information, self.space, self.feasibility, self.feasibility.pairs)
         found = select(setup, pool, shares, searches, options, self.checkpoint, progress, begun)
-        return self._plan(setup, found, shares, counts, targets.source, curve, done)
+        progress("random plans beside it")
+        drawn = random_plans(setup.problem(pool, shares), options.seed)
+        return self._plan(setup, found, shares, counts, targets.source, curve, done, drawn)
 
     def _at_work(self) -> Feasibility:
         """The rules for test poses: there the arm works, and the tracker need not see it."""
@@ -202,7 +205,7 @@ class _Design:
 
     def _plan(
         self, setup: Setup, found: Selection, shares: IntArray, counts: Candidates, targets: str,
-        curve: tuple[SizePoint, ...], done: Done | None,
+        curve: tuple[SizePoint, ...], done: Done | None, drawn: RandomPlans,
     ) -> Plan:  # fmt: skip
         self.progress("order of execution")
         found, execution, told = ordered(
@@ -245,6 +248,7 @@ class _Design:
             bound_reported=None if bound is None else setup.criterion.reported(bound)[0],
             warnings=tuple(self.warnings),
             first=next_number(self.options.done),
+            chance=Chance.of(drawn, found.value, setup.criterion),
         )  # fmt: skip
 
 

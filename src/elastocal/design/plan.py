@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.design.criteria.base import Criterion
 from elastocal.design.order.execution import Execution
+from elastocal.design.random_plans import RandomPlans
 from elastocal.design.reasons import Predicted, Reason
 from elastocal.manipulator.model import Model
 from elastocal.notebook import ForNotebooks
@@ -43,6 +45,37 @@ class Certificate:
     efficiency_continuum: float | None = None
     searched: int = 0
     ascents: int = 0
+
+
+@dataclass(frozen=True)
+class Chance:
+    """The same number of random feasible poses: criteria of `drawn` such plans in the plan's unit.
+
+    `determined` of them determine every parameter; `median`, `best` and `worst` are None where
+    that plan does not.  `efficiency` is the plan's Φ over the median's, None where the criterion
+    has no bound: such a Φ does not count poses.
+    """
+
+    drawn: int
+    determined: int
+    median: float | None
+    best: float | None
+    worst: float | None
+    efficiency: float | None
+
+    @classmethod
+    def of(cls, found: RandomPlans, value: float, criterion: Criterion) -> Chance:
+        """What `found` is beside a plan of Φ = `value`."""
+
+        def known(phi: float) -> float | None:
+            return criterion.reported(phi)[0] if np.isfinite(phi) else None
+
+        values = found.values
+        return cls(
+            len(values), found.determined, known(found.median), known(float(values[0])),
+            known(float(values[-1])),
+            found.efficiency(value) if criterion.certifiable else None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,6 +116,7 @@ class Plan(ForNotebooks):
     bound_reported: float | None = None
     warnings: tuple[str, ...] = field(default=())
     first: int = 1
+    chance: Chance | None = None
 
     @property
     def configurations(self) -> tuple[str, ...]:
@@ -132,6 +166,14 @@ class Plan(ForNotebooks):
                 "searched": c.searched,
                 "ascents": c.ascents,
             },
+            "random_plans": None if self.chance is None else {
+                "n": self.chance.drawn,
+                "determined": self.chance.determined,
+                "median": self.chance.median,
+                "best": self.chance.best,
+                "worst": self.chance.worst,
+                "efficiency": self.chance.efficiency,
+            },
             "predicted": [
                 {
                     "name": p.name,
@@ -156,4 +198,4 @@ class Plan(ForNotebooks):
             "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
             "warnings": list(self.warnings),
             "seed": self.seed,
-        }
+        }  # fmt: skip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from elastocal.design.order.execution import Execution, Stop
 from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text, atomic_writer
+from elastocal.json_text import json_text
 from elastocal.labels import is_label
 from elastocal.measurement_columns import column, families
 from elastocal.nearest import quoted
@@ -135,19 +135,4 @@ def write_plan_json(path: str | Path, summary: Mapping[str, Any]) -> None:
     numpy numbers and arrays become plain ones; numbers that are not finite become null, as JSON
     has none.  Raises InputError where the place cannot be written.
     """
-    text = json.dumps({"schema": SCHEMA, **_plain(summary)}, indent=1, allow_nan=False)
-    atomic_write_text(path, text + "\n")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(v) for key, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    return value
+    atomic_write_text(path, json_text({"schema": SCHEMA, **summary}) + "\n")

@@ -24,6 +24,7 @@ from elastocal.export.pieces import Pieces, evaluate_pieces
 from elastocal.export.urdf import Frames, calibrated_urdf
 from elastocal.export.urdf_new import BASE, FLANGE, new_urdf
 from elastocal.export.yaml_text import to_yaml
+from elastocal.json_text import json_text
 from elastocal.manipulator.calibrated import Calibrated
 from elastocal.manipulator.chain import Array, Chain
 
@@ -121,12 +122,10 @@ def _written(
         return _mjcf(calibrated, wish, kept, pieces)
     if wish.format in CONVENTIONS:
         return _dh(calibrated, wish, kept, pieces)
-    import json
-
     document = parameter_document(calibrated, estimates, pieces, cost)
     if wish.format == "yaml":
         return to_yaml(document), None, "", [], None
-    return json.dumps(document, indent=1, allow_nan=False) + "\n", None, "", [], None
+    return json_text(document) + "\n", None, "", [], None
 
 
 def _note(calibrated: Calibrated, wish: Wish) -> str:

@@ -113,7 +113,8 @@ def _estimates(
         names = tuple(model.names[d] for d in terms)
         if terms:
             shares = {parameter.name: 1.0} | {model.names[d]: f for d, f in terms.items()}
-            combination = Combination(shares, parameter.unit, value, float(std[k]), ci)
+            held = {model.names[d]: float(x[d]) for d in terms}
+            combination = Combination(shares, parameter.unit, value, float(std[k]), ci, held)
             combinations.append(combination)
             found[int(c)] = Estimate(
                 parameter.name, parameter.unit, parameter.nominal, value,

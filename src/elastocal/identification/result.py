@@ -55,7 +55,8 @@ class Combination:
     """A sum Σ factor·parameter that the data determine although its members they do not.
 
     `terms` maps parameter names to factors (SI units); deviations of all members but the first
-    are counted from their held value.  `value`, `std`, `ci95` in the first member's unit.
+    are counted from their `held` value, 0 where none is stated.  `value`, `std`, `ci95` in the
+    first member's unit.
     """
 
     terms: dict[str, float]
@@ -63,15 +64,25 @@ class Combination:
     value: float
     std: float
     ci95: tuple[float, float]
+    held: dict[str, float] = field(default_factory=dict)
 
     @property
     def expression(self) -> str:
+        """The sum as it was determined: "joint2.offset + 0.5·(link1.rz - 0.001)"."""
         first, *rest = self.terms.items()
         text = first[0]
         for name, factor in rest:
-            size = "" if abs(abs(factor) - 1) < 1e-6 else f"{abs(factor):.4g}·"
-            text += f" {'-' if factor < 0 else '+'} {size}{name}"
+            number = f"{abs(factor):.4g}"
+            size = "" if number == "1" else f"{number}·"
+            text += f" {'-' if factor < 0 else '+'} {size}{deviation(name, self.held.get(name))}"
         return text
+
+
+def deviation(name: str, held: float | None, digits: int = 6) -> str:
+    """A parameter as its deviation from where it is held: "(link1.rz - 0.001)"; plain from 0."""
+    if not held:
+        return name
+    return f"({name} {'-' if held > 0 else '+'} {abs(held):.{digits}g})"
 
 
 @dataclass(frozen=True)
@@ -196,8 +207,9 @@ class IdentificationResult(ForNotebooks):
             "method": self.method,
             "parameters": [_estimate_json(e) for e in self.estimates],
             "combinations": [
-                {"terms": c.terms, "expression": c.expression, "unit": c.unit,
-                 "value": c.value, "std": c.std, "ci95": list(c.ci95)}
+                {"terms": c.terms, "held": {name: c.held.get(name, 0.0) for name in c.terms},
+                 "expression": c.expression, "unit": c.unit,
+                 "value": c.value, "std": _finite(c.std), "ci95": [_finite(v) for v in c.ci95]}
                 for c in self.combinations
             ],
             "covariance": self.covariance.tolist(),
@@ -244,8 +256,16 @@ def _estimate_json(e: Estimate) -> dict[str, Any]:
         "ci95": None if e.ci95 is None else [_finite(v) for v in e.ci95],
         "dof": None if e.dof is None else _finite(e.dof), "identifiable": e.identifiable,
         "combined_with": list(e.combined_with), "nominal": e.nominal, "held": e.held,
-        "note": e.note,
+        "note": e.note or _endless(e.ci95),
     }  # fmt: skip
+
+
+def _endless(ci95: tuple[float, float] | None) -> str:
+    """Why an end of the interval is null; "" where both are numbers."""
+    if ci95 is None:
+        return ""
+    ends = [name for name, v in zip(("lower", "upper"), ci95, strict=True) if not np.isfinite(v)]
+    return f"the data set no {' or '.join(ends)} limit to it" if ends else ""
 
 
 def _interval(value: float, ci95: tuple[float, float]) -> str:

@@ -18,6 +18,7 @@ from elastocal.importing.plausible import plausibility
 from elastocal.importing.pool import pooled
 from elastocal.importing.records import Records, Understood, read_records
 from elastocal.importing.schema import SourceTable, UnitsTable
+from elastocal.importing.spherical import is_spherical, with_positions
 from elastocal.importing.table_file import table_text, validated
 from elastocal.importing.with_cell import Fit, against_cell
 from elastocal.measurements import Measurements
@@ -60,8 +61,11 @@ def import_files(
     units = table.units or UnitsTable()
     records: dict[str, list[Records]] = {"points": [], "joints": []}
     understood = []
+    spherical = False
     for path, source in _assigned(where, files, mapping.sources):
         found = with_labels(where, read_records(where, path, source, units), source.names)
+        spherical = spherical or is_spherical(found)
+        found = with_positions(found, clockwise=source.azimuth == "clockwise")
         has_joints = any(stem[0] == "q" and stem[1:].isdigit() for stem in found.numbers)
         role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
                                else "joints")  # fmt: skip
@@ -84,7 +88,7 @@ def import_files(
     made = assemble(where, points, log, joined, table)
     text = table_text(made)
     measured = validated(text, name, made, cell)
-    fit, refused = against_cell(cell, measured, made) if cell is not None else (None, "")
+    fit, refused = against_cell(cell, measured, made, spherical) if cell is not None else (None, "")
     remarks = [] if joined is None else [r for r in joined.remarks if r.startswith("WARNING: ")]
     warnings = [*(r.removeprefix("WARNING: ") for r in remarks), *made.warnings]
     warnings += plausibility(made, measured, None if cell is None else cell.model.observe)

@@ -19,7 +19,7 @@ from elastocal.importing.schema import MappingTable, SourceTable
 from elastocal.nearest import did_you_mean, listed, quoted
 
 MAX_BYTES = 1_000_000
-PRESETS = ("spatialanalyzer", "polyworks", "leica", "faro", "kuka", "abb", "ros")
+PRESETS = ("spatialanalyzer", "polyworks", "leica", "faro", "spherical", "kuka", "abb", "ros")
 # A key of [source.columns] with its unit cut off: what two keys for the same column share.
 _UNIT = re.compile(r"_[A-Za-z]+$")
 

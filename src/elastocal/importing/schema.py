@@ -56,6 +56,9 @@ class SourceTable(Table):
     load: Text | None = key("the name of a load of [loads], for all of these files")
     time_format: Text | Texts | None = key('how time_text is written, as in "%d.%m.%Y %H:%M:%S"')
     coverage_factor: Positive | None = key("a positive number k: the sigma columns hold k sigma")
+    azimuth: Literal["counterclockwise", "clockwise"] | None = key(
+        '"counterclockwise" or "clockwise", seen from above'
+    )
     text: TextTable | None = key("a table")
     columns: dict[str, Where] | None = key(COLUMNS)
     optional: dict[str, Where] | None = key(COLUMNS + "; these may be absent")

@@ -12,7 +12,8 @@ from elastocal.nearest import did_you_mean, listed, quoted
 TEXTS = ("name", "configuration", "marker", "repeat", "load", "time_text", "joint#")
 AUTO = "auto"
 _QUANTITIES: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("x", "y", "z", "distance"), ("length",)),
+    **dict.fromkeys(("x", "y", "z", "distance", "range"), ("length",)),
+    **dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",)),
     **dict.fromkeys(("sigma_x", "sigma_y", "sigma_z"), ("length",)),
     **dict.fromkeys(("sigma_range", "sigma_azimuth", "sigma_elevation"), ("length",)),
     **dict.fromkeys(("rx", "ry", "rz"), ("angle",)),

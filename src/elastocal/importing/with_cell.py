@@ -33,9 +33,14 @@ class Fit:
     warning: str
 
 
-def against_cell(cell: Cell, table: Measurements, made: Assembled) -> tuple[Fit | None, str]:
+def against_cell(
+    cell: Cell, table: Measurements, made: Assembled, spherical: bool = False
+) -> tuple[Fit | None, str]:
     """The fit to the nominal arm (None without positions or with few poses), and why the cell's
-    limits refuse the table ("" where they do not)."""
+    limits refuse the table ("" where they do not).
+
+    `spherical`: positions were read as distance and angles, which invites mistakes of their own.
+    """
     chain = load_chain(cell)
     lower, upper = joint_limits(cell, chain)
     beyond = (table.q < lower - SLACK) | (table.q > upper + SLACK)
@@ -55,10 +60,10 @@ def against_cell(cell: Cell, table: Measurements, made: Assembled) -> tuple[Fit 
     poses = len(np.unique(table.q, axis=0))
     if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
         return None, refused
-    return _fit(cell, table), refused
+    return _fit(cell, table, spherical), refused
 
 
-def _fit(cell: Cell, table: Measurements) -> Fit:
+def _fit(cell: Cell, table: Measurements, spherical: bool) -> Fit:
     rigid = _rigid(cell, table.marker_names)
     light = np.flatnonzero(~np.any(table.force != 0, axis=1))
     rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
@@ -69,7 +74,9 @@ def _fit(cell: Cell, table: Measurements) -> Fit:
     if error <= POOR:
         return Fit(error, "")
     # A registration takes time; the linear one, exact where the base is a rotation, chooses.
-    guesses = sorted(_corrections(used), key=lambda guess: _linear_error(rigid, guess[1]))
+    guesses = sorted(
+        _corrections(used, spherical), key=lambda guess: _linear_error(rigid, guess[1])
+    )
     tried = [(_error(rigid, changed), words) for words, changed in guesses[:CONFIRMED]]
     best, words = min(tried, key=lambda t: t[0])
     said = f"the readings fit the nominal arm only to {error * 1e3:.3g} mm"
@@ -121,22 +128,37 @@ def _linear_error(model: Model, table: Measurements) -> float:
     return float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
 
 
-def _corrections(table: Measurements) -> Iterator[tuple[str, Measurements]]:
+def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Measurements]]:
     """Mistakes that are often made, each undone."""
 
     def other(q: Array) -> Measurements:
         return replace(table, q=q)
 
+    def other_place(position: Array) -> Measurements:
+        return replace(table, position=position)
+
     position = np.asarray(table.position)
     for factor, words in ((1e-3, "mm read as m"), (1e3, "m read as mm"),
                           (25.4, "inches read as mm"),
                                                     (1 / 25.4, "mm read as inches")):  # fmt: skip
-        yield f"if positions were {words}", replace(table, position=position * factor)
+        yield f"if positions were {words}", other_place(position * factor)
     # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
+    mirrored = position[:, [1, 0, 2]]
+    if spherical:
+        yield (
+            "with azimuths counted the other way (azimuth = … in [[source]])",
+            other_place(mirrored),
+        )
+        level = np.hypot(*position[:, :2].T)
+        turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
+        yield (
+            "with zenith angles read as elevations or the other way round",
+            other_place(np.column_stack([position[:, :2] * turned[:, None], level])),
+        )
     yield (
         "with two columns of the positions swapped, or the sign of one turned round (now they "
         "make a left-handed frame),",
-        replace(table, position=position[:, [1, 0, 2]]),
+        other_place(mirrored),
     )
     yield "if joints were degrees read as radians", other(np.radians(table.q))
     yield "if joints were radians read as degrees", other(np.degrees(table.q))

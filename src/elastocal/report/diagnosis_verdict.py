@@ -178,8 +178,8 @@ def next_steps(d: Diagnosis) -> list[str]:
     steps: list[str] = []
     if d.verdict == "explained":
         steps.append(
-            "Write the cell with --cell-out, run identify with it, and check the promise on "
-            "poses that were never fitted (identify --test)."
+            "Identify with the cell that --cell-out writes, and check the promise on poses that "
+            "were never fitted (identify --test)."
         )
     elif d.verdict == "ambiguous":
         steps.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -9,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elastocal.compensation.commands_file import commands_csv, joint_columns, summary
+from elastocal.compensation.compensate import Compensation
 from elastocal.design.plan import Plan
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.errors import InputError
@@ -19,6 +22,7 @@ from elastocal.report.diagnosis_rows import BUDGET, CANDIDATES, budget_rows, can
 from elastocal.report.diagnosis_verdict import verdict_lines
 from elastocal.report.plan_tables import plan_lines
 from elastocal.report.rows import combination_rows, parameter_rows
+from elastocal.report.units import length
 from elastocal.report.verdict import summary_lines
 
 if TYPE_CHECKING:
@@ -76,6 +80,31 @@ def _diagnosis(d: Diagnosis) -> str:
         _lines(verdict_lines(d))
         + _table("Gap budget (3-D rms error on held-out poses)", BUDGET, budget_rows(d))
         + _table("Candidates", CANDIDATES, candidate_rows(d, MOST_CANDIDATES))
+    )
+
+
+def _compensation(c: Compensation) -> str:
+    told = summary(c, c.chain.kinds, commands=False)
+    rows = [
+        (name, *("–" if v is None else length(v * 1e-6) for v in told[key].values()))
+        for name, key in (
+            ("nominal command", "error_before_um"),
+            ("new command", "error_after_um"),
+            ("standard uncertainty", "std_um"),
+        )
+    ]
+    frame = _commands(c)
+    chosen = ["configuration", *joint_columns(c.chain.kinds), "std_um", "status"]
+    commands = [
+        tuple("" if v != v else _short(v) for v in row)
+        for row in frame[chosen].itertuples(index=False)
+    ]
+    reached = f"{told['reached']} of {told['n']} targets reached by the {told['point']}"
+    lines = [("Reached", f"{reached}; targets in the {told['frame']} frame.")]
+    return (
+        _lines([*lines, *(("Warning", text) for text in c.warnings)])
+        + _table("Position of the tool, predicted", ("", "rms", "95 %", "max"), rows)
+        + _table("Commands", chosen, commands)
     )
 
 
@@ -166,6 +195,14 @@ def _candidates(d: Diagnosis) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def _commands(c: Compensation) -> pd.DataFrame:
+    """One row per target: the columns of the commands file, NaN where a target is not reached."""
+    import pandas as pd
+
+    text = io.StringIO(commands_csv(c, c.chain.kinds))
+    return pd.read_csv(text, dtype={"configuration": str}, keep_default_na=False, na_values=[""])
+
+
 VIEWS: dict[type, View] = {
     IdentificationResult: View(
         _identification,
@@ -173,6 +210,9 @@ VIEWS: dict[type, View] = {
         {"residuals": figures.residuals, "parameters": figures.parameters},
     ),
     Plan: View(_plan, _plan_frame, {"poses": figures.poses, "intervals": figures.intervals}),
+    Compensation: View(
+        _compensation, _commands, {"errors": figures.errors, "uncertainty": figures.uncertainties}
+    ),
     Diagnosis: View(
         _diagnosis, _candidates, {"budget": figures.budget, "candidates": figures.candidates}
     ),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.compensation.compensate import Compensation
 from elastocal.design.plan import Plan
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.identification.result import IdentificationResult
@@ -129,6 +130,24 @@ def candidates(d: Diagnosis, interactive: bool) -> Any:
     value = np.array([*(c.probability for c in best), d.probability_unknown, d.probability_nothing])
     nothing = np.full(len(value), np.nan)
     return _bars(Bars(tuple(names), value, nothing, nothing, "probability"), interactive)
+
+
+def errors(c: Compensation, interactive: bool) -> Any:
+    """Predicted error at the nominal commands, of the rows that are reached."""
+    return _of_targets(c, c.before, "error at the nominal command in µm", interactive)
+
+
+def uncertainties(c: Compensation, interactive: bool) -> Any:
+    """Standard uncertainty of the tool's position at the new commands, of the rows reached."""
+    return _of_targets(c, c.uncertainty.std, "standard uncertainty in µm", interactive)
+
+
+def _of_targets(c: Compensation, metres: Array, axis: str, interactive: bool) -> Any:
+    rows = np.flatnonzero(c.reached)[:MOST_BARS]
+    table = c.targets.table
+    names = tuple(table.configuration_labels[table.configuration[i]] for i in rows)
+    nothing = np.full(len(rows), np.nan)
+    return _bars(Bars(names, metres[rows] * 1e6, nothing, nothing, axis), interactive)
 
 
 def poses(plan: Plan, interactive: bool) -> Any:

@@ -74,7 +74,8 @@ def _printed(title: str, table: Table) -> RichTable:
 
 def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     """What the plan is worth, as (label, sentence)."""
-    lines = [_criterion_line(plan), _candidate_line(plan), *_certificate_lines(plan)]
+    lines = [_criterion_line(plan), *_chance_lines(plan), _candidate_line(plan)]
+    lines += _certificate_lines(plan)
     lines.append(_execution_line(plan))
     if plan.polished:
         text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
@@ -89,6 +90,28 @@ def _criterion_line(plan: Plan) -> tuple[str, str]:
             f"after compensation ({printable(plan.targets)})."
         )
     return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+
+
+def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
+    """What as many random poses would have given."""
+    c = plan.chance
+    if c is None:
+        return []
+    whole = f"{c.drawn} random plans of as many feasible poses"
+    open_ = c.drawn - c.determined
+    lost = f"{open_} of {whole} leave parameters open that this plan determines"
+    if c.median is None or c.best is None:
+        return [("Chance", f"{lost}.")]
+    name = "ρ₀" if plan.criterion == "test_pose" else plan.criterion
+    unit = f" {plan.unit}" if plan.unit else ""
+    worst = "no value" if c.worst is None else f"{c.worst:.4g}"
+    text = (
+        f"the median of {whole} has {name} = {c.median:.4g}{unit} (best {c.best:.4g}, worst "
+        f"{worst})"
+    )
+    if c.efficiency is not None:
+        text += f", an efficiency of {c.efficiency:.2f} against this plan"
+    return [("Chance", f"{text}; {lost}." if open_ else f"{text}.")]
 
 
 def _candidate_line(plan: Plan) -> tuple[str, str]:

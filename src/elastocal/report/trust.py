@@ -8,6 +8,7 @@ from typing import Literal
 
 from scipy import stats
 
+from elastocal.identification.advice import MANY
 from elastocal.identification.result import IdentificationResult
 from elastocal.report.noise import LACK_OF_FIT
 from elastocal.report.units import length, significant
@@ -15,6 +16,8 @@ from elastocal.report.verdict import FLATTERS, counted
 from elastocal.report.words import ABSORBED, INVISIBLE, names_of
 
 Tone = Literal["good", "care", "poor"]
+SECTIONS = FAULTY, OPEN = ("Faulty readings", "What is not determined")  # of the page
+LITTLE = 1.25  # times better than the nominal arm, below which little was gained
 WORSE = 1.5  # test data this much worse than held-out poses lie where the calibration was not made
 
 
@@ -25,6 +28,13 @@ class Judgement:
     tone: Tone
     headline: str
     steps: tuple[str, ...]
+
+
+def without_sections(step: str) -> str:
+    """A step where there is no page with sections to look into."""
+    for section in SECTIONS:
+        step = step.replace(f" ({section})", "")
+    return step
 
 
 def judgement(result: IdentificationResult) -> Judgement:
@@ -93,6 +103,14 @@ def _doubts(result: IdentificationResult) -> list[str]:
         doubts.append("configurations scatter more than repeats of one explain")
     if math.isfinite(held) and held > FLATTERS * result.residual_rms:
         doubts.append(f"unseen poses are worse than fitted ones ({length(result.residual_rms)})")
+    if result.nominal_rms < LITTLE * held < math.inf:
+        doubts.append("that is hardly better than the nominal arm")
+    fitted = len(result.observations.lead)
+    if len(result.outliers) > MANY * fitted:
+        doubts.append(
+            f"{len(result.outliers)} of the {fitted} readings fitted lie beyond what the noise "
+            "explains"
+        )
     if result.test is not None and result.test.rms > WORSE * held:
         doubts.append(f"test data are off by {length(result.test.rms)} rms")
     return doubts
@@ -101,26 +119,38 @@ def _doubts(result: IdentificationResult) -> list[str]:
 def _steps(result: IdentificationResult, fine: bool) -> tuple[str, ...]:
     steps = []
     if larger_than_noise(result) is not None or lacks_fit(result):
-        steps.append("Ask what the model lacks: elastocal diagnose with the same cell and data.")
+        steps.append(
+            "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it "
+            "finds nothing, the excess is the robot's repeatability, or noise larger than stated."
+        )
+    elif result.noise.get("ratio_to_stated") is None:
+        steps.append(
+            "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only "
+            "beside it does the residual say whether the model lacks something. elastocal diagnose "
+            "looks for that either way."
+        )
     held, few = result.heldout_rms, result.heldout_rms > FLATTERS * result.residual_rms
     if not math.isfinite(held) or few:
         steps.append("Measure more poses: elastocal design --augment plans what these data lack.")
     if n := len(result.faulty):
         verb = "lies" if n == 1 else "lie"
         steps.append(
-            f"Look at the {counted(n, 'reading')} that {verb} beyond the noise (Faulty readings)."
+            f"Look at the {counted(n, 'reading')} that {verb} beyond the noise ({FAULTY})."
         )
     hidden = len(names_of(result, INVISIBLE)) + len(names_of(result, ABSORBED))
     if hidden:
         steps.append(
-            f"{counted(hidden, 'parameter')} cannot be had from these data (What is not "
-            "determined). Poses and loads like those measured are predicted all the same; for "
-            "others, measure what shows them."
+            f"{counted(hidden, 'parameter')} cannot be had from these data ({OPEN}). Poses and "
+            "loads like those measured are predicted all the same; for others, measure what shows "
+            "them."
         )
     if result.test is None:
         steps.append(
             "Prove it: measure some poses that take no part in the fit, and give them with --test."
         )
     if fine:
-        steps.append("Use it where poses and loads are like those measured.")
+        steps.append(
+            "Use it (elastocal compensate, elastocal export) where poses and loads are like those "
+            "measured."
+        )
     return tuple(steps)

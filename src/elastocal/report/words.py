@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from elastocal.identification.result import Combination, Estimate, IdentificationResult
+from elastocal.identification.result import (
+    Combination,
+    Estimate,
+    IdentificationResult,
+    deviation,
+)
 from elastocal.report.units import significant
 
 # How a parameter stands, in the order in which they are told.
@@ -51,7 +56,8 @@ def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     for name, factor in [term for term in rest if term in kept]:
         size = significant(abs(factor))
         number = "" if float(size) == 1 else f"{size}·"
-        text += f" {'-' if factor < 0 else '+'} {number}{printable(name)}"
+        member = deviation(printable(name), combination.held.get(name), 4)
+        text += f" {'-' if factor < 0 else '+'} {number}{member}"
     more = len(rest) - len(kept)
     return f"{text} + {more} more" if more else text
 

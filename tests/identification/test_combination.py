@@ -1,0 +1,60 @@
+"""The text of a combination is the sum that was determined, wherever its members are held."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.calibration import cell_of, measured, table_at
+from support.cells import kr270_chain, random_poses
+
+from elastocal.cell import Nominal
+from elastocal.identification.identify import identify
+from elastocal.json_text import json_text
+from elastocal.manipulator.model import Model
+
+HELD = 2e-6  # rad/(N m), what the cell states for every joint
+
+
+def test_the_expression_at_the_true_values_is_the_value_that_was_found():
+    """With the wrist stretched under one load, axes 4 and 6 are one line."""
+    chain = kr270_chain()
+    q = random_poses(chain, 20, 3)
+    q[:, 4] = 0.0
+    nominal = Nominal(joint_compliance=(HELD,) * 6)
+    cell = cell_of(("joint_compliance",), {"M1": np.array([0.2, 0.1, 0.1])}, nominal=nominal,
+                   load_point=(0.2, 0.1, 0.2))  # fmt: skip
+    model = Model(chain, cell)
+    rng = np.random.default_rng(0)
+    truth = model.nominal * rng.uniform(0.5, 1.5, len(model.nominal))
+    plan = table_at(q, [[0, 0, 0], [0, 0, -2600], [900, 0, -1500]])
+    result = identify(model, measured(model, plan, truth, 3e-5, rng))
+    (c,) = result.combinations
+    assert set(c.terms) == {"joint4.compliance", "joint6.compliance"}
+    first, other = c.terms
+    assert c.held == {other: HELD}
+    values = dict(zip(model.names, truth, strict=True))
+    text = c.expression.replace("·", "*")
+    for name, value in values.items():
+        text = text.replace(name, repr(float(value)))
+    assert eval(text) == pytest.approx(c.value, abs=4 * c.std)
+    plain = sum(f * values[name] for name, f in c.terms.items())
+    assert abs(plain - c.value) > 10 * c.std
+    (told,) = result.to_json()["combinations"]
+    assert told["held"] == {first: 0.0, other: HELD}
+
+
+def test_an_interval_without_an_end_is_null_with_the_reason():
+    chain = kr270_chain()
+    model = Model(chain, cell_of(("joint_offset",), {"M1": np.array([0.2, 0.1, 0.1])}))
+    rng = np.random.default_rng(1)
+    result = identify(
+        model, measured(model, table_at(random_poses(chain, 9, 1)), model.nominal, 1e-5, rng)
+    )
+    known = next(e for e in result.estimates if e.identifiable)
+    endless = replace(known, ci95=(-np.inf, known.ci95[1]))
+    others = tuple(endless if e is known else e for e in result.estimates)
+    published = json.loads(json_text(replace(result, estimates=others).to_json()))
+    told = next(e for e in published["parameters"] if e["name"] == known.name)
+    assert told["ci95"] == [None, known.ci95[1]]
+    assert told["note"] == "the data set no lower limit to it"

@@ -1,0 +1,177 @@
+"""Distance, azimuth, and zenith or elevation become the positions that they were read from."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.tracker_exports import MARKERS, imported, kr270_readings, krl
+
+from elastocal.errors import InputError
+from elastocal.importing.units import FACTORS
+
+TURN = {"deg": 360.0, "gon": 400.0, "rad": 2 * np.pi}
+MAPPING = """
+[[source]]
+files = ["points*"]
+role = "points"
+{extra}
+[source.text]
+delimiter = ";"
+[source.columns]
+name = "P"
+range_{length} = "D"
+azimuth_{angle} = "Hz"
+{height}_{angle} = "V"
+[source.names]
+pattern = '^P(?P<configuration>[0-9]+)_(?P<marker>M[0-9])$'
+[[source]]
+preset = "kuka"
+"""
+
+
+@pytest.fixture(scope="module")
+def readings(tmp_path_factory):
+    return kr270_readings(tmp_path_factory.mktemp("cell"))
+
+
+def read_by_a_tracker(points, angle="deg", height="zenith", clockwise=False, second_face=False):
+    """(n, 3): distance, azimuth and height angle of points (n, 3), by atan2 and nothing of ours."""
+    x, y, z = points.T
+    az = np.arctan2(-y if clockwise else y, x)
+    zen = np.arctan2(np.hypot(x, y), z)
+    if second_face:
+        az, zen = az + np.pi, 2 * np.pi - zen
+    up = zen if height == "zenith" else np.pi / 2 - zen
+    to = TURN[angle] / (2 * np.pi)
+    return np.column_stack([np.linalg.norm(points, axis=1), az % (2 * np.pi) * to, up * to])
+
+
+def written(polar, head="P;D;Hz;V", poses=10):
+    names = [f"P{i}_{m}" for i in range(1, poses + 1) for m in MARKERS]
+    rows = [";".join([n, *(f"{v:.12f}" for v in p)]) for n, p in zip(names, polar, strict=True)]
+    return "\n".join([head, *rows, ""])
+
+
+def brought_in(tmp_path, readings, polar, length="mm", angle="deg", height="zenith", extra=""):
+    mapping = MAPPING.format(length=length, angle=angle, height=height, extra=extra)
+    files = {"points.csv": written(polar), "poses.dat": krl(readings[1])}
+    return imported(tmp_path, files, mapping, cell=readings[0])
+
+
+@pytest.mark.parametrize("length", ["mm", "m"])
+@pytest.mark.parametrize("angle", list(TURN))
+@pytest.mark.parametrize("height", ["zenith", "elevation"])
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_every_unit_and_sense_gives_the_positions_back(
+    tmp_path, readings, length, angle, height, clockwise
+):
+    points = readings[2].reshape(-1, 3)
+    polar = read_by_a_tracker(points, angle, height, clockwise)
+    polar[:, 0] /= FACTORS["length"][length]
+    extra = 'azimuth = "clockwise"' if clockwise else ""
+    found = brought_in(tmp_path, readings, polar, length, angle, height, extra)
+    np.testing.assert_allclose(found.table.position * 1e3, points, rtol=0, atol=1e-6)
+    assert found.warnings == ()
+
+
+def test_readings_in_the_second_face_come_out_right(tmp_path, readings):
+    points = readings[2].reshape(-1, 3)
+    polar = read_by_a_tracker(points, "gon", second_face=True)
+    found = brought_in(tmp_path, readings, polar, angle="gon")
+    np.testing.assert_allclose(found.table.position * 1e3, points, rtol=0, atol=1e-6)
+
+
+@given(
+    st.floats(1e-3, 1e5), st.floats(0, 400), st.floats(0, 400), st.booleans(),
+    st.sampled_from(["deg", "gon", "rad"]),
+)  # fmt: skip
+def test_the_length_is_the_range_whatever_the_angles(d, az, zen, clockwise, unit):
+    from elastocal.importing.records import Records, Understood
+    from elastocal.importing.spherical import with_positions
+
+    scale = TURN[unit] / 400
+    seen = Understood("p", None, "points", "utf-8", "", ".", (), (), 1, ())
+    numbers = {"range": np.array([d]), "azimuth": np.array([az * scale]),
+               "zenith": np.array([zen * scale * (1 - 1e-15)])}  # fmt: skip
+    units = {"range": "mm", "azimuth": unit, "zenith": unit}
+    records = Records("p", np.array([2]), numbers, units, {}, None, seen)
+    found = with_positions(records, clockwise)
+    assert set(found.numbers) == set(found.units) == set("xyz")
+    assert set(found.units.values()) == {"mm"}
+    assert np.hypot(np.hypot(*(found.numbers[k][0] for k in "xy")), found.numbers["z"][0]) == (
+        pytest.approx(d, rel=1e-12)
+    )
+
+
+def test_the_preset_reads_a_total_stations_table(tmp_path, readings):
+    points = readings[2].reshape(-1, 3)
+    polar = read_by_a_tracker(points, "gon", clockwise=True)
+    head = "Point ID;Slope Distance [mm];Hz [gon];Zenith Angle [gon]"
+    mapping = """
+[[source]]
+preset = "spherical"
+files = ["points*"]
+azimuth = "clockwise"
+[[source]]
+preset = "kuka"
+"""
+    files = {"points.csv": written(polar, head), "poses.dat": krl(readings[1])}
+    found = imported(tmp_path, files, mapping, cell=readings[0])
+    np.testing.assert_allclose(found.table.position * 1e3, points, rtol=0, atol=1e-6)
+    assert found.warnings == () and found.fit.error < 1e-5
+
+
+def test_no_unit_of_an_angle_is_guessed(tmp_path, readings):
+    polar = read_by_a_tracker(readings[2].reshape(-1, 3))
+    files = {"points.csv": written(polar, "Point;Range mm;Azimuth;Zenith"),
+             "poses.dat": krl(readings[1])}  # fmt: skip
+    with pytest.raises(InputError, match=r"column 'Azimuth' states no unit; give --angle-unit"):
+        imported(tmp_path, files, presets=("spherical", "kuka"))
+
+
+def test_azimuths_counted_the_other_way_are_told_with_a_cell(tmp_path, readings):
+    polar = read_by_a_tracker(readings[2].reshape(-1, 3), clockwise=True)
+    found = brought_in(tmp_path, readings, polar)
+    assert any("azimuths counted the other way" in w for w in found.warnings)
+
+
+def test_zenith_angles_read_as_elevations_are_told_with_a_cell(tmp_path, readings):
+    points = readings[2].reshape(-1, 3) + np.array([0, 0, 2000.0])  # the tracker stands lower
+    polar = read_by_a_tracker(points)
+    assert polar[:, 2].max() < 90
+    found = brought_in(tmp_path, readings, polar, height="elevation")
+    assert any("zenith angles read as elevations" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda t: t.replace('azimuth_deg = "Hz"\n', ""), r"zenith without azimuth; map range_mm"),
+        (lambda t: t.replace('zenith_deg = "V"\n', ""), "without zenith or elevation"),
+        (lambda t: t.replace('"V"\n', '"V"\nelevation_deg = "Hz"\n'), "both zenith and elevation"),
+        (lambda t: t.replace('"V"\n', '"V"\nx_mm = "D"\n'), "mapped twice, as x and as range"),
+        (lambda t: t.replace("azimuth_deg", "azimuth_mm"), "unit mm is not one of its"),
+        (lambda t: t.replace('role = "points"', 'role = "points"\nazimuth = "left"'),
+         'takes "counterclockwise" or "clockwise"'),
+    ],
+)  # fmt: skip
+def test_mistakes_in_the_mapping_are_told(tmp_path, readings, change, told):
+    polar = read_by_a_tracker(readings[2].reshape(-1, 3))
+    mapping = change(MAPPING.format(length="mm", angle="deg", height="zenith", extra=""))
+    files = {"points.csv": written(polar), "poses.dat": krl(readings[1])}
+    with pytest.raises(InputError, match=told):
+        imported(tmp_path, files, mapping)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "told"),
+    [
+        (0, -1.0, r"points.csv, line 4: a range of -1 mm"),
+        (2, -3.0, r"line 4: zenith of -3°, which lies beyond 0° to 360°.*elevation_deg"),
+    ],
+)
+def test_what_no_tracker_reads_names_its_line(tmp_path, readings, column, value, told):
+    polar = read_by_a_tracker(readings[2].reshape(-1, 3))
+    polar[2, column] = value
+    with pytest.raises(InputError, match=told):
+        brought_in(tmp_path, readings, polar)

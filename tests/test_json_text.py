@@ -1,0 +1,48 @@
+"""What is written as JSON is JSON, whatever numbers it is made of."""
+
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from elastocal.json_text import json_text
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+)
+
+
+def refuse(constant):
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def without_numbers_that_are_none(value):
+    if isinstance(value, dict):
+        return {k: without_numbers_that_are_none(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [without_numbers_that_are_none(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@given(ANYTHING)
+def test_strict_json_that_reads_back_with_null_where_there_is_no_number(value):
+    read = json.loads(json_text(value), parse_constant=refuse)
+    assert read == without_numbers_that_are_none(value)
+
+
+def test_numpy_numbers_and_arrays_are_plain_ones():
+    value = {"a": np.array([[1.0, np.nan], [np.inf, 2.5]]), "n": np.int64(3), "t": np.bool_(True),
+             "x": np.float64("-inf"), "both": (np.float32(0.5), 1)}  # fmt: skip
+    assert json.loads(json_text(value)) == {
+        "a": [[1.0, None], [None, 2.5]], "n": 3, "t": True, "x": None, "both": [0.5, 1],
+    }  # fmt: skip
+
+
+def test_it_loads_no_numpy_as_the_help_texts_come_by_it():
+    program = "import sys, elastocal.json_text; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
