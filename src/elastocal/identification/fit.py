@@ -44,7 +44,9 @@ class FitProblem:
 
     `sizes` (parameters,) scale the variables.  `tie` (columns,), where given, adds
     ((X − centre)/tie)² per column, in units of the noise: a weak tie, used only to keep
-    undetermined directions still before they are known to be undetermined.
+    undetermined directions still before they are known to be undetermined.  `among` (ascending)
+    are columns of which those fitted are a choice: a large table's fit leaves their triangle too,
+    which else would take another pass.
     """
 
     model: Model
@@ -58,6 +60,7 @@ class FitProblem:
     bounded: bool = False
     # The table in parts, where whoever poses the problem has cut it already.
     cut: Partition | None = None
+    among: NDArray[np.int64] | None = None
 
     @cached_property
     def parts(self) -> Partition:
@@ -96,7 +99,8 @@ class FitProblem:
 class Fit:
     """Values x (parameters,), raw and whitened residual (rows,), `triangle` of whitened B and it.
 
-    `columns` (fitted,) index the parameters.
+    `columns` (fitted,) index the parameters; `wide`, where there is one, is the triangle of the
+    columns that these were chosen among.
     """
 
     x: Array
@@ -107,6 +111,7 @@ class Fit:
     reason: str
     steps: int
     problem: FitProblem = field(repr=False)
+    wide: Triangle | None = field(default=None, repr=False)
 
     @property
     def columns(self) -> NDArray[np.int64]:
@@ -188,16 +193,23 @@ def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
         at = evaluate(problem.model, problem.parts, problem.values(u), columns)
         return Evaluation(at.residual, at.triangle.scaled(size))
 
+    def among_others(u: Array) -> Evaluation:
+        among = columns if problem.among is None else problem.among
+        at = evaluate(problem.model, problem.parts, problem.values(u), among)
+        own = at.triangle.of_columns(np.searchsorted(among, columns))
+        return Evaluation(at.residual, own.scaled(size), at.triangle)
+
     objective = Objective(
         evaluated, np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size,
         (problem.tied_to - problem.x[columns]) / size, lower, upper,
+        None if problem.among is None else among_others,
     )  # fmt: skip
     start = np.clip(np.zeros(len(columns)), lower, upper)
     found = descend(objective, start, tolerance, max_steps)
     return Fit(
         problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
         found.at.triangle.scaled(1 / size), found.converged, found.reason, found.evaluations,
-        problem,
+        problem, found.at.wide,
     )  # fmt: skip
 
 

@@ -119,7 +119,7 @@ def settle(problem: Problem, sizes: Array, progress: Progress = lambda message: 
             break
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
-        found = fit_kept(problem, sizes, found.x, reduction)
+        found = fit_kept(problem, sizes, found.x, reduction, again=True)
         sigma, triangle = residual_sigma(found, len(kept)), free_triangle(problem, found)
     return Settled(problem, found, reduction, triangle, nominal)
 

@@ -113,8 +113,8 @@ def _leaves(rows: Array) -> Array:
     whole = len(rows) // leaf * leaf
     if not whole:
         return rows
-    triangles = np.linalg.qr(rows[:whole].reshape(-1, leaf, k), mode="r").reshape(-1, k)
-    return np.vstack([triangles, rows[whole:]])
+    triangles = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, leaf, k), mode="r"))
+    return np.vstack([triangles.reshape(-1, k), rows[whole:]])
 
 
 def _factor(rows: Array) -> Array:
