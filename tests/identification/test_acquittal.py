@@ -60,3 +60,12 @@ def test_a_gross_error_is_never_acquitted():
     solution, log = solved_with(1, 100.0, 4), []
     faulty, fitted = find_faulty(solution, refitting(solution, log))
     assert log and faulty[0] and len(fitted.fit.whitened) == 3 * log[-1]
+
+
+def test_as_many_good_equations_as_parameters_acquit_nobody():
+    """Nothing is left over to judge by; the fit to the others has to say what it makes of that."""
+    solution = solved_with(0, 0, 1, 20)
+    good = np.zeros(20, dtype=bool)
+    good[: len(solution.reduction.kept) // 3] = True
+    assert 3 * good.sum() <= len(solution.reduction.kept)
+    assert outliers._acquitted(solution, good) is None

@@ -67,7 +67,9 @@ def _acquitted(solution: Solution, good: Mask) -> Visit | None:
             problem.weights.apply(at.B)[rows], problem.weights.apply(at.residual)[rows]
         )
         own = triangle.of_columns(np.searchsorted(free, kept))
-        sigma = own.rest / np.sqrt(max(own.rows - len(kept), 1))
+        if own.rows <= len(kept):
+            return None
+        sigma = max(own.rest / float(np.sqrt(own.rows - len(kept))), 1e-12)
         chosen = choose(problem, sizes, triangle, sigma, WORTH_A_COLUMN)
         if not np.array_equal(chosen.kept, kept):
             return None
