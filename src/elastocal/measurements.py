@@ -94,8 +94,8 @@ class Measurements:
         """The first and last rows, as notebooks show a data frame."""
         return str(self.to_dataframe()._repr_html_())
 
-    def take(self, index: NDArray) -> Measurements:
-        """The rows `index` (integers or a mask) as a table of their own; labels are kept."""
+    def take(self, index: NDArray | slice) -> Measurements:
+        """The rows `index` (integers, mask or slice) as a table of their own; labels are kept."""
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in fields(self)

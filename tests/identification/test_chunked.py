@@ -73,6 +73,23 @@ def test_in_parts_equals_whole(case, in_parts):
     assert np.array_equal(faulty_of(parts)[0], accused)
 
 
+def test_the_last_evaluation_leaves_the_triangle_of_all_columns_to_choose_from(in_parts):
+    """It is that of another pass at the fitted values, and the fit's own is a part of it."""
+    model, table = positions()
+    in_parts()
+    solution = solved(model, table)
+    problem, fitted = solution.problem, solution.fit
+    assert len(fitted.columns) < len(problem.free)
+    again = chunked.evaluate(model, problem.parts, fitted.x, problem.free).triangle
+    own = chunked.evaluate(model, problem.parts, fitted.x, fitted.columns).triangle
+    for one, other in ((fitted.wide, again), (fitted.triangle, own)):
+        scale = np.linalg.norm(other.augmented, axis=0)
+        scale[scale == 0] = 1.0
+        np.testing.assert_allclose(one.augmented.T @ one.augmented / np.outer(scale, scale),
+                                   other.augmented.T @ other.augmented / np.outer(scale, scale),
+                                   atol=1e-12)  # fmt: skip
+
+
 def test_a_covariance_that_links_configurations_keeps_them_together(in_parts):
     """Neighbouring observations are correlated in runs of five, across configurations."""
     model, plan, truth, rng = arm(GEOMETRY, 7)

@@ -1,5 +1,7 @@
 """Levenberg–Marquardt on triangles: it arrives, within bounds, and says when it has not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
@@ -33,6 +35,26 @@ def test_descent_through_a_curved_valley():
     found = descend(objective_of(rosenbrock, rosenbrock_slope, 2), np.array([-1.2, 1.0]), 1e-12, 99)
     assert found.converged
     np.testing.assert_allclose(found.u, [1, 1], atol=1e-10)
+
+
+def test_where_the_descent_means_to_end_the_last_evaluation_takes_the_place_of_the_others():
+    objective = objective_of(
+        lambda u: np.exp(u[0] * np.arange(4.0)) - [1.1, 1.4, 2.8, 4.4],
+        lambda u: (np.arange(4.0) * np.exp(u[0] * np.arange(4.0)))[:, None],
+        1,
+    )
+    wide = Triangle.of(np.eye(4), np.ones(4))
+    asked = []
+
+    def last(u):
+        asked.append(u)
+        return replace(objective.evaluate(u), wide=wide)
+
+    start = np.array([0.3])
+    found = descend(replace(objective, evaluate_last=last), start, 1e-8, 99)
+    assert len(asked) == 1 and found.at.wide is wide
+    assert np.array_equal(found.u, asked[0])
+    assert np.array_equal(found.u, descend(objective, start, 1e-8, 99).u)
 
 
 def test_descent_turns_back_where_there_is_no_prediction():

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.identification.triangle import Triangle, merge
+from elastocal.identification.triangle import BLOCK, Triangle, merge
 
 NIST = Path(__file__).parent / "nist"
 CERTIFIED = json.loads((NIST / "certified.json").read_text(encoding="utf-8"))
@@ -78,3 +78,23 @@ def test_a_direction_without_data_is_left_where_it_is():
     B = np.ones((9, 3)) * [1.0, 1.0, 0.0]
     step = Triangle.of(B, np.full(9, 5.0)).step(np.array([2.0, 1.0, 1.0]))
     np.testing.assert_allclose(step, [4.0, 1.0, 0.0], atol=1e-14)
+
+
+@pytest.mark.parametrize("p", [10, 46])
+def test_a_long_ill_conditioned_part_keeps_its_digits(p):
+    """Rows that are factorised leaf by leaf: R is that of one QR, and a condition number of 1e10
+    enters once, where in normal equations it would leave nothing."""
+    rng = np.random.default_rng(p)
+    B = rng.normal(size=(30_011, p))
+    B[:, -1] = B[:, 0] + 1e-10 * B[:, -1]
+    x = rng.normal(size=p)
+    e = B @ x
+    triangle = Triangle.of(B, e)
+    assert B.size + len(e) > BLOCK and triangle.rows == len(e)
+    R = np.linalg.qr(B, mode="r")
+    own, other = (r * np.sign(np.diag(r))[:, None] for r in (triangle.R, R))
+    assert np.abs(own - other).max() < 1e-14 * np.linalg.norm(B, axis=0).max()
+    assert np.abs(triangle.step(np.ones(p)) - x).max() < 1e-5
+    assert triangle.rest < 1e-13 * np.linalg.norm(e)
+    normal = np.linalg.lstsq(B.T @ B, B.T @ e, rcond=None)[0]
+    assert np.abs(normal - x).max() > 0.1

@@ -85,7 +85,7 @@ def _settled(
             break
     # One that ended at a bound is held there and no longer a column.
     fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
-    final = estimate_noise(fitted, noise.kind)
+    final = estimate_noise(fitted, noise.kind, noise)
     final = replace(final, trials=noise.trials, reason=noise.reason)
     return Adapted(solution, final, now)
 

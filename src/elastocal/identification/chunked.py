@@ -25,10 +25,14 @@ AT_ONCE = 2
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Residual (rows,), observed minus predicted and raw, and the triangle of whitened B and it."""
+    """Residual (rows,), observed minus predicted and raw, and the triangle of whitened B and it.
+
+    `wide` is the triangle of more columns, where they were evaluated with it.
+    """
 
     residual: Array
     triangle: Triangle
+    wide: Triangle | None = None
 
 
 def evaluate(model: Model, parts: Partition, x: Array, columns: NDArray[np.integer]) -> Evaluation:

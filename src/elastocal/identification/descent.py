@@ -40,6 +40,8 @@ class Objective:
 
     `evaluate` gives the triangle of e and of B per unit of u, (p,) in typical sizes; it raises
     ElastocalError where the model has no prediction.  A `tie` (p,) of infinity is none.
+    `evaluate_last`, where given, evaluates in its place where the descent means to end: for what
+    else is wanted there.
     """
 
     evaluate: Callable[[Array], Evaluation]
@@ -47,6 +49,7 @@ class Objective:
     centre: Array
     lower: Array
     upper: Array
+    evaluate_last: Callable[[Array], Evaluation] | None = None
 
     def cost(self, u: Array, at: Evaluation) -> float:
         """The sum of squares, ties included."""
@@ -78,6 +81,7 @@ def descend(objective: Objective, u: Array, tolerance: float, max_evaluations: i
 
     Raises ElastocalError where the start has no prediction.
     """
+    ending = objective.evaluate_last or objective.evaluate
     at = objective.evaluate(u)
     cost, damping, evaluations = objective.cost(u, at), 0.0, 1
     while evaluations < max_evaluations:
@@ -87,7 +91,7 @@ def descend(objective: Objective, u: Array, tolerance: float, max_evaluations: i
             return Descent(u, at, True, NEGLIGIBLE, evaluations)
         evaluations += 1
         try:
-            trial = objective.evaluate(u + step)
+            trial = (ending if last else objective.evaluate)(u + step)
             trial_cost = objective.cost(u + step, trial)
         except ElastocalError:
             trial, trial_cost = at, np.inf

@@ -44,7 +44,9 @@ class FitProblem:
 
     `sizes` (parameters,) scale the variables.  `tie` (columns,), where given, adds
     ((X − centre)/tie)² per column, in units of the noise: a weak tie, used only to keep
-    undetermined directions still before they are known to be undetermined.
+    undetermined directions still before they are known to be undetermined.  `among` (ascending)
+    are columns of which those fitted are a choice: a large table's fit leaves their triangle too,
+    which else would take another pass.
     """
 
     model: Model
@@ -58,6 +60,7 @@ class FitProblem:
     bounded: bool = False
     # The table in parts, where whoever poses the problem has cut it already.
     cut: Partition | None = None
+    among: NDArray[np.int64] | None = None
 
     @cached_property
     def parts(self) -> Partition:
@@ -96,7 +99,8 @@ class FitProblem:
 class Fit:
     """Values x (parameters,), raw and whitened residual (rows,), `triangle` of whitened B and it.
 
-    `columns` (fitted,) index the parameters.
+    `columns` (fitted,) index the parameters; `wide`, where there is one, is the triangle of the
+    columns that these were chosen among.
     """
 
     x: Array
@@ -107,6 +111,7 @@ class Fit:
     reason: str
     steps: int
     problem: FitProblem = field(repr=False)
+    wide: Triangle | None = field(default=None, repr=False)
 
     @property
     def columns(self) -> NDArray[np.int64]:
@@ -115,8 +120,7 @@ class Fit:
     @cached_property
     def B(self) -> Array:
         """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `triangle`."""
-        seen = self.problem.observations
-        return self.problem.model.regressor(seen.table, self.x, self.columns, seen).B
+        return _regression(self.problem, self.x).B
 
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13).
@@ -144,32 +148,62 @@ def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLER
     return _fit_whole(problem, max_steps)
 
 
+class _Points:
+    """The regression at one point after another: residual and B come from one evaluation.
+
+    It lives as long as one descent, whose rows do not change.
+    """
+
+    def __init__(self, problem: FitProblem) -> None:
+        self.problem = problem
+        self._u: Array | None = None
+        self._at: Regression | None = None
+
+    def at(self, u: Array) -> Regression:
+        """The regression at u (columns,).  Raises ElastocalError for poses without one."""
+        if self._at is None or self._u is None or not np.array_equal(u, self._u):
+            self._at = _regression(self.problem, self.problem.values(u))
+            self._u = u.copy()
+        return self._at
+
+    def residual(self, u: Array) -> Array:
+        """Predicted minus observed (rows,), NaN where a pose has no equilibrium."""
+        try:
+            return -self.at(u).residual
+        except ElastocalError:
+            seen, x = self.problem.observations, self.problem.values(u)
+            return self.problem.model.predict(seen.table, x, seen) - seen.value
+
+
+def _regression(problem: FitProblem, x: Array) -> Regression:
+    seen = problem.observations
+    return problem.model.regressor(seen.table, x, problem.columns, seen)
+
+
 def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
-    model, seen, columns = problem.model, problem.observations, problem.columns
-    size, weights = problem.sizes[columns], problem.weights
+    size, weights, points = problem.sizes[problem.columns], problem.weights, _Points(problem)
 
     def residual(u: Array) -> Array:
-        x = problem.values(u)
-        r = weights.apply(model.predict(seen.table, x, seen) - seen.value)
+        r = weights.apply(points.residual(u))
         if problem.tie is None:
             return r
-        return np.concatenate([r, (x[columns] - problem.tied_to) / problem.tie])
+        x = problem.values(u)
+        return np.concatenate([r, (x[problem.columns] - problem.tied_to) / problem.tie])
 
     def jacobian(u: Array) -> Array:
-        B = weights.apply(model.regressor(seen.table, problem.values(u), columns, seen).B * size)
+        B = weights.apply(points.at(u).B * size)
         return B if problem.tie is None else np.vstack([B, np.diag(size / problem.tie)])
 
     lower, upper = problem.limits
-    start = np.clip(np.zeros(len(columns)), lower, upper)
+    start = np.clip(np.zeros(len(problem.columns)), lower, upper)
     if not np.isfinite(residual(start)).all():
-        evaluate(model, problem.parts, problem.values(start), columns)  # names the row
+        points.at(start)  # names the row
         raise ElastocalError("the model has no finite prediction at the start values")
     found = least_squares(
         residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
         ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
     )  # fmt: skip
-    x = problem.values(found.x)
-    final = model.regressor(seen.table, x, columns, seen)
+    x, final = problem.values(found.x), points.at(found.x)
     if problem.tie is None and not problem.bounded and found.status > 0:
         x, final = _polished(problem, x, final)
     whitened = weights.apply(final.residual)
@@ -188,28 +222,38 @@ def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
         at = evaluate(problem.model, problem.parts, problem.values(u), columns)
         return Evaluation(at.residual, at.triangle.scaled(size))
 
+    def among_others(u: Array) -> Evaluation:
+        among = columns if problem.among is None else problem.among
+        at = evaluate(problem.model, problem.parts, problem.values(u), among)
+        own = at.triangle.of_columns(np.searchsorted(among, columns))
+        return Evaluation(at.residual, own.scaled(size), at.triangle)
+
     objective = Objective(
         evaluated, np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size,
         (problem.tied_to - problem.x[columns]) / size, lower, upper,
+        None if problem.among is None else among_others,
     )  # fmt: skip
     start = np.clip(np.zeros(len(columns)), lower, upper)
     found = descend(objective, start, tolerance, max_steps)
     return Fit(
         problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
         found.at.triangle.scaled(1 / size), found.converged, found.reason, found.evaluations,
-        problem,
+        problem, found.at.wide,
     )  # fmt: skip
 
 
 def _polished(problem: FitProblem, x: Array, at: Regression) -> tuple[Array, Regression]:
     """One Gauss–Newton step with the exact linear solver, kept where it does not cost."""
-    weights, columns, seen = problem.weights, problem.columns, problem.observations
+    weights, columns = problem.weights, problem.columns
     before = weights.apply(at.residual)
     step = solve_weighted(weights.apply(at.B), before, scale=problem.sizes[columns])
     moved = x.copy()
     moved[columns] += step.x
-    residual = seen.value - problem.model.predict(seen.table, moved, seen)
-    after = weights.apply(residual)
+    try:
+        there = _regression(problem, moved)
+    except ElastocalError:
+        return x, at
+    after = weights.apply(there.residual)
     if not np.isfinite(after).all() or after @ after > before @ before:
         return x, at
-    return moved, problem.model.regressor(seen.table, moved, columns, seen)
+    return moved, there

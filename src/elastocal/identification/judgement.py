@@ -22,16 +22,24 @@ ROUNDS = 12
 ALONE = 1e-9  # share of an observation's direction that the other observations must see
 
 
+# The trimmed cost of a fit (`judge`), the observations (N,) it is of, and the fit.
+Visit = tuple[float, Mask, Solution]
+
+
 def verdict(
-    solution: Solution, refit: Callable[[Mask], Solution], good: Mask
+    solution: Solution,
+    refit: Callable[[Mask], Solution],
+    good: Mask,
+    before: tuple[Visit, ...] = (),
 ) -> tuple[Mask, Solution]:
     """Which observations (N,) are faulty, and the fit to the others, beginning with the `good`.
 
     Every observation is judged against the fit to the good ones at a Bonferroni limit for the
     whole table, which makes new good ones, and so on until the verdict stands.  Where taking
     readings back in has bent the fit away from the majority, the earlier verdict stands.
+    `before` are fits to others that have been judged already.
     """
-    visited: list[tuple[float, Mask, Solution]] = []
+    visited = list(before)
     for _ in range(ROUNDS):
         try:
             current = solution if good.all() else refit(good)

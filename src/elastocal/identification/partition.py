@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from elastocal.identification.noise import Weights
-from elastocal.manipulator.observation import Observations, subset
+from elastocal.manipulator.observation import Observations, alone, subset
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -86,14 +86,20 @@ def part_of(seen: Observations, weights: Weights, index: IntArray) -> Part:
         chosen[index] = True
         own = subset(seen, chosen)
     else:
-        value = seen.value.reshape(-1, seen.size)[index].ravel()
-        single = sparse.csr_array(sparse.eye_array(len(index)))
-        own = Observations(
-            seen.kind, value, single, np.arange(len(index)), seen.table.take(seen.lead[index])
-        )
+        value = seen.value[_run(rows)]
+        table = seen.table.take(_run(seen.lead[index]))
+        own = Observations(seen.kind, value, alone(len(index)), np.arange(len(index)), table)
     if weights.whiten is None:
         return Part(index, rows, own, weights)
-    return Part(index, rows, own, replace(weights, whiten=weights.whiten[rows][:, rows]))
+    inside = weights.whiten[_run(rows)][:, _run(rows)]
+    return Part(index, rows, own, replace(weights, whiten=inside))
+
+
+def _run(index: IntArray) -> IntArray | slice:
+    """`index` (n,) as a slice where it counts up by one: arrays are then seen and not copied."""
+    if len(index) and index[-1] - index[0] == len(index) - 1 and (np.diff(index) == 1).all():
+        return slice(int(index[0]), int(index[-1]) + 1)
+    return index
 
 
 def sample(parts: Partition, n: int, seed: int = 0) -> Part:

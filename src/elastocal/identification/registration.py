@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 
 SAMPLE = 400  # readings used: a start needs no more
-SWEEPS = 60
+ROUGH_SWEEPS, SWEEPS = 6, 60
+FINALISTS = 4
+RCOND = 1e-6  # a direction the poses do not show stays at zero instead of running away
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,58 @@ def register(problem: RegistrationProblem, seed: int = 0) -> Registration:
         return _descend(problem, problem.base_rotation, sweeps=3)
     starts = [_linear_rotation(problem), _kabsch_rotation(problem, problem.start_markers)]
     starts += list(Rotation.create_group("O").as_matrix())
-    rough = [_descend(problem, R, sweeps=6) for R in starts]
-    best = sorted(rough, key=lambda r: r.error)[:4]
+    # All starts together show which ones lead where; those are gone through again with all digits.
+    nearest = np.argsort(_errors(problem, np.array(starts)), kind="stable")[:FINALISTS]
+    best = [_descend(problem, starts[k], ROUGH_SWEEPS) for k in nearest]
     return min((_descend(problem, r.rotation, SWEEPS, r) for r in best), key=lambda r: r.error)
+
+
+def _errors(problem: RegistrationProblem, rotation: Array) -> Array:
+    """Median distances (starts,) after a few sweeps of `_descend` from every `rotation`
+    (starts, 3, 3), all of them together."""
+    weight = np.ones((len(rotation), len(problem.points)))
+    for sweep in range(ROUGH_SWEEPS + 1):
+        translation, markers = _linear_parts(problem, rotation, weight)
+        turned = np.einsum("nij,snj->sni", problem.flange_rotation, markers[:, problem.marker])
+        body = turned + problem.flange_position
+        if sweep < ROUGH_SWEEPS:
+            rotation = _rotation_between(body, problem.points, weight)
+        predicted = body @ rotation.transpose(0, 2, 1) + translation[:, None]
+        distance = np.linalg.norm(problem.points - predicted, axis=2)
+        error = np.median(distance, axis=1)
+        weight = 1.0 / np.maximum(distance, np.maximum(error, 1e-9)[:, None])
+    return np.asarray(error, dtype=np.float64)
+
+
+def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tuple[Array, Array]:
+    """As `_linear_part` with a free base, for every rotation R (s, 3, 3) and weight (s, n).
+
+    With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations, of
+    orthogonal blocks.  Its normal equations cost half the digits, which a search can spare.
+    """
+    turn, code = problem.flange_rotation, problem.marker
+    free = np.flatnonzero(problem.free_markers)
+    fixed = problem.start_markers * ~problem.free_markers[:, None]
+    y = problem.points @ R - _body_points(problem, fixed)
+    size = 3 + 3 * len(free)
+    normal, right = np.zeros((len(R), size, size)), np.empty((len(R), size))
+    own = np.arange(3)
+    normal[:, own, own] = weight.sum(axis=1)[:, None]
+    right[:, :3] = (weight[..., None] * y).sum(axis=1)
+    for k, c in enumerate(free):
+        here, at = code == c, slice(3 + 3 * k, 6 + 3 * k)
+        w = weight[:, here]
+        cross = (w @ turn[here].reshape(-1, 9)).reshape(-1, 3, 3)
+        normal[:, :3, at], normal[:, at, :3] = cross, cross.transpose(0, 2, 1)
+        normal[:, 3 + 3 * k + own, 3 + 3 * k + own] = w.sum(axis=1)[:, None]
+        right[:, at] = np.einsum("nij,sni->sj", turn[here], w[..., None] * y[:, here])
+    values, vectors = np.linalg.eigh(normal)
+    shown = values > RCOND**2 * values[:, -1:]
+    along = (right[:, None] @ vectors)[:, 0] / np.where(shown, values, np.inf)
+    x = (vectors @ along[..., None])[..., 0]
+    markers = np.broadcast_to(fixed, (len(R), *fixed.shape)).copy()
+    markers[:, free] = x[:, 3:].reshape(len(R), -1, 3)
+    return (R @ x[:, :3, None])[..., 0], markers
 
 
 def _subset(problem: RegistrationProblem, rows: NDArray) -> RegistrationProblem:
@@ -123,8 +174,7 @@ def _linear_part(
         return problem.base_translation, fixed
     w = np.sqrt(weight)[:, None]
     A = (np.concatenate(columns, axis=2) * w[..., None]).reshape(3 * n, -1)
-    # rcond: a direction the poses do not show stays at zero instead of running away.
-    x = np.linalg.lstsq(A, (target * w).ravel(), rcond=1e-6)[0]
+    x = np.linalg.lstsq(A, (target * w).ravel(), rcond=RCOND)[0]
     translation = x[:3] if problem.free_base else problem.base_translation
     found = fixed.copy()
     found[problem.free_markers] = x[3 if problem.free_base else 0 :].reshape(-1, 3)
@@ -132,11 +182,12 @@ def _linear_part(
 
 
 def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
-    """Weighted Kabsch: R minimising Σ w |p − R b − t|²."""
-    w = weight / weight.sum()
+    """Weighted Kabsch: R (…, 3, 3) minimising Σ w |p − R b − t|², `body` (…, n, 3)."""
+    w = (weight / weight.sum(axis=-1, keepdims=True))[..., None, :]
     b, p = body - w @ body, points - w @ points
-    U, _, Vt = np.linalg.svd((p * w[:, None]).T @ b)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    U, _, Vt = np.linalg.svd((p.swapaxes(-1, -2) * w) @ b)
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
+    return np.asarray(U @ Vt, dtype=np.float64)
 
 
 def _kabsch_rotation(problem: RegistrationProblem, markers: Array) -> Array:

@@ -38,7 +38,7 @@ def groupings(seen: Observations, chosen: NDArray[np.bool_]) -> list[Labels]:
             continue
         order = np.argsort(first)
         place = np.argsort(order)
-        found.append(Labels(by, place[index], tuple(names[k] for k in used[order])))
+        found.append(Labels(by, place[index], tuple(names[k] for k in used[order].tolist())))
     return found
 
 

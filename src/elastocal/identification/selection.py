@@ -66,6 +66,8 @@ def free_triangle(problem: Problem, found: Fit) -> Triangle:
     """The triangle of the free columns at the fitted values."""
     if np.array_equal(found.columns, problem.free):
         return found.triangle
+    if found.wide is not None:
+        return found.wide
     return evaluate(problem.model, problem.parts, found.x, problem.free).triangle
 
 
@@ -88,10 +90,15 @@ def choose(
 
 
 def fit_kept(
-    problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_steps: int = 60
-) -> Fit:
-    """Fit of the kept parameters, the others held at the start; their share moves over first."""
+    problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_steps: int = 60,
+    *, again: bool = False,
+) -> Fit:  # fmt: skip
+    """Fit of the kept parameters, the others held at the start; their share moves over first.
+
+    `again` says that there will be another choice at its end, by `free_triangle`.
+    """
     kept, dropped = chosen.kept, chosen.dropped
+    among = problem.free if again else None
     start = x.copy()
     start[dropped] = problem.x0[dropped]
     shifted = start.copy()
@@ -99,10 +106,10 @@ def fit_kept(
     # The share is a linear estimate: a soft arm may have no equilibrium so far out.
     for trial in (shifted, start):
         try:
-            return fit(problem.fit_of(kept, trial, sizes), max_steps)
+            return fit(replace(problem.fit_of(kept, trial, sizes), among=among), max_steps)
         except ElastocalError:
             continue
-    return fit(problem.fit_of(kept, problem.x0, sizes), max_steps)
+    return fit(replace(problem.fit_of(kept, problem.x0, sizes), among=among), max_steps)
 
 
 def heldout_of(problem: Problem, found: Fit) -> Array:
@@ -137,7 +144,7 @@ def prefer_wider(
         if rms_3d(linear_heldout, size) >= rms_3d(heldout, size):
             continue
         try:
-            wide = fit_kept(problem, sizes, x, wider, max_steps=30)
+            wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             continue  # along an undetermined direction the wide set may leave every valid arm
         wide_heldout = heldout_of(problem, wide)

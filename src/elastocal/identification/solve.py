@@ -119,7 +119,7 @@ def settle(problem: Problem, sizes: Array, progress: Progress = lambda message: 
             break
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
-        found = fit_kept(problem, sizes, found.x, reduction)
+        found = fit_kept(problem, sizes, found.x, reduction, again=True)
         sigma, triangle = residual_sigma(found, len(kept)), free_triangle(problem, found)
     return Settled(problem, found, reduction, triangle, nominal)
 
@@ -133,15 +133,18 @@ def sizes_and_check(problem: Problem) -> Array:
     """Typical sizes (parameters,) at the start; refuses where the equations are too few."""
     model, seen, free = problem.model, problem.observations, problem.free
     every = np.arange(len(model.parameters))
+    few = len(seen.value) <= len(free)  # more equations than unknowns need no rank
 
-    def of_part(part: Part) -> tuple[Array, Triangle]:
+    def of_part(part: Part) -> tuple[Array, Triangle | None]:
         at = regressor(model, part, problem.x0, every)
-        return np.abs(at.B).max(axis=0, initial=0.0), Triangle.of(at.B, at.residual)
+        triangle = Triangle.of(at.B[:, free], at.residual) if few else None
+        return np.abs(at.B).max(axis=0, initial=0.0), triangle
 
     largest, triangles = zip(*each(problem.parts, of_part), strict=True)
     sizes = model.sizes(np.stack(largest))
     sizes[is_placed(model)] = PLACED
-    check_enough(model, seen, merge(triangles).R[:, free] * sizes[free])
+    if few:
+        check_enough(model, seen, merge(t for t in triangles if t is not None).R * sizes[free])
     return sizes
 
 

@@ -20,6 +20,12 @@ from scipy import linalg
 
 Array = NDArray[np.float64]
 
+# Numbers of [B e] formed and factorised at once where there are more rows: 2 MB, and in these the
+# rows of a leaf, 16 for every column.  A leaf stays in the second level of cache, where LAPACK's
+# panels, which go over all rows column by column, take half the time (docs/performance.md).
+BLOCK = 2**18
+LEAF, SMALLEST_LEAF = 16, 512
+
 
 @dataclass(frozen=True)
 class Triangle:
@@ -31,7 +37,12 @@ class Triangle:
     @classmethod
     def of(cls, B: Array, e: Array) -> Triangle:
         """The triangle of the whitened B (rows, p) and residual e (rows,)."""
-        return cls(_factor(np.column_stack([B, e])), len(e))
+        step = _leaf(B.shape[1] + 1, BLOCK)
+        if len(e) <= step:
+            return cls(_factor(np.column_stack([B, e])), len(e))
+        blocks = (slice(first, first + step) for first in range(0, len(e), step))
+        leaves = [_leaves(np.column_stack([B[block], e[block]])) for block in blocks]
+        return cls(_factor(np.vstack(leaves)), len(e))
 
     def merged(self, other: Triangle) -> Triangle:
         """The triangle of the rows of both."""
@@ -89,8 +100,28 @@ def merge(triangles: Iterable[Triangle]) -> Triangle:
     return reduce(Triangle.merged, triangles)
 
 
+def _leaf(k: int, numbers: int = 0) -> int:
+    """Rows of a leaf of `k` columns, or of as many leaves as `numbers` take."""
+    rows = max(LEAF * k, SMALLEST_LEAF)
+    return max(numbers // (rows * k), 1) * rows
+
+
+def _leaves(rows: Array) -> Array:
+    """The R factors of the leaves of `rows` (n, k) on top of each other."""
+    k = rows.shape[1]
+    leaf = _leaf(k)
+    whole = len(rows) // leaf * leaf
+    if not whole:
+        return rows
+    triangles = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, leaf, k), mode="r"))
+    return np.vstack([triangles.reshape(-1, k), rows[whole:]])
+
+
 def _factor(rows: Array) -> Array:
     """R factor (k, k) of `rows` (n, k), filled up with zeros where n < k."""
+    k = rows.shape[1]
+    while rows.size > BLOCK and len(rows) >= 2 * _leaf(k):
+        rows = _leaves(rows)
     # Not scipy's qr, whose R has all n rows: kept in a triangle it would hold a part of the table.
-    R, k = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64), rows.shape[1]
+    R = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
     return R if len(R) == k else np.vstack([R, np.zeros((k - len(R), k))])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,31 @@ from numpy.typing import NDArray
 from elastocal.manipulator.backend_instructions import BINARY_OP, CONSTANT, READ, UNARY_OP
 from elastocal.manipulator.backend_operations import BINARY, ON_NUMBERS, UNARY
 
-# A function, the slots of its first and second operand (−1: none) and of its result.
-Step = tuple[Any, int, int, int]
+
+@dataclass(frozen=True)
+class Steps:
+    """Functions, the slots of their first and second operands (−1: none) and of their results.
+
+    Four lists and not a tuple for every step: thousands of these would have Python look for
+    garbage in all that is loaded, 0.07 s each time.
+    """
+
+    operation: list[Any] = field(default_factory=list)
+    first: list[int] = field(default_factory=list)
+    second: list[int] = field(default_factory=list)
+    out: list[int] = field(default_factory=list)
+
+    def add(self, operation: Any, first: int, second: int, out: int) -> None:
+        self.operation.append(operation)
+        self.first.append(first)
+        self.second.append(second)
+        self.out.append(out)
+
+    def __len__(self) -> int:
+        return len(self.out)
+
+    def __iter__(self) -> Iterator[tuple[Any, int, int, int]]:
+        return zip(self.operation, self.first, self.second, self.out, strict=True)
 
 
 class Plan:
@@ -29,17 +53,17 @@ class Plan:
         self, table: NDArray[np.int32], ends: Sequence[int], by_row: Sequence[bool]
     ) -> None:
         """`ends`: first slot of every input, of every output, and of the values in common."""
-        self.once: list[Step] = []
+        self.once = Steps()
         self.constants: list[tuple[int, int]] = []
         self.first_common = free = ends[-1]
-        steps: list[Step] = []  # the k-th result of all rows is value `unplaced` + k
+        steps = Steps()  # the k-th result of all rows is value `unplaced` + k
         unplaced = free + len(table)
         varies = [False] * unplaced  # of inputs and of values in common; results all do
         for k, rows in enumerate(by_row):
             varies[ends[k] : ends[k + 1]] = [rows] * (ends[k + 1] - ends[k])
         value = [0] * (1 + int(table[:, 2].max(initial=0)))  # what a register holds now
         home: dict[int, int] = {}  # the output's slot where a result is put out
-        copies: list[Step] = []
+        copies: list[tuple[int, int]] = []
         # Column by column: a list per instruction is garbage that the collector would count.
         for kind, code, out, a, b in zip(*(column.tolist() for column in table.T), strict=True):
             if kind >= UNARY_OP:
@@ -52,10 +76,10 @@ class Plan:
                     operation = UNARY[code]
                 if per_row:
                     value[out] = unplaced + len(steps)
-                    steps.append((operation, first, second, value[out]))
+                    steps.add(operation, first, second, value[out])
                 else:
                     operation = ON_NUMBERS.get(operation, operation)
-                    self.once.append((operation, first, second, free))
+                    self.once.add(operation, first, second, free)
                     value[out], free = free, free + 1
             elif kind == READ:
                 value[out] = ends[a] + b
@@ -67,25 +91,25 @@ class Plan:
                 if source >= unplaced and source not in home:
                     home[source] = place
                 else:
-                    copies.append((np.positive, home.get(source, source), -1, place))
+                    copies.append((home.get(source, source), place))
         self.n_common = free - self.first_common
-        placed, self.n_registers = _placed(steps, home, unplaced, free)
-        self.steps = placed + copies
-        read = {slot for _, first, second, _ in self.steps for slot in (first, second)}
+        self.steps, self.n_registers = _placed(steps, home, unplaced, free)
+        for source, place in copies:
+            self.steps.add(np.positive, source, -1, place)
+        read = {*self.steps.first, *self.steps.second}
         self.shared = sorted(slot for slot in read if self.first_common <= slot < free)
 
 
-def _placed(
-    steps: Sequence[Step], home: dict[int, int], unplaced: int, first: int
-) -> tuple[list[Step], int]:
+def _placed(steps: Steps, home: dict[int, int], unplaced: int, first: int) -> tuple[Steps, int]:
     """The steps with their results in output slots and registers `first`…, and how many of these.
 
     A register is free after the last step that reads it, and what became free last is taken
     first: it is in cache.
     """
-    last = {slot: k for k, step in enumerate(steps) for slot in step[1:3]}
+    last = {slot: k for k, pair in enumerate(zip(steps.first, steps.second, strict=True))
+            for slot in pair}  # fmt: skip
     slot_of = dict(home)
-    placed: list[Step] = []
+    placed = Steps()
     unused: list[int] = []
     count = 0
     for k, (operation, a, b, out) in enumerate(steps):
@@ -103,5 +127,5 @@ def _placed(
                 unused.append(first + count)
                 count += 1
             slot_of[out] = unused.pop()
-        placed.append((operation, x, y, slot_of[out]))
+        placed.add(operation, x, y, slot_of[out])
     return placed, count

@@ -51,12 +51,13 @@ def _one_hot(codes: NDArray, size: int) -> NDArray:
 def _marker_codes(arm: Arm, table: Measurements) -> NDArray:
     known = {name: k for k, name in enumerate(arm.markers)}
     missing = [name for name in table.marker_names if name not in known]
-    used = {table.marker_names[k] for k in np.unique(table.marker)}
-    if used & set(missing):
-        raise InputError(
-            f"{table.source}: marker '{sorted(used & set(missing))[0]}' is not one of the cell's "
-            f"markers: {', '.join(known)}"
-        )
+    if missing:
+        used = {table.marker_names[k] for k in np.unique(table.marker)}
+        if used & set(missing):
+            raise InputError(
+                f"{table.source}: marker '{sorted(used & set(missing))[0]}' is not one of the "
+                f"cell's markers: {', '.join(known)}"
+            )
     return np.array([known.get(name, 0) for name in table.marker_names])[table.marker]
 
 

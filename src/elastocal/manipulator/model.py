@@ -84,7 +84,7 @@ class Model:
         spec = replace(spec, effects=(), observe="position", nominal=nominal, link_gravity=False)
         return Model(self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(p.name for p in self.parameters)
 

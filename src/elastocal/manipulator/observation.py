@@ -66,8 +66,7 @@ def observe(table: Measurements, kind: str) -> Observations:
         lead, combine = pair_loaded_with_unloaded(table)
     else:
         lead = np.arange(n)
-        places = np.arange(n + 1, dtype=np.int32)  # the identity; scipy's own takes 0.1 ms more
-        combine = sparse.csr_array((np.ones(n), places[:n], places), shape=(n, n))
+        combine = alone(n)
     if kind == "distance":
         value = _needed(table.distance, table, "distance_mm (or distance_m)", kind)[:, None]
     else:
@@ -78,6 +77,12 @@ def observe(table: Measurements, kind: str) -> Observations:
     if kind == "deflection":
         value = np.asarray(combine @ value)
     return Observations(kind, value.ravel(), combine, lead, table)
+
+
+def alone(n: int) -> sparse.csr_array:
+    """The combination (n, n) of n readings that are observations by themselves: the identity."""
+    places = np.arange(n + 1, dtype=np.int32)  # scipy's own takes 0.1 ms more
+    return sparse.csr_array((np.ones(n), places[:n], places), shape=(n, n))
 
 
 def subset(seen: Observations, chosen: NDArray[np.bool_]) -> Observations:

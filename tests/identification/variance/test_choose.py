@@ -170,3 +170,21 @@ def test_groups_are_left_out_where_their_matrices_would_be_too_large(monkeypatch
     assert any(t.kind.startswith("groups") for t in estimate_noise(r).trials)
     monkeypatch.setattr("elastocal.identification.variance.choose.MOST_GROUPS", 11)
     assert not any(t.kind.startswith("groups") for t in estimate_noise(r).trials)
+
+
+@pytest.mark.parametrize("kind", ["independent", "polar", "axis+configuration"])
+def test_a_former_fit_is_a_start_and_nothing_else(kind):
+    """Readings moved by a little: the same end from the fit of the others as from nothing, to the
+    nine digits that REML gives."""
+    r = readings(Table(configurations=10, markers=3), 5, noise=1e-5, shared=1e-5)
+    former = estimate_noise(r, kind)
+    rng = np.random.default_rng(6)
+    moved = r.moved(r.e + 1e-8 * rng.normal(size=r.e.shape))
+    near, alone = estimate_noise(moved, kind, former), estimate_noise(moved, kind)
+    np.testing.assert_allclose(
+        near.fit.own, alone.fit.own, rtol=1e-7, atol=1e-9 * alone.fit.own.max()
+    )
+    scale = np.sqrt(np.diag(alone.covariance.matrix))
+    assert np.abs((near.x - alone.x) / scale).max() < 1e-8
+    one, other = (f.covariance.matrix / np.outer(scale, scale) for f in (near, alone))
+    np.testing.assert_allclose(one, other, atol=1e-8)

@@ -10,6 +10,7 @@ from identification.variance.dense import Table, readings
 from scipy import optimize
 from statsmodels.regression.mixed_linear_model import MixedLMParams
 
+from elastocal.identification.variance import reml as module
 from elastocal.identification.variance.blocks import stacks
 from elastocal.identification.variance.likelihood import evaluate
 from elastocal.identification.variance.reml import reml
@@ -135,3 +136,28 @@ def test_the_start_does_not_matter(start):
     usual = reml(structure, effects)
     other = reml(structure, effects, start=np.full(3 + len(effects), start))
     np.testing.assert_allclose(other.state.theta, usual.state.theta, rtol=1e-4)
+
+
+def test_a_variance_that_vanishes_goes_there_at_once_and_to_the_same_end(monkeypatch):
+    """White noise has no share that grows with the reach or goes by the angle: one ends at its
+    bound in most tables, after as many steps as it takes to fall there by e each without."""
+    steps, vanished = [], 0
+    slope = module.slope
+    monkeypatch.setattr(module, "slope", lambda *a: steps.append(1) or slope(*a))
+    for seed in range(6):
+        structure = STRUCTURES["polar"](readings(Table(configurations=40), seed))
+        counts = []
+        for little in (0.0, module.LITTLE):
+            monkeypatch.setattr(module, "LITTLE", little)
+            steps.clear()
+            counts.append((reml(structure, ()), len(steps)))
+        (slow, many), (found, few) = counts
+        assert found.converged and few <= many
+        own = slow.own > 1e-9 * slow.own.max()
+        np.testing.assert_array_equal(found.own > 1e-9 * found.own.max(), own)
+        np.testing.assert_allclose(found.own[own], slow.own[own], rtol=1e-8)
+        assert found.log_likelihood == pytest.approx(slow.log_likelihood, rel=1e-12)
+        scale = np.sqrt(np.diag(slow.state.Phi))
+        assert np.abs((found.state.x - slow.state.x) / scale).max() < 1e-8
+        vanished += few < many - 3
+    assert vanished >= 2

@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 SHARED = "+configuration"
 KINDS = ("auto", *STRUCTURES, *(name + SHARED for name in STRUCTURES))
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
+SEEN = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
 
 
@@ -68,13 +69,16 @@ class NoiseFit:
         return text + (f", and a deviation common to each {' / '.join(found)}" if found else "")
 
 
-def estimate_noise(readings: Readings, kind: str = "auto") -> NoiseFit:
+def estimate_noise(
+    readings: Readings, kind: str = "auto", like: NoiseFit | None = None
+) -> NoiseFit:
     """Variances of the chosen noise model by REML, and the estimate under it.
 
     `kind`: a structure (independent, axis, marker, groups, polar, stated), with "+configuration"
     for effects that readings of a configuration share, or "auto".  Auto tries every structure
     that the table has the labels and the readings for, each with shared effects, takes the one
     with the smallest criterion, and leaves the shared effects out where it is smaller without.
+    `like`, a fit of nearly the same readings, is where the search of a named kind starts.
 
     Raises InputError for an unknown kind or one that the readings do not support.
     """
@@ -82,7 +86,8 @@ def estimate_noise(readings: Readings, kind: str = "auto") -> NoiseFit:
         raise InputError(f"there is no noise model '{kind}'{did_you_mean(kind, KINDS)}")
     basis, T = _orthonormal(readings)
     if kind != "auto":
-        fit = _fitted(basis, kind.removesuffix(SHARED), kind.endswith(SHARED))
+        near = None if like is None else like.fit
+        fit = _fitted(basis, kind.removesuffix(SHARED), kind.endswith(SHARED), near)
         return _result(kind, fit, T, (), "as asked for")
     best: tuple[float, str, Reml] | None = None
     trials: list[Trial] = []
@@ -135,7 +140,7 @@ def _supported(readings: Readings) -> list[str]:
 
 
 def _fitted(readings: Readings, name: str, shared: bool, like: Reml | None = None) -> Reml:
-    """A structure's fit; the search for shared variances starts from those of `like`."""
+    """A structure's fit; the search starts from the variances of `like` where it has the same."""
     structure = STRUCTURES[name](readings)
     effects = shared_effects(structure.cells, readings.size, shared)
     if shared and not effects:
@@ -150,6 +155,8 @@ def _fitted(readings: Readings, name: str, shared: bool, like: Reml | None = Non
         start[:own] = np.exp(prior.mean)
     if like is not None and len(like.common) == len(effects):
         start[own:] = np.where(like.common > 0, like.common, start[own:])
+        if like.structure.names == structure.names:
+            start[:own] = np.where(like.own > SEEN * like.own.max(), like.own, start[:own])
     return reml(structure, effects, prior, start)
 
 

@@ -20,6 +20,9 @@ STEPS = 60
 DECREMENT = 1e-18  # gain in ℓ that a step still promises: variances exact to about nine digits
 VISIBLE = 1e-7  # gains below this drown in the rounding of ℓ, those of the score do not
 SMALLEST = 1e-10  # of the start: a variance that falls below this (σ by 1e5) stays there
+# A variance that goes to zero falls by e with every Newton step in its logarithm, and the gain with
+# it.  Once no step promises more than this, one step takes it all the way.
+LITTLE = 1e-3
 TINY = 1e-100  # stands for the variance of perfect data: its square is still a number
 
 
@@ -98,7 +101,9 @@ def reml(
         if gain < VISIBLE:
             state, last = evaluate(structure, stacked, _moved(state.theta, step, own, bound)), gain
         else:
-            moved = _line_search(structure, stacked, state, value, step, prior, own, bound)
+            moved = _vanished(structure, stacked, state, value, gain, step, prior, own, bound)
+            if moved is None:
+                moved = _line_search(structure, stacked, state, value, step, prior, own, bound)
             if moved is None:
                 converged = gain < 1e-4  # as good as rounding allows
                 break
@@ -186,6 +191,33 @@ def _moved(theta: Array, step: Array, own: int, bound: Array) -> Array:
     moved = theta + step
     moved[:own] = theta[:own] * np.exp(step[:own])
     return np.maximum(moved, bound)
+
+
+def _vanished(
+    structure: Structure,
+    stacked: list[Stack],
+    state: State,
+    value: float,
+    gain: float,
+    step: Array,
+    prior: LogPrior | None,
+    own: int,
+    bound: Array,
+) -> tuple[State, float] | None:
+    """The step that takes variances on their way to zero to their bound; None where there are
+    none or that costs."""
+    falling = np.zeros(len(step), dtype=bool)
+    falling[:own] = np.abs(step[:own] + 1.0) < 0.1
+    if gain > LITTLE or not falling.any():
+        return None
+    theta = _moved(state.theta, step, own, bound)
+    theta[falling] = bound[falling]
+    try:
+        trial = evaluate(structure, stacked, theta)
+    except np.linalg.LinAlgError:
+        return None
+    found = _objective(trial, prior, own)
+    return (trial, found) if found > value else None
 
 
 def _line_search(

@@ -1,0 +1,41 @@
+"""A whole table's fit: one evaluation per point, and B at the rows that its problem has."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from support.parts import positions, solved
+
+from elastocal.identification.fit import fit
+from elastocal.identification.partition import part_of
+
+
+def test_residual_and_B_of_a_point_come_from_one_evaluation(monkeypatch):
+    """No prediction without B, and no point of the descent twice in turn."""
+    model, table = positions()
+    solution = solved(model, table)
+    kept, points = solution.reduction.kept, []
+    problem = solution.problem.fit_of(kept, solution.problem.x0, solution.sizes)
+    regressor = type(model).regressor
+
+    def counted(self, table, x, columns, observations):
+        points.append(x.copy())
+        return regressor(self, table, x, columns, observations)
+
+    monkeypatch.setattr(type(model), "predict", None)
+    monkeypatch.setattr(type(model), "regressor", counted)
+    found = fit(problem)
+    assert found.converged and len(points) > 2
+    assert not any(np.array_equal(a, b) for a, b in pairwise(points))
+
+
+def test_B_follows_the_rows_of_the_problem():
+    """A fit that is handed on with readings left out has the B of those that are left."""
+    model, table = positions()
+    solution = solved(model, table)
+    problem = solution.fit.problem
+    few = part_of(problem.observations, problem.weights, np.arange(20))
+    own = replace(problem, observations=few.observations, weights=few.weights, cut=None)
+    shorter = replace(solution.fit, problem=own)
+    assert shorter.B.shape == (60, len(problem.columns))
+    np.testing.assert_array_equal(shorter.B, solution.fit.B[:60])
