@@ -27,7 +27,13 @@ from support.diagnoses import (
 
 from elastocal.diagnosis.result import EffectAt, NoiseFloor
 from elastocal.report.diagnosis_rows import budget_rows, candidate_rows, untested_rows
-from elastocal.report.diagnosis_verdict import headline, next_steps, sensitivity, verdict_lines
+from elastocal.report.diagnosis_verdict import (
+    headline,
+    hidden_below,
+    next_steps,
+    sensitivity,
+    verdict_lines,
+)
 from elastocal.report.diagnosis_words import (
     effect_at,
     name_of,
@@ -112,6 +118,13 @@ def test_the_smallest_effect_that_shows_has_distance_five():
     field *= float(told) * 1e-6 / math.sqrt((field**2).sum(axis=1).mean())
     sigma = NOTHING.gap.noise_floor / math.sqrt(3)
     assert np.linalg.norm(field / sigma) == pytest.approx(5, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("d", "text"), [(50.0, "0.10"), (5.0, "1.0"), (0.1, "50"), (0.01, "> 100"), (0.0, "–")]
+)
+def test_a_size_that_no_arm_has_is_not_given_as_a_number(d: float, text: str):
+    assert hidden_below(d) == text
 
 
 def test_nothing_says_what_hides_in_the_noise_and_what_does_not():

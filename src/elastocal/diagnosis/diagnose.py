@@ -105,7 +105,7 @@ def _unknown(found: Found) -> float:
     for slot in found.slots:
         each = slot.probabilities()[0]
         blocks = [p for item, p in zip(slot.items, each, strict=True) if not item.known]
-        shares.append(float(np.sum(blocks)))
+        shares.append(min(float(np.sum(blocks)), 1.0))  # a sum of hundreds may exceed it
     return max(shares)
 
 

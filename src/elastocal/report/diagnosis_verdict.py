@@ -26,6 +26,7 @@ from elastocal.report.words import printable
 # A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
 # Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
 SEEN, FAINTEST = 5.0, 3.0
+ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
 STRUCTURE = 0.05  # family-wise p-value from which on a driver is told
 MOST_NAMED = 6
 
@@ -170,7 +171,11 @@ def sensitivity(d: Diagnosis) -> list[str]:
 
 def hidden_below(detectable: float) -> str:
     """The size from which an effect would be seen, in typical sizes: "0.4"."""
-    return significant(SEEN / detectable, 2) if detectable > 0 else "–"
+    if detectable <= 0:
+        return "–"
+    if detectable * ABSURD < SEEN:
+        return f"> {ABSURD:.0f}"
+    return significant(SEEN / detectable, 2)
 
 
 def next_steps(d: Diagnosis) -> list[str]:
