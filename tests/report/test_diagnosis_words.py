@@ -106,6 +106,13 @@ def test_an_unknown_effect_has_a_place_a_driver_and_a_chance_but_no_name():
     assert "--plan" in text
 
 
+def test_what_is_named_beside_something_unknown_has_to_prove_itself():
+    beside = replace(UNKNOWN, effects=EXPLAINED.effects)
+    (step,) = [line for line in next_steps(beside) if "--cell-out" in line]
+    assert all(effect_at(f) in step for f in EXPLAINED.effects) and "--test" in step
+    assert not any("--cell-out" in line for line in next_steps(UNKNOWN))
+
+
 def test_an_unknown_effect_without_a_place_says_so():
     assert "do not show where" in headline(VERDICTS["unlocated"])
 

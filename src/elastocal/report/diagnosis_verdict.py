@@ -196,6 +196,12 @@ def next_steps(d: Diagnosis) -> list[str]:
             "Look for a physical cause where the evidence points, and measure more where the "
             "curve is steep; compensate nothing by a name that the data do not support."
         )
+        if d.effects:
+            names = together([effect_at(f) for f in d.effects], "and")
+            steps.append(
+                f"The cell that --cell-out writes has {names} added, and nothing for what has no "
+                "name: keep it only where it does better on poses kept back (identify --test)."
+            )
     else:
         steps.append("Nothing calls for another effect in the model.")
     if d.verdict in ("ambiguous", "unknown_effect") and d.extra is None:
