@@ -103,6 +103,15 @@ def test_the_published_methods_are_those_of_the_paper():
         np.testing.assert_allclose(np.sqrt(np.diag(stated)), std, rtol=1e-3)
 
 
+@pytest.mark.parametrize("method", ["reml", "ols", "eq14"])
+def test_a_bootstrap_is_drawn_by_the_seed_asked_for(method):
+    model, table, _ = campaign(poses=8)
+    options = [Options(method=method, intervals="wild", seed=seed) for seed in (1, 1, 2)]
+    ends = [np.array([e.ci95 for e in identify(model, table, o).estimates]) for o in options]
+    np.testing.assert_array_equal(ends[0], ends[1])
+    assert (ends[0] != ends[2]).any()
+
+
 def test_published_methods_fit_every_reading_unless_told_otherwise():
     model, table, _ = campaign()
     wrong = with_errors(table, 0.05)

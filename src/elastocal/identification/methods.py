@@ -154,7 +154,8 @@ def _published(
     kept = good if len(seen.lead) < len(good) else np.ones_like(good)
     solution = refined(whole, start, start.fit.x, kept, weights)
     if options.intervals != "auto":
-        return Found(method, solution, intervals_of(solution, options.intervals, None), None, good)
+        own = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
+        return Found(method, solution, own, None, good)
     covariance = Covariance(
         "eq13", last.covariance * np.outer(size, size), np.full(len(size), np.inf),
         "as published, eq. (13) with the σ of eq. (14): not corrected for estimated weights",
