@@ -114,7 +114,8 @@ class Dataset:
     def state(self, statement: Mapping[str, Any]) -> None:
         """Write down what the results are of: seed, options, hashes of the sources."""
         atomic_write_text(
-            self.folder / STATEMENT, json.dumps(statement, indent=1, ensure_ascii=False) + "\n"
+            self.folder / STATEMENT,
+            json.dumps(statement, indent=1, ensure_ascii=False, allow_nan=False) + "\n",
         )
 
     def stated(self) -> dict[str, Any]:

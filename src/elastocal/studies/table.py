@@ -89,7 +89,8 @@ class Table:
         common: dict[str, Any] = {"task": job.index, "task_hash": job.hash}
         for name, kind in self._task_kind.items():
             value = task.get(name)
-            common[name] = json.dumps(value, sort_keys=True) if kind == "json" else value
+            text = json.dumps(value, sort_keys=True, allow_nan=False) if kind == "json" else value
+            common[name] = text
         common |= {
             "task_seconds": outcome.seconds, "elastocal": self.version, "task_error": outcome.error
         }  # fmt: skip
