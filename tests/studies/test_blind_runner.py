@@ -25,6 +25,7 @@ import suites
 import worker
 from calibration import calibration_error, draw_reliability, reliability
 from draw import ALIKE, Recipe, draw_world
+from power import CANDIDATES, LEVEL, power
 from support.study_scripts import study_of
 from visits import draw_poses
 from world_files import write_world
@@ -486,3 +487,13 @@ def test_alike_pairs_are_named_as_the_tool_names_them():
     for effect, rival in ALIKE.items():
         sealed = truth(tuple(effect.split(":")))
         assert bars._rival({"truth": sealed}) == tuple(rival.split(":"))
+
+
+@pytest.mark.parametrize(("d", "parameters"), [(0.0, 1), (3.0, 1), (4.0, 3)])
+def test_the_power_of_a_test_is_how_often_it_rejects(d, parameters):
+    """By drawing the χ² of a mean at distance d from zero, at a level that draws can show."""
+    rng = np.random.default_rng(4)
+    z = rng.normal(size=(200_000, parameters))
+    least = np.quantile((z**2).sum(axis=1), 1 - LEVEL / CANDIDATES)
+    z[:, 0] += d
+    assert ((z**2).sum(axis=1) > least).mean() == pytest.approx(power(d, parameters), abs=0.02)
