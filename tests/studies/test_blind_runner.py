@@ -44,7 +44,7 @@ BACKLASHES = [("backlash", "joint2"), ("backlash", "joint3")]
 
 
 def truth(*places, location=None, joints=6):
-    effects = [{"effect": e, "where": w} for e, w in places]
+    effects = [{"effect": e, "where": w, "values": {"size": 1.0}} for e, w in places]
     if location:
         effects[0]["location"] = location
     return {"effects": effects, "arm_values": {"joint_offset_rad": [0.0] * joints}}
