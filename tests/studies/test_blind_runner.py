@@ -460,7 +460,7 @@ def test_the_report_counts_every_world_and_says_which_bars_are_met():
 
     right, wrong, done = answer("explained", ECCENTRIC), answer("explained", SCALE), []
     for k in range(20):
-        at = [{"distance": 7.0 if k else 1.5}]
+        at = [{"distance": 7.0 if k else 1.5, "nothing": 7.5}]
         given = right if k else wrong
         done.append(record("catalogue", k, given, distances=at))
     for k in range(10):
