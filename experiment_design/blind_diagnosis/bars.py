@@ -108,8 +108,14 @@ def _one_effect(every: Records) -> Iterator[Row]:
 def _alike(found: Sequence[Record]) -> Iterator[Row]:
     both = [both_reported(r["truth"], _rival(r), r["answer"]) for r in found]
     yield share("alike for any poses", "both reported", both, 0.95)
+    seen = [b for r, b in zip(found, both, strict=True) if _from_nothing(r) >= FAR]
+    yield share("… with d ≥ 5 from nothing", "both reported", seen)
     yield share("alike for any poses", "one claimed with > 90 %",
                 [sure(r["answer"]) for r in found], at_most=0.05)  # fmt: skip
+
+
+def _from_nothing(r: Record) -> float:
+    return float(r["distances"][0]["nothing"]) if "distances" in r else 0.0
 
 
 def _rival(r: Record) -> tuple[str, str]:

@@ -69,7 +69,7 @@ def _catalogue(poses: int, suite: str, seed: int, n: int) -> Iterator[Task]:
 
 def _alike(suite: str, seed: int, n: int) -> Iterator[Task]:
     for recipe in alike_recipes(seed, n):
-        yield Task(suite, recipe)
+        yield Task(suite, recipe, distance=True)
 
 
 def _clean(suite: str, seed: int, n: int) -> Iterator[Task]:
