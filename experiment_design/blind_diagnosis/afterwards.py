@@ -40,13 +40,14 @@ def plain_fit(visible: Path) -> Baseline:
     return fit_baseline(model, read(model, visible / "data.csv"))
 
 
-def distances(base: Baseline, world: World) -> list[dict[str, Any]]:
+def distances(base: Baseline, world: World, without: tuple[str, ...] = ()) -> list[dict[str, Any]]:
     """Of each true effect: d from nothing and from its nearest rival, in standard deviations.
 
     d² = min over β, γ of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s², where v is what the effect does to the
     noise-free readings beside the other effects, V the true noise with repeatability, X the
     fitted columns and those of the other effects, C the columns of the rival, at the best of its
-    settings, and s the width of its size prior.  `distance` is the smaller of the two.
+    settings, and s the width of its size prior.  `distance` is the smaller of the two.  Effects
+    that the tool went `without` are no rivals.
     """
     hypotheses, _ = possible(base.model, base.seen.table)
     scene = scene_of(base, hypotheses)
@@ -64,7 +65,8 @@ def distances(base: Baseline, world: World) -> list[dict[str, Any]]:
         grams = Grams(scene, data, at)
         alone = float((data.r * at.u).sum())
         taken = {(e.name, e.where) for e in world.effects}
-        left = {key: alone - _explained(grams, h) for key, h in known.items() if key not in taken}
+        rivals = {k: h for k, h in known.items() if k not in taken and h.name not in without}
+        left = {key: alone - _explained(grams, h) for key, h in rivals.items()}
         rival = min(left, key=left.__getitem__)
         nothing, nearest = (float(np.sqrt(max(d, 0.0))) for d in (alone, left[rival]))
         out.append({

@@ -81,6 +81,7 @@ def bar_rows(every: Records) -> list[Row]:
         *_pairs(every["pairs"]),
         *_unknown("outside the catalogue, × 2", every["outside"]),
         *_unknown("taken out of the catalogue, × 2", every["left_out"]),
+        *_unknown("… that nothing left in it imitates (d ≥ 5)", _unlike(every["left_out"])),
         *_probabilities(every),
         *_shrinkage("60 poses", every["catalogue"]),
         *_shrinkage("300 poses", every["catalogue300"]),
@@ -147,6 +148,10 @@ def _unknown(worlds: str, found: Sequence[Record]) -> Iterator[Row]:
     yield share(worlds, "its location right", [location_right(*_both(r)) for r in called], 0.8)
     yield share(worlds, "an effect of the catalogue claimed with > 90 %",
                 [sure(r["answer"]) for r in found], at_most=0.05)  # fmt: skip
+
+
+def _unlike(found: Sequence[Record]) -> list[Record]:
+    return [r for r in found if "distances" in r and weaker_distance(r["distances"]) >= FAR]
 
 
 def _probabilities(every: Records) -> Iterator[Row]:

@@ -74,7 +74,7 @@ def _afterwards(
         return {}
     base, answer, out = plain_fit(visible), record["answer"], dict[str, Any]()
     if task.distance:
-        out["distances"] = distances(base, world)
+        out["distances"] = distances(base, world, task.without)
     if task.shrinkage and answer is not None:
         first = [said[0] for said in claims(answer)]
         if first == truths(record["truth"]):

@@ -90,7 +90,7 @@ def _outside(suite: str, seed: int, n: int) -> Iterator[Task]:
 
 def _left_out(suite: str, seed: int, n: int) -> Iterator[Task]:
     for recipe in catalogue_recipes(seed, n, factor=LEFT_OUT_FACTOR):
-        yield Task(suite, recipe, without=recipe.effects)
+        yield Task(suite, recipe, without=recipe.effects, distance=True)
 
 
 def _sizes(suite: str, seed: int, n: int) -> Iterator[Task]:

@@ -370,6 +370,15 @@ def test_distance_scales_with_the_effect_and_does_not_see_the_noise_that_was_dra
     assert other["nothing"] == pytest.approx(one["nothing"] / 2, rel=0.01)
 
 
+def test_what_the_tool_went_without_is_no_rival(eccentric):
+    world, _, base = eccentric
+    (one,) = afterwards.distances(base, world)
+    nearest = one["rival"].partition(":")[0]
+    (other,) = afterwards.distances(base, world, (nearest,))
+    assert not other["rival"].startswith(nearest)
+    assert other["distance"] > one["distance"] and other["nothing"] == one["nothing"]
+
+
 def test_an_effect_beside_another_is_never_farther_from_nothing_than_alone(eccentric):
     """Its column may be explained by the other's in part."""
     world, _, base = eccentric
