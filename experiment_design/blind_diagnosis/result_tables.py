@@ -48,8 +48,9 @@ def report(done: Sequence[Record]) -> str:
     """All tables of these worlds."""
     every = by_suite(done)
     versions = ", ".join(sorted({r["version"] for r in done}))
+    seeds = " and ".join(str(seed) for seed in sorted({r["seed"] for r in done}))
     sections = [
-        f"# Blind check of `diagnose`, seed {done[0]['seed']}",
+        f"# Blind check of `diagnose`, seed {seeds}",
         f"{date.today().isoformat()}, elastocal {versions}, {len(done)} worlds. "
         "Intervals: Wilson, 95 %. An empty row has not been run.",
         "## Bars\n\n" + _bars(bar_rows(every)),

@@ -22,6 +22,7 @@ from elastocal.diagnosis.separate_rivals import RivalSet
 from elastocal.diagnosis.separate_rows import campaign_of, rows_of
 from elastocal.diagnosis.separate_search import expected, expected_of_random, fewest
 from elastocal.diagnosis.separate_settings import best_imitations
+from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 from elastocal.simulation.simulate import simulate, values_from
@@ -159,7 +160,7 @@ def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(contest) -> N
         contest, rivals=replace(contest.rivals, rivals=contest.rivals.rivals[:2], probability=p),
         draws=contest.draws[:2], before=np.zeros((2, 2, 1)), classes=np.arange(2),
     )  # fmt: skip
-    delta = 1.7
+    delta = 2.3
     squared = delta**2 * (1 - np.eye(2))[:, :, None]
     rng = np.random.default_rng(0)
     L = np.log(p[0] / p[1])
@@ -169,6 +170,18 @@ def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(contest) -> N
     assert two.probability(squared) == pytest.approx(p @ drawn, abs=2e-3)
     even = replace(two, rivals=replace(two.rivals, probability=np.array([0.5, 0.5])))
     assert even.probability(squared) == pytest.approx(stats.norm.cdf(delta / 2))
+
+
+def test_what_the_verdict_calls_alike_is_named_with_no_more_than_it_allows(contest) -> None:
+    """However the odds stand: a promise that the verdict cannot keep is none."""
+    p = np.array([0.5, 0.5])
+    two = replace(
+        contest, rivals=replace(contest.rivals, rivals=contest.rivals.rivals[:2], probability=p),
+        draws=contest.draws[:2], before=np.full((2, 2, 1), -40.0), classes=np.arange(2),
+    )  # fmt: skip
+    apart = 1 - np.eye(2)[:, :, None]
+    assert two.probability(0.99 * ALIKE**2 * apart) == pytest.approx(ALIKE_PROBABILITY)
+    assert two.probability(1.01 * ALIKE**2 * apart) > 0.99
 
 
 def test_the_search_finds_the_best_pair_of_visits(contest) -> None:

@@ -27,6 +27,7 @@ from elastocal.diagnosis.alike import PLAUSIBLE
 from elastocal.diagnosis.evidence import evidence_of
 from elastocal.diagnosis.separate_rivals import RivalSet
 from elastocal.diagnosis.separate_rows import Rows, eliminated
+from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -121,12 +122,16 @@ class Contest:
 
         By the union bound over the truth's rival classes, each as dangerous as its strongest
         member; not below what naming the likeliest so far gives, which nobody has to give up.
+        While a pair is as near as the verdict calls alike, no odds name one of the two with more
+        than ALIKE_PROBABILITY.
         """
         p = self.rivals.probability
         odds = np.log(np.bincount(self.classes, p)[self.classes])
         L = (odds[:, None] - odds[None, :])[..., None]
         delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
         beaten = norm.cdf(-(L + delta**2 / 2) / delta)
+        alike = squared < ALIKE**2
+        beaten = np.where(alike, np.maximum(beaten, 1 - ALIKE_PROBABILITY), beaten)
         lost = np.zeros(beaten.shape[:-2] + beaten.shape[-1:])
         for k in np.unique(self.classes):
             strongest = beaten[..., self.classes == k, :].max(axis=-2)
