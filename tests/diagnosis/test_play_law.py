@@ -13,11 +13,13 @@ from support.diagnosis_data import FITTED, Fault, cell, measured, plan
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.listing import warnings
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
 from elastocal.diagnosis.play_law import doubt, under_other_law, with_likelier_play
 from elastocal.diagnosis.recorded_drivers import with_recorded_drivers
 from elastocal.diagnosis.scan import Scan
 from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.diagnosis.screen import Screened
 from elastocal.diagnosis.truths import NOISES, Confirmation
 from elastocal.manipulator.model import Model
 
@@ -90,6 +92,19 @@ def test_one_configuration_alone_does_not_settle_the_law() -> None:
     r = right.data.r.copy()
     r[4] += 1e-3
     assert doubt(right, replace(right, data=replace(right.data, r=r))) > 0.1
+
+
+@pytest.mark.parametrize(("doubt_of_it", "told"), [(0.05, False), (0.5, True)])
+def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool) -> None:
+    one = replace(with_likelier_play(scene("load")), other_play=doubt_of_it)
+    (play,) = [h for h in one.hypotheses if (h.name, h.where) == PLAY.key]
+    plain = fit_set(one, ())
+    nothing: Scan = None  # type: ignore[assignment]
+    screened = Screened(one.data.faulty, one.data.faulty)
+    for items, expected in (((Item(play, np.zeros(0), 0.0),), told), ((), False)):
+        found = Found(one, fit_set(one, items), (), (), plain, nothing, nothing)
+        texts = [t for t in warnings(one, found, screened) if "play of joint3" in t]
+        assert bool(texts) == expected
 
 
 def test_play_by_either_law_may_be_true_at_fresh_poses() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from elastocal.diagnosis.found import Found
 from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.play_law import EFFECT
 from elastocal.diagnosis.result import Candidate, Untested
 from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.screen import Screened
@@ -15,6 +16,7 @@ DETECTABLE = 1.0  # standard deviations: below, a typical size does not move the
 STATED_LOW, STATED_HIGH = 0.67, 1.5
 FAULTY_SHARE = 0.02
 SUSPECT_SHARE = 0.05
+OPEN_LAW = 0.2  # probability of the other law of play from which the reader is told
 
 
 def candidates(scene: Scene, found: Found, answer: Answer) -> tuple[Candidate, ...]:
@@ -85,6 +87,22 @@ def warnings(scene: Scene, found: Found, screened: Screened) -> tuple[str, ...]:
             f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
             "other to be accidents; they were kept: look at them with `elastocal identify` first"
         )
+    if text := _undecided_play(found):
+        out.append(text)
     if scene.base.seen.table.time is None:
         out.append("without times neither drifts nor jumps can be seen: record time_s")
     return tuple(out)
+
+
+def _undecided_play(found: Found) -> str:
+    """That the law of the play that was found is not known, where it is not."""
+    named = [i.what.where for i in found.chosen.items if isinstance(i.what, Hypothesis)
+             and i.what.name == EFFECT]  # fmt: skip
+    if not named or found.scene.other_play <= OPEN_LAW:
+        return ""
+    places = " and ".join(named)
+    return (
+        f"hardly a reading tells whether the play of {places} follows the load alone or also the "
+        "last motion, so the error left at fresh poses is uncertain: measure poses in which the "
+        f"load hardly turns {places}, approached from both sides"
+    )
