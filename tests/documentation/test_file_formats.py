@@ -29,7 +29,9 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "file-formats.md").read_text(encoding="utf-8")
 EXAMPLE = ROOT / "experiment_design" / "blind_diagnosis" / "example"
 # Their keys are names of parameters, places, drivers or settings of the arm at hand.
-NAMED_BY_THE_ARM = ("terms", "prior_share", "drivers", "stages", "places", "settings", "removed_by")
+NAMED_BY_THE_ARM = (
+    "terms", "held", "prior_share", "drivers", "stages", "places", "settings", "removed_by",
+)  # fmt: skip
 
 
 def section(heading):
