@@ -29,8 +29,7 @@ def fresh_table(
     measured ones show: floor and fixtures keep fresh poses out of the same regions (unless
     hardly any is inside).  Of those, angles that lead out of the box more often are chosen more
     often, until every joint is as far from its middle as it was in the campaign.  Times are
-    uniform over the campaign's.  Readings are left as they are
-    and mean nothing.
+    uniform over the campaign's.  Readings are left as they are and mean nothing.
     """
     drawn, donors = _recombined(table, CANDIDATES * n, rng)
     low, high = _box(model.target_poses(table)[1], table.configuration)

@@ -71,7 +71,6 @@ def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
     # Step by step: one long stride of the line search ends where V is singular to rounding.
     # A round ends at the first small gain, often that of a poor first direction: the search is
     # over when a whole round gains nothing.
-    gain = np.inf
     for _ in range(ROUNDS):
         low, high = np.maximum(lower, theta - STRIDE), np.minimum(upper, theta + STRIDE)
         found = optimize.minimize(

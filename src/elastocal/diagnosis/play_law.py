@@ -10,15 +10,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit
 from scipy.stats import norm
 
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
-from elastocal.diagnosis.noise import NoiseValues
-from elastocal.diagnosis.projection import project
+from elastocal.diagnosis.noise import NoiseValues, NoisyData
+from elastocal.diagnosis.projection import Projection, project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.manipulator.model import Model
+
+Array = NDArray[np.float64]
 
 EFFECT, BY_LOAD, BY_BOTH = "backlash", "load", "load_and_approach"
 LAWS = {BY_LOAD: BY_BOTH, BY_BOTH: BY_LOAD}
@@ -73,11 +76,13 @@ def doubt(better: ModelSet, other: ModelSet) -> float:
     speak loudly for the wrong one; by the test of Vuong (1989, Econometrica 57) for laws of which
     none is quite true, their ratio counts against its own scatter.
     """
-    spent = []
-    for chosen in (better, other):
-        at = project(chosen.data, better.noise)
-        left = chosen.data.masked(chosen.data.r - chosen.data.X @ at.beta)
-        spent.append((left * at.u).sum(axis=1))
-    d = (spent[1] - spent[0]) / 2
+    others = _squares(other.data, project(other.data, better.noise))
+    d = (others - _squares(better.data, better.at)) / 2
     odds, scatter = max(float(d.sum()), 0.0), max(float(np.linalg.norm(d)), 1e-300)
     return float(max(expit(-odds), norm.cdf(-odds / scatter)))
+
+
+def _squares(data: NoisyData, at: Projection) -> Array:
+    """eᵀV⁻¹e of each configuration (C,) with what the fit leaves, e = r − Xβ."""
+    left = data.masked(data.r - data.X @ at.beta)
+    return np.asarray((left * at.u).sum(axis=1))
