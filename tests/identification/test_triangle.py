@@ -15,10 +15,15 @@ NIST = Path(__file__).parent / "nist"
 CERTIFIED = json.loads((NIST / "certified.json").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize(("name", "digits"), [("Longley", 9), ("Filip", 6), ("Wampler5", 6)])
+@pytest.mark.parametrize(("name", "digits"), [("Longley", 9), ("Filip", 6), ("Wampler5", 9)])
 def test_an_ill_conditioned_problem_keeps_its_digits(name, digits):
     """Condition numbers to 5e9 (columns scaled) enter once.  Normal equations, where they enter
-    squared, lose all digits of Filip; parts of five rows are smaller than the triangle itself."""
+    squared, lose all digits of Filip; parts of five rows are smaller than the triangle itself.
+
+    A digit counts of a coefficient or of its standard error, whichever is larger: the rounding of
+    readings 2e5 times as large as the coefficients, as Wampler5 has them, differs from one
+    processor's kernels to another's.
+    """
     certified = CERTIFIED[name]
     rows = np.loadtxt(NIST / f"{name}.csv", delimiter=",", skiprows=1)
     y, predictors = rows[:, 0], rows[:, 1:]
@@ -28,7 +33,8 @@ def test_an_ill_conditioned_problem_keeps_its_digits(name, digits):
     triangle = merge(Triangle.of(B[piece], y[piece]) for piece in pieces)
     scale = 1 / np.linalg.norm(B, axis=0)
     x, std = np.array(certified["x"]), np.array(certified["std"])
-    assert (np.abs(triangle.step(scale) / x - 1) < 10.0**-digits).all()
+    error = np.abs(triangle.step(scale) - x) / np.maximum(np.abs(x), std)
+    assert (error < 10.0**-digits).all()
     sigma = triangle.rest / np.sqrt(len(y) - len(x))
     found = sigma * np.sqrt(np.diag(triangle.cofactor(scale)))
     assert (np.abs(found / std - 1) < 10.0**-digits).all()
