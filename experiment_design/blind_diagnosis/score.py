@@ -64,6 +64,18 @@ def outright(truth: Json, answer: Json | None) -> bool:
     )  # fmt: skip
 
 
+def told_apart(truth: Json, plan: Json, answer: Json | None) -> bool:
+    """The effect is named outright, or among those alone of which the plan said that no pose
+    separates them."""
+    if answer is None or outright(truth, answer):
+        return answer is not None
+    said, (true,) = claims(answer), truths(truth)
+    if answer["verdict"] != "ambiguous" or len(said) != 1 or true not in said[0]:
+        return False
+    names = {":".join(rival) for rival in said[0]}
+    return any(names <= {*group} for group in plan["inseparable"])
+
+
 def claimed(answer: Json | None) -> bool:
     """Any effect is held to be there, of a known name or not."""
     return answer is not None and answer["verdict"] != "nothing_significant"

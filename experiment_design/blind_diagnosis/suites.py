@@ -19,6 +19,7 @@ from instrument import VARIANTS
 
 FACTORS = (0.1, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0)
 FEW_POSES, MANY_POSES = 60, 300
+TOO_FEW_POSES = 20  # campaigns that were ended too early
 LEFT_OUT_FACTOR = 2.0
 MOST = 1000  # worlds of one effect; names have three digits
 # Worlds of suites that are not counted by effect, over those per effect.
@@ -107,6 +108,11 @@ def _plan(suite: str, seed: int, n: int) -> Iterator[Task]:
             yield Task(suite, Recipe(name, (seed, i, k), (effect,), HARD_FACTOR), plan=True)
 
 
+def _plan_early(suite: str, seed: int, n: int) -> Iterator[Task]:
+    for recipe in catalogue_recipes(seed, n, poses=TOO_FEW_POSES):
+        yield Task(suite, recipe, plan=True)
+
+
 SUITES: dict[str, Callable[[str, int, int], Iterator[Task]]] = {
     "catalogue": partial(_catalogue, FEW_POSES),
     "catalogue300": partial(_catalogue, MANY_POSES),
@@ -117,4 +123,5 @@ SUITES: dict[str, Callable[[str, int, int], Iterator[Task]]] = {
     "left_out": _left_out,
     "sizes": _sizes,
     "plan": _plan,
+    "plan20": _plan_early,
 }

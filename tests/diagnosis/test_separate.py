@@ -122,8 +122,22 @@ def test_rivals_that_stay_alike_are_planned_for_as_one(narrow) -> None:
     extra = plan_extra(model, table, diagnosis_of(trio), most=3)
     alike = [t for t in extra.advice if "no pose separates" in t]
     assert len(alike) == 1 and "encoder_scale" not in alike[0]
+    assert extra.inseparable == (("gear_eccentricity:joint2", "link_mass_error:link2"),)
     assert extra.separable and extra.plan is not None
     assert extra.probability_before == pytest.approx(0.7)
+
+
+def test_what_the_verdict_had_no_room_for_is_a_rival(narrow) -> None:
+    """A set names three effects; a plan that knew no others would promise what they break."""
+    far, alike = ("encoder_scale", "joint2"), ("gear_second_harmonic", "joint3")
+    diagnosis = diagnosis_of({ECCENTRIC: 0.5, SCALE: 0.4, far: 0.05, alike: 0.001})
+    named = diagnosis.indistinguishable[0][:2]
+    diagnosis.indistinguishable = (named,)
+    extra = plan_extra(*narrow, diagnosis, most=3)
+    # Over ±0.5 rad half a wave of any length looks like any other.
+    assert extra.rivals == tuple(":".join(key) for key in (ECCENTRIC, SCALE, alike))
+    alone = plan_extra(*narrow, diagnosis_of({ECCENTRIC: 0.5, SCALE: 0.4}), most=3)
+    assert extra.probability_after < alone.probability_after
 
 
 def test_no_pose_is_asked_for_where_only_alike_rivals_are_left() -> None:

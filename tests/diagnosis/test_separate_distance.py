@@ -21,7 +21,7 @@ from elastocal.diagnosis.separate_pool import Pool, joined, pool_of
 from elastocal.diagnosis.separate_rivals import RivalSet
 from elastocal.diagnosis.separate_rows import campaign_of, rows_of
 from elastocal.diagnosis.separate_search import expected, expected_of_random, fewest
-from elastocal.diagnosis.separate_settings import best_imitations
+from elastocal.diagnosis.separate_settings import SETTINGS, imitations
 from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
@@ -208,7 +208,8 @@ def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, contest) ->
     found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
     whole = campaign_of(base, pool, [drift.what], type("Found", (), {"noise": found}))
     rivals = RivalSet.of([drift, quick], [0.5, 0.5], [])
-    best = best_imitations(whole.so_far, NOISE, rivals)
-    assert best[0, 1].settings[0] == pytest.approx(TIME_CONSTANT)
+    drifts = imitations(whole.so_far, NOISE, rivals)[1]
+    assert drifts[0].settings[0] == pytest.approx(TIME_CONSTANT)
+    assert 1 < len({float(item.settings[0]) for item in drifts}) == len(drifts) <= SETTINGS
     d = Contest.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
     assert d.distances(d.before)[0, 1] < 0.1

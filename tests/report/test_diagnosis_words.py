@@ -147,6 +147,10 @@ def test_extra_poses_promise_or_say_that_none_helps():
     promise = " ".join(next_steps(replace(AMBIGUOUS, extra=EXTRA)))
     assert "2 more poses" in promise and "from 0.69 to > 0.99" in promise and "0.85" in promise
     assert "--plan" not in promise
+    assert "count as one" not in promise
+    grouped = replace(EXTRA, inseparable=(("backlash:joint2", "encoder_scale:joint2"),))
+    lines = next_steps(replace(AMBIGUOUS, extra=grouped))
+    assert "Backlash at joint 2 and encoder scale at joint 2 count as one." in lines
     hopeless = " ".join(next_steps(replace(AMBIGUOUS, extra=INSEPARABLE)))
     assert "No pose that this cell allows tells apart gear eccentricity at joint 2" in hopeless
     assert "rises" not in hopeless

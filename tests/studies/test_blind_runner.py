@@ -94,6 +94,25 @@ def test_one_effect(given, outcome, outright):
     assert score.outright(truth(ECCENTRIC), given) is outright
 
 
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        (answer("explained", ECCENTRIC), True),
+        (answer("explained", MASS), False),
+        (answer("ambiguous", MASS, sets=[[MASS, ECCENTRIC]]), True),
+        (answer("ambiguous", MASS, sets=[[MASS, ECCENTRIC, SCALE]]), False),
+        (answer("ambiguous", ECCENTRIC, sets=[[ECCENTRIC, SCALE]]), False),
+        (answer("ambiguous", ECCENTRIC, MASS, sets=[[MASS, ECCENTRIC]]), False),
+        (NOTHING, False),
+        (None, False),
+    ],
+)
+def test_a_plan_is_held_to_what_it_said_it_can_tell_apart(given, kept):
+    plan = {"inseparable": [[":".join(ECCENTRIC), ":".join(MASS)]]}
+    assert score.told_apart(truth(ECCENTRIC), plan, given) is kept
+    assert not score.told_apart(truth(SCALE), plan, given)
+
+
 def test_a_claim_is_the_set_that_its_own_finding_leads():
     given = answer("ambiguous", MASS, SCALE, sets=[[SCALE, MASS], [MASS, ECCENTRIC]])
     assert score.claims(given) == [[MASS, ECCENTRIC], [SCALE, MASS]]

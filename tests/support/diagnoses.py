@@ -204,9 +204,17 @@ EXTRA = ExtraPlan(
     probability_after=0.997,
     probability_random=0.85,
     separable=True,
+    inseparable=(),
     advice=(f"pull sideways as well {HOSTILE}",),
 )
-INSEPARABLE = replace(EXTRA, plan=None, n_poses=0, separable=False, probability_after=0.69)
+INSEPARABLE = replace(
+    EXTRA,
+    plan=None,
+    n_poses=0,
+    separable=False,
+    probability_after=0.69,
+    inseparable=(EXTRA.rivals,),
+)
 
 VERDICTS = {
     "explained": EXPLAINED,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_cache import made_once
-from elastocal.diagnosis.tangent import with_tangents
+from elastocal.diagnosis.tangent import tangents, with_tangents
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.effects.driven import DrivenEffect
 from elastocal.manipulator.effects.entry import (
@@ -48,12 +49,14 @@ class Columns:
     """B of the model, of direct hypotheses and of the chain's entries, row by row of the table.
 
     `rows` (n_rows, size, K) at the fitted values, raw; `places` says which columns of it belong to
-    an effect (or entry) at a place.
+    an effect (or entry) at a place.  `whole` is the model with all of them, at x (K,).
     """
 
     base: Baseline
     rows: Array
     places: dict[tuple[str, str], slice]
+    whole: Model
+    x: Array
 
     @cached_property
     def table(self) -> Measurements:
@@ -66,6 +69,11 @@ class Columns:
     def of(self, hypothesis: Hypothesis) -> Array:
         """Columns (n_rows, size, k) of a hypothesis that is not driven."""
         return self.rows[:, :, self.places[hypothesis.name, hypothesis.where]]
+
+    def from_each_start(self, hypothesis: Hypothesis) -> Iterator[Array]:
+        """Its columns (n_rows, size, k) about each of the starts of which `of` has the best."""
+        for tangent in tangents(self.whole, hypothesis, self.base, self.x, self.rows):
+            yield tangent.columns
 
     def torques(self) -> Array:
         """The load's torque τ (n_rows, joints) on every joint, zero where nothing depends on it.
@@ -133,7 +141,7 @@ def compute_columns(
     for k, p in enumerate(whole.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
-    return Columns(base, B, places)
+    return Columns(base, B, places, whole, x)
 
 
 def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:

@@ -158,6 +158,7 @@ def _faulty(reading: FaultyReading) -> dict[str, Any]:
 def _extra(extra: ExtraPlan) -> dict[str, Any]:
     return {
         "separable": extra.separable,
+        "inseparable": [list(group) for group in extra.inseparable],
         "n_poses": extra.n_poses,
         "rivals": list(extra.rivals),
         "pairs": [vars(pair) for pair in extra.pairs],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from elastocal.diagnosis.baseline import Baseline, fit_baseline
 from elastocal.diagnosis.recorded_drivers import with_recorded_drivers
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.diagnosis.separate_contest import Contest
+from elastocal.diagnosis.separate_neighbours import with_neighbours
 from elastocal.diagnosis.separate_order import measuring_order
 from elastocal.diagnosis.separate_pool import Pool, draw_pool, pool_of
 from elastocal.diagnosis.separate_result import ExtraPlan, RivalPair
@@ -66,6 +67,8 @@ def plan_extra(
     suspects = Suspects(model, table, diagnosis)
     progress("extra poses: fitting the model as it is")
     base = fit_baseline(model, table, seed)
+    progress("extra poses: what else the rivals may be")
+    suspects = suspects.with_sets(with_neighbours(base, diagnosis, suspects.sets, suspects.known))
     progress("extra poses: drawing candidates")
     try:
         pool = draw_pool(
@@ -73,14 +76,15 @@ def plan_extra(
             most=_room(base), seed=seed,
         )  # fmt: skip
     except InsufficientDataError as error:
-        return _nothing(list(suspects.named_sets()), diagnosis, (str(error),))
+        return _nothing(list(suspects.sets), diagnosis, (str(error),))
     progress("extra poses: columns of the candidates")
     drawn = _drawn(base, pool, suspects, seed)
     sets = [c.rivals for c in drawn]
     contests, hopeless = _judged(drawn)
-    notes += [
-        advice.inseparable_advice(pair, distance, len(pool)) for pair, distance in hopeless.items()
-    ]
+    together = tuple(group for c in contests for group in _together(c))
+    for group in together:
+        near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
+        notes.append(advice.inseparable_advice(group, near, len(pool)))
     notes += advice.other_means(list(hopeless))
     # Where what can be told apart is told apart already, only what cannot be is left.
     worthwhile = any(c.open for c in contests) and expected(contests, ()) < ENOUGH
@@ -95,7 +99,8 @@ def plan_extra(
         pulled = _pulled(base, pool, suspects, seed)
         notes += _pull_notes(contests, hopeless, pulled, len(chosen), after, _newton(pool))
     if not worthwhile:
-        return replace(_nothing(sets, diagnosis, tuple(notes)), pairs=_pairs(contests, chosen))
+        nothing = _nothing(sets, diagnosis, tuple(notes))
+        return replace(nothing, pairs=_pairs(contests, chosen), inseparable=together)
     rng = np.random.default_rng(seed)
     return ExtraPlan(
         rivals=_names(sets),
@@ -106,6 +111,7 @@ def plan_extra(
         probability_after=after,
         probability_random=expected_of_random(contests, len(chosen), rng),
         separable=True,
+        inseparable=together,
         advice=(*advice.recording_advice(sets), *notes),
     )
 
@@ -119,7 +125,7 @@ def _room(base: Baseline) -> int:
 def _drawn(base: Baseline, pool: Pool, suspects: Suspects, seed: int) -> list[Contest]:
     """The contests of the diagnosis, with the candidates of a pool."""
     campaign = campaign_of(base, pool, suspects.hypotheses, suspects.diagnosis)
-    sets = list(suspects.named_sets())
+    sets = list(suspects.sets)
     if suspects.unknown:
         sets.append(suspects.unknown_set(campaign.so_far, campaign.noise))
     return [Contest.of(s, rows_of(campaign, s), np.random.default_rng(seed)) for s in sets]
@@ -142,6 +148,14 @@ def _judged(
     return judged, hopeless
 
 
+def _together(c: Contest) -> Iterator[tuple[str, ...]]:
+    """The rivals of each class that has several."""
+    for k in np.unique(c.classes):
+        names = [name for name, own in zip(c.rivals.names, c.classes, strict=True) if own == k]
+        if len(names) > 1:
+            yield tuple(names)
+
+
 def _pairs(contests: Sequence[Contest], chosen: Sequence[int]) -> tuple[RivalPair, ...]:
     out = []
     for c in contests:
@@ -156,7 +170,7 @@ def _nothing(sets: Sequence[RivalSet], diagnosis: Diagnosis, notes: tuple[str, .
     """No pose helps: the right one is named as often as the likeliest is right."""
     likeliest = [float(s.probability.max()) for s in sets]
     p = float(np.prod(likeliest)) if sets else diagnosis.probability_unknown
-    return ExtraPlan(_names(sets), (), None, 0, p, p, p, False, notes)
+    return ExtraPlan(_names(sets), (), None, 0, p, p, p, False, (), notes)
 
 
 def _names(sets: Sequence[RivalSet]) -> tuple[str, ...]:
@@ -186,7 +200,8 @@ def _pull_notes(
 ) -> list[str]:  # fmt: skip
     """Advice to pull sideways, where that helps."""
     still = _judged(pulled)[1] if pulled else hopeless
-    notes = [advice.pull_separates(pair, newton) for pair in hopeless if pair not in still]
+    helped = [pair for pair in hopeless if pair not in still]
+    notes = [advice.pull_separates(helped, newton)] if helped else []
     if pulled and n:
         alike = [p.in_classes(c.classes) for p, c in zip(pulled, contests, strict=True)]
         chosen = fewest(alike, n)

@@ -32,13 +32,13 @@ MEANS = {
 }
 
 
-def inseparable_advice(pair: tuple[str, str], distance: float, tried: int) -> str:
-    """That no pose separates two rivals."""
-    first, second = pair
-    return (
-        f"no pose separates {first} and {second}: measured in all {tried} poses that were tried "
-        f"they would be {distance:.1f} standard deviations apart"
-    )
+def inseparable_advice(group: Sequence[str], distance: float, tried: int) -> str:
+    """That no pose separates these rivals, neighbours among which are so far apart at most."""
+    names = " and ".join([", ".join(group[:-1]), group[-1]])
+    near = f"they would be {distance:.1f} standard deviations apart"
+    if len(group) > 2:
+        near = f"each would be within {distance:.1f} standard deviations of another of them"
+    return f"no pose separates {names}: measured in all {tried} poses that were tried {near}"
 
 
 def other_means(pairs: Sequence[tuple[str, str]]) -> list[str]:
@@ -65,12 +65,12 @@ def pull_advice(n: int, newton: float, without: float, with_pull: float) -> str:
     )
 
 
-def pull_separates(pair: tuple[str, str], newton: float) -> str:
+def pull_separates(pairs: Sequence[tuple[str, str]], newton: float) -> str:
     """That pulling sideways tells apart what the load alone does not."""
-    first, second = pair
+    apart = ", ".join(f"{first} and {second}" for first, second in pairs)
     return (
         f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a pulley, "
-        f"would separate {first} and {second}: measure poses under it, too"
+        f"would separate {apart}: measure poses under it, too"
     )
 
 

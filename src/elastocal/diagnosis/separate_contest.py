@@ -6,11 +6,12 @@ lets a rival be, s_b) eliminated, the signal C_a γ of rival a keeps the squared
     d²_ab(γ) = min_{β, η} |C_a γ − X β − C_b η|²_V⁻¹ + |β|²_Λ + |η|²/s_b² = γᵀ D_ab γ,
     D_ab = S_aa − S_ab (S_bb + I/s_b²)⁻¹ S_ba,
 
-with S the Schur complement of the nuisance in the Gram matrix: the T-criterion (Atkinson and
-Fedorov 1975), and twice the Kullback-Leibler distance (López-Fidalgo et al. 2007).  γ is what the
-data so far leave of it: draws from its posterior.  If a is the truth, further visits that raise
-d² by δ² move the log odds of a over b from where they stand, L_ab, by N(δ²/2, δ²), so that b
-wins with probability Φ(−(L_ab + δ²/2)/δ).
+with S the Schur complement of the nuisance in the Gram matrix and the smallest over the starts
+from which b is sought: the T-criterion (Atkinson and Fedorov 1975), and twice the
+Kullback-Leibler distance (López-Fidalgo et al. 2007).  γ is what the data so far leave of it:
+draws from its posterior.  If a is the truth, further visits that raise d² by δ² move the log odds
+of a over b from where they stand, L_ab, by N(δ²/2, δ²), so that b wins with probability
+Φ(−(L_ab + δ²/2)/δ).
 """
 
 from __future__ import annotations
@@ -93,15 +94,17 @@ class Contest:
         n, p = len(self.draws), self.rows.nuisance
         out = np.zeros((len(S), n, n, 2 * DRAWS))
         for a, b in permutations(range(n), 2):
-            truth, rival = self.rows.groups[a], self.rows.imitation(a, b)
+            truth, g = self.rows.groups[a], self.draws[a]
             of_a = slice(truth.start - p, truth.stop - p)
-            of_b = slice(rival.start - p, rival.stop - p)
             size = PLAUSIBLE * self.rivals.rivals[b].scales.max()
-            tie = np.eye(rival.stop - rival.start) / size**2
-            taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
-            D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
-            g = self.draws[a]
-            out[:, a, b] = np.maximum(((g @ D) * g).sum(axis=2), 0.0)
+            nearest = np.full((len(S), len(g)), np.inf)
+            for rival in self.rows.imitations[b]:
+                of_b = slice(rival.start - p, rival.stop - p)
+                tie = np.eye(rival.stop - rival.start) / size**2
+                taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
+                D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
+                nearest = np.minimum(nearest, ((g @ D) * g).sum(axis=2))
+            out[:, a, b] = np.maximum(nearest, 0.0)
         return out
 
     def gained(self, squared: Array) -> Array:

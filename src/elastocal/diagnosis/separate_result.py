@@ -27,9 +27,9 @@ class ExtraPlan:
 
     `plan` holds one row per visit (pose and load state) in the order of measuring, None where
     poses cannot separate them; `probability_before` and `probability_after` of naming the right
-    one of the rivals; `probability_random` the same after as many random poses.  Rivals of a
-    larger set that no pose separates count as one, and `advice` names them.  `advice` in words
-    (load, approach direction, time, monuments).
+    one of the rivals; `probability_random` the same after as many random poses.  Rivals that no
+    pose separates count as one: `inseparable`, groups of their names.  `advice` in words (load,
+    approach direction, time, monuments).
     """
 
     rivals: tuple[str, ...]
@@ -40,4 +40,5 @@ class ExtraPlan:
     probability_after: float
     probability_random: float
     separable: bool
+    inseparable: tuple[tuple[str, ...], ...]
     advice: tuple[str, ...]

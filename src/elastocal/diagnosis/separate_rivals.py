@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
+from elastocal.diagnosis.alike import item_key
 from elastocal.diagnosis.generic import Generic, generic_blocks
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.model_set import Item, packed_columns
@@ -94,8 +96,20 @@ class Suspects:
                 f"{table.source}: the diagnosis names {effect} at {where}, which this model and "
                 "table cannot test; plan with those that were diagnosed",
             )
+        self.sets = tuple(self._named_sets())
 
-    def named_sets(self) -> Iterator[RivalSet]:
+    @property
+    def known(self) -> dict[tuple[str, str], tuple[Item, float]]:
+        """Every effect that was tried, with its probability."""
+        return {key: (item, self._probability[key]) for key, item in self._items.items()}
+
+    def with_sets(self, sets: tuple[RivalSet, ...]) -> Suspects:
+        """The same with other sets of rivals."""
+        other = copy(self)
+        other.sets = sets
+        return other
+
+    def _named_sets(self) -> Iterator[RivalSet]:
         """The sets that the diagnosis calls indistinguishable."""
         for group in self.diagnosis.indistinguishable:
             keys = [(e.effect, e.where) for e in group if e.effect != UNKNOWN_EFFECT]
@@ -110,8 +124,8 @@ class Suspects:
     @property
     def hypotheses(self) -> list[Hypothesis]:
         """Everything that may take part."""
-        keys = [(e.effect, e.where) for group in self.diagnosis.indistinguishable for e in group]
-        keys = [key for key in keys if key[0] != UNKNOWN_EFFECT] + self._found
+        items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
+        keys = [item_key(item) for item in items] + self._found
         if self.unknown:
             keys += self._likeliest()
             # Torques, which may drive what is unknown, come from the compliances' columns.
@@ -127,7 +141,7 @@ class Suspects:
     @property
     def sides_matter(self) -> bool:
         """Whether the side of approach may tell the rivals apart."""
-        return self.unknown or any(s.depends_on("approach") for s in self.named_sets())
+        return self.unknown or any(s.depends_on("approach") for s in self.sets)
 
     @property
     def waiting_matters(self) -> bool:

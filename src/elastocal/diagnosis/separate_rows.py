@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, islice, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,11 @@ from elastocal.diagnosis.model_set import Item, packed_columns
 from elastocal.diagnosis.noise import NoiseValues, covariance
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.diagnosis.separate_noise import left_out, noise_found
 from elastocal.diagnosis.separate_pool import Pool, joined
 from elastocal.diagnosis.separate_rivals import RivalSet
-from elastocal.diagnosis.separate_settings import best_imitations
+from elastocal.diagnosis.separate_settings import imitations
+from elastocal.diagnosis.separate_starts import columns_of_starts
 from elastocal.manipulator.observation import observe
 
 Array = NDArray[np.float64]
@@ -68,12 +70,9 @@ def campaign_of(
         base, seen=seen, stated=np.concatenate([stated, usual[later]]),
         residual=np.concatenate([base.residual, np.zeros(size * len(later))]), planned=len(later),
     )  # fmt: skip
-    lines = [f.line for f in diagnosis.noise.faulty]
-    faulty = np.isin(seen.table.row[seen.lead], lines)
-    found = diagnosis.noise
-    noise = NoiseValues(found.stated_factor, np.array(found.repeatability), found.shared)
     measured = len(np.unique(table.configuration[base.seen.lead]))
-    return Campaign(scene_of(whole, hypotheses).without(faulty), measured, noise)
+    scene = scene_of(whole, hypotheses).without(left_out(whole, diagnosis))
+    return Campaign(scene, measured, noise_found(diagnosis))
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,8 @@ class Rows:
     `gram` (w, w) = Wᵀ V⁻¹ W of the data so far, with the nuisance's prior precision; `pool`
     (N, m, w) = V^−½ W of each candidate; `response` (w,) = Wᵀ V⁻¹ r.  Columns W: the `nuisance`
     first ones are those of the fitted parameters and of the effects beside the rivals, then each
-    rival's own, at `groups`, and at `imitations` those of b where it imitates a by other settings.
+    rival's own, at `groups`, and at `imitations` those with which it may imitate others instead:
+    at other settings or about other starts, each by itself.
     """
 
     gram: Array
@@ -91,20 +91,20 @@ class Rows:
     response: Array
     nuisance: int
     groups: tuple[slice, ...]
-    imitations: dict[tuple[int, int], slice]
-
-    def imitation(self, a: int, b: int) -> slice:
-        """The columns by which rival b imitates rival a."""
-        return self.imitations.get((a, b), self.groups[b])
+    imitations: tuple[tuple[slice, ...], ...]
 
 
 def rows_of(campaign: Campaign, contest: RivalSet) -> Rows:
     """Whiten the columns of `contest` by V = covariance of each configuration."""
     scene, data = campaign.scene, campaign.scene.data
-    imitations = best_imitations(campaign.so_far, campaign.noise, contest)
+    searched = imitations(campaign.so_far, campaign.noise, contest)
     beside = [_scaled(scene, item) for item in contest.beside]
-    items = [*contest.rivals, *imitations.values()]
-    own = [data.masked(packed_columns(scene, item)) for item in items]
+    others = [
+        [*(packed_columns(scene, i) for i in items), *columns_of_starts(scene, rival)]
+        for rival, items in zip(contest.rivals, searched, strict=True)
+    ]
+    own = [packed_columns(scene, rival) for rival in contest.rivals]
+    own = [data.masked(C) for C in [*own, *chain.from_iterable(others)]]
     nuisance = data.X.shape[2] + sum(C.shape[2] for C in beside)
     ends = nuisance + np.cumsum([0, *(C.shape[2] for C in own)])
     spans = [slice(int(a), int(b)) for a, b in pairwise(ends)]
@@ -118,9 +118,11 @@ def rows_of(campaign: Campaign, contest: RivalSet) -> Rows:
     gram[:fitted, :fitted] += np.diag(data.precision)
     gram[fitted:nuisance, fitted:nuisance] += np.eye(nuisance - fitted)
     n = len(contest.rivals)
+    rest = iter(spans[n:])
+    by = [tuple(islice(rest, len(each))) or (spans[b],) for b, each in enumerate(others)]
     return Rows(
         gram[:-1, :-1], white[campaign.measured :, :, :-1], gram[:-1, -1], nuisance,
-        tuple(spans[:n]), dict(zip(imitations, spans[n:], strict=True)),
+        tuple(spans[:n]), tuple(by),
     )  # fmt: skip
 
 

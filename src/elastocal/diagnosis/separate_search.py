@@ -3,7 +3,8 @@
 The design module's criteria are functions of one information matrix, convex and homogeneous of
 degree −1, which its bounds rest on.  Distances of rivals are neither: they start from data in
 hand, and a pair's distance is a difference of two informations.  So this search is its own: one
-candidate more at a time, each then exchanged for the best other until none helps.
+candidate more at a time until they are enough, each then exchanged for the best other until none
+helps, and what has become needless left out.
 """
 
 from __future__ import annotations
@@ -28,9 +29,15 @@ def fewest(contests: Sequence[Contest], most: int) -> list[int]:
     chosen: list[int] = []
     while len(chosen) < min(most, len(contests[0].rows.pool)):
         chosen.append(_best(contests, chosen)[0])
-        _exchange(contests, chosen)
         if expected(contests, chosen) >= ENOUGH:
             break
+    _exchange(contests, chosen)
+    while len(chosen) > 1 and expected(contests, chosen) >= ENOUGH:
+        fewer = _without_least(contests, chosen)
+        _exchange(contests, fewer)
+        if expected(contests, fewer) < ENOUGH:
+            break
+        chosen = fewer
     return chosen
 
 
@@ -56,6 +63,16 @@ def _best(contests: Sequence[Contest], chosen: Sequence[int]) -> tuple[int, floa
     return best, float(error[best])
 
 
+def _without_least(contests: Sequence[Contest], chosen: list[int]) -> list[int]:
+    """All but the one without which the error grows least."""
+    fewer = [chosen[:k] + chosen[k + 1 :] for k in range(len(chosen))]
+    return min(fewer, key=lambda left: _error(contests, left))
+
+
+def _error(contests: Sequence[Contest], chosen: Sequence[int]) -> float:
+    return sum(float(c.error_bound(c.squared(c.gram(chosen)))) for c in contests)
+
+
 def _exchange(contests: Sequence[Contest], chosen: list[int]) -> None:
     """Replace candidates in place while another one is better."""
     for _ in range(ROUNDS if len(chosen) > 1 else 0):
@@ -65,8 +82,7 @@ def _exchange(contests: Sequence[Contest], chosen: list[int]) -> None:
             best, error = _best(contests, others)
             if best == own:
                 continue
-            now = sum(float(c.error_bound(c.squared(c.gram(chosen)))) for c in contests)
-            if error < (1 - WORTH) * now:
+            if error < (1 - WORTH) * _error(contests, chosen):
                 chosen[k], changed = best, True
         if not changed:
             break

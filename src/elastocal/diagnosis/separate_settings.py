@@ -1,4 +1,8 @@
-"""The settings with which one rival imitates another best: its order, its time."""
+"""The settings with which one rival may imitate the others: its order, its time.
+
+The best in the data so far need not be the best once further poses are measured, when the
+diagnosis seeks them anew: what is nearly as good stays possible.
+"""
 
 from __future__ import annotations
 
@@ -18,38 +22,40 @@ from elastocal.diagnosis.separate_rivals import RivalSet
 
 Array = NDArray[np.float64]
 
+NEARLY = 4.0  # in d²: two standard deviations
+SETTINGS = 6  # of a rival that are tried, at most
 
-def best_imitations(
-    scene: Scene, noise: NoiseValues, contest: RivalSet
-) -> dict[tuple[int, int], Item]:
-    """(a, b) → rival b at the settings that explain most of rival a's signal.
 
-    Only where b has settings; the signal is a's at its estimate.  `scene` with only the data so
-    far counting.
+def imitations(scene: Scene, noise: NoiseValues, contest: RivalSet) -> tuple[tuple[Item, ...], ...]:
+    """Of each rival that has settings the item at those which explain most of another's signal,
+    the bests first, then what explains NEARLY as much; of other rivals nothing.
+
+    A signal is a rival's at its estimate; `scene` with only the data so far counting.
     """
-    searched = {
-        b: item.what
-        for b, item in enumerate(contest.rivals)
-        if isinstance(item.what, Hypothesis) and item.what.settings
-    }
+    rivals = contest.rivals
     widest = tuple(float(item.scales.max()) for item in contest.beside)
     data = with_items(scene, tuple(contest.beside), widest)
-    out: dict[tuple[int, int], Item] = {}
-    for a, item in enumerate(contest.rivals):
-        others = {b: h for b, h in searched.items() if b != a}
-        if not others:
-            continue
+    grams = {}
+    for a, item in enumerate(rivals):
         C = data.masked(packed_columns(scene, item))
-        both = data.with_columns(C, np.ones(C.shape[2]))
-        at = project(both, noise)
+        at = project(data.with_columns(C, np.ones(C.shape[2])), noise)
         signal = C @ at.beta[data.X.shape[2] :]
-        grams = Grams(scene, data, project(replace(data, r=signal), noise))
-        for b, h in others.items():
-            tried = settings_to_try(scene, h, item)
-            assert tried is not None  # it has settings
-            explained = grams.of_hypothesis(h, tried).explained(
-                float(contest.rivals[b].scales.max())
-            )
-            best = tried[int(np.argmax(explained))]
-            out[a, b] = replace(contest.rivals[b], settings=best)
-    return out
+        grams[a] = Grams(scene, data, project(replace(data, r=signal), noise))
+    return tuple(_of_rival(scene, rivals, b, grams) for b in range(len(rivals)))
+
+
+def _of_rival(
+    scene: Scene, rivals: tuple[Item, ...], b: int, grams: dict[int, Grams]
+) -> tuple[Item, ...]:
+    what, size = rivals[b].what, float(rivals[b].scales.max())
+    others = [a for a in range(len(rivals)) if a != b]
+    if not isinstance(what, Hypothesis) or not what.settings or not others:
+        return ()
+    lists = [settings_to_try(scene, what, rivals[a]) for a in others]
+    tried = np.unique(np.vstack([each for each in lists if each is not None]), axis=0)
+    explained = np.array([grams[a].of_hypothesis(what, tried).explained(size) for a in others])
+    short = explained.max(axis=1, keepdims=True) - explained
+    near = np.flatnonzero((short <= NEARLY).any(axis=0))
+    evenly = near[np.linspace(0, len(near) - 1, min(SETTINGS, len(near))).round().astype(int)]
+    chosen = list(dict.fromkeys([*short.argmin(axis=1), *evenly]))[:SETTINGS]
+    return tuple(replace(rivals[b], settings=tried[k]) for k in chosen)

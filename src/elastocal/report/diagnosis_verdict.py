@@ -225,4 +225,6 @@ def extra_lines(extra: ExtraPlan) -> list[str]:
             f"{probability(extra.probability_after)} (as many random poses: "
             f"{probability(extra.probability_random)})."
         ]
+        for group in extra.inseparable:
+            lines.append(f"{capital(together([name_of(name) for name in group]))} count as one.")
     return lines + [capital(printable(text)) for text in extra.advice]
