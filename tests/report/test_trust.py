@@ -58,6 +58,18 @@ def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
         assert any(remedy in step for step in found.steps), text
 
 
+@pytest.mark.parametrize(
+    ("ratio", "n", "doubted"),
+    [(1.4, 20, True), (1.4, 5, False), (1.3, 20, False), (1.3, 200, True), (1.2, 10000, False)],
+)
+def test_test_data_count_where_chance_does_not_explain_them(fine, ratio, n, doubted) -> None:
+    """Twenty readings may be 1.38 times worse by chance (1 %), five 1.74 times."""
+    known = replace(fine, dof=600, test=TestErrors(ratio * fine.heldout_rms, 0.0, 0.0, n))
+    found = judgement(known)
+    assert ("more than chance explains" in found.headline) == doubted
+    assert any("Compare the test poses" in step for step in found.steps) == doubted
+
+
 def test_what_is_no_better_than_nominal_must_not_be_used(fine: Any) -> None:
     useless = judgement(replace(fine, heldout_rms=2 * fine.nominal_rms))
     lost = judgement(replace(fine, converged=False, reason="100 steps"))
