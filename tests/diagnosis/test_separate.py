@@ -15,6 +15,7 @@ from elastocal.diagnosis.result import Location
 from elastocal.diagnosis.separate import plan_extra
 from elastocal.diagnosis.separate_order import measuring_order
 from elastocal.diagnosis.separate_pool import Pool, load_forces
+from elastocal.diagnosis.separate_rivals import Suspects
 from elastocal.errors import InputError
 from elastocal.manipulator.limits import finite_ranges, joint_limits
 from elastocal.manipulator.model import Model
@@ -167,6 +168,21 @@ def test_the_side_of_approach_is_chosen_where_rivals_depend_on_it() -> None:
     assert extra.plan is not None
     assert (extra.plan.approach[:, 2] == -1.0).any()
     assert any("side that the plan states" in text for text in extra.advice)
+
+
+def test_effects_that_keep_a_chance_are_rivals_of_the_unknown(narrow) -> None:
+    """The two likeliest in any case, others from one in a hundred."""
+    model, table = narrow
+    third, fourth = ("encoder_scale", "joint2"), ("encoder_scale", "joint4")
+    unknown = diagnosis_of({ECCENTRIC: 0.002, SCALE: 0.001})
+    unknown.verdict, unknown.indistinguishable, unknown.effects = "unknown_effect", (), ()
+    named = {h.where for h in Suspects(model, table, unknown).hypotheses if h.name == SCALE[0]}
+    assert named == {"joint3"}
+    unknown.candidates = diagnosis_of(
+        {ECCENTRIC: 0.1, SCALE: 0.05, third: 0.01, fourth: 0.009}
+    ).candidates
+    named = {h.where for h in Suspects(model, table, unknown).hypotheses if h.name == SCALE[0]}
+    assert named == {"joint2", "joint3"}
 
 
 def test_an_unknown_effect_is_told_from_its_likeliest_rivals(narrow) -> None:

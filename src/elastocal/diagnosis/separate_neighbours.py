@@ -17,12 +17,12 @@ from elastocal.diagnosis.model_set import Item, fit_set
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.diagnosis.scene import scene_of
 from elastocal.diagnosis.separate_noise import left_out, noise_found
-from elastocal.diagnosis.separate_rivals import RivalSet
+from elastocal.diagnosis.separate_rivals import CHANCE, RivalSet
 from elastocal.diagnosis.verdict import ALIKE
 
 # Alike, or so near (twice the deviate of 0.97, what a plan is to reach) that their evidence
 # leaves them a chance; so many at most, those named among them.
-NEAR, CHANCE, MOST = 3.76, 0.01, 10
+NEAR, MOST = 3.76, 10
 
 
 def with_neighbours(

@@ -24,8 +24,10 @@ from elastocal.errors import InputError, require
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
-# An unknown effect is told from so many known ones, as so many blocks at so many places.
-KNOWN, BLOCKS, PLACES = 2, 2, 2
+# An unknown effect is told from the known ones that keep a chance, so many at least and at most,
+# as so many blocks at so many places.
+CHANCE = 0.01
+FEWEST_KNOWN, MOST_KNOWN, BLOCKS, PLACES = 2, 6, 2, 2
 # Probability that a rival keeps, however unlikely it looks so far.  Blocks only approximate what
 # is unknown, so that the evidence for them against each other says less.
 SMALLEST, SMALLEST_UNKNOWN = 0.01, 0.05
@@ -176,7 +178,8 @@ class Suspects:
 
     def _likeliest(self) -> list[tuple[str, str]]:
         free = [k for k in self._items if k not in self._found]
-        return sorted(free, key=lambda k: -self._probability[k])[:KNOWN]
+        free = sorted(free, key=lambda k: -self._probability[k])[:MOST_KNOWN]
+        return [k for n, k in enumerate(free) if n < FEWEST_KNOWN or self._probability[k] >= CHANCE]
 
 
 def check_open(diagnosis: Diagnosis) -> None:
