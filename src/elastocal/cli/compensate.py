@@ -104,29 +104,12 @@ def compensate(
     """
     from elastocal.cli.compensate_files import commands_of, read_near, read_table_grid, table_of
     from elastocal.compensation.point import tool_point
-    from elastocal.compensation.targets import FRAMES
     from elastocal.files import atomic_write_text
     from elastocal.manipulator.calibrated import read_calibrated
 
     # What can be wrong with the options is told before any file is read.
-    require(frame in FRAMES, f"--frame takes base or tracker; found '{frame}'")
-    require(
-        targets is not None or target is not None or table is not None,
-        "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE",
-    )
-    require(
-        targets is None or target is None,
-        f"both {targets} and --target are given; drop one of them",
-    )
-    require(
-        output is None or targets is not None or target is not None,
-        "-o writes the commands of targets; name a table of them, or give --target",
-    )
-    require(
-        table is not None or (box is None and rotation is None and grid == "5"),
-        "--grid, --box and --rotation belong to a correction table; give --table FILE",
-    )
-    require(rotation is None or box is not None, "--rotation belongs to --box")
+    _check_targets(targets, target, frame, output, table)
+    _check_grid(table, grid, box, rotation)
     force = checked_force(load)
     written = [path for path in (output, table) if path is not None]
     check_outputs(*written)
@@ -168,6 +151,34 @@ def compensate(
             f"Next: run the commands of {output.name} (its q columns) and measure some: the tool "
             "should lie within two or three std_um, and the tracker's noise, of its targets."
         )
+
+
+def _check_targets(
+    targets: Path | None, target: str | None, frame: str, output: Path | None, table: Path | None
+) -> None:
+    from elastocal.compensation.targets import FRAMES
+
+    require(frame in FRAMES, f"--frame takes base or tracker; found '{frame}'")
+    require(
+        targets is not None or target is not None or table is not None,
+        "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE",
+    )
+    require(
+        targets is None or target is None,
+        f"both {targets} and --target are given; drop one of them",
+    )
+    require(
+        output is None or targets is not None or target is not None,
+        "-o writes the commands of targets; name a table of them, or give --target",
+    )
+
+
+def _check_grid(table: Path | None, grid: str, box: str | None, rotation: str | None) -> None:
+    require(
+        table is not None or (box is None and rotation is None and grid == "5"),
+        "--grid, --box and --rotation belong to a correction table; give --table FILE",
+    )
+    require(rotation is None or box is not None, "--rotation belongs to --box")
 
 
 def _targets(
