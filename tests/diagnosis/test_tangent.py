@@ -15,10 +15,10 @@ from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.model_set import Item
 from elastocal.diagnosis.result import NoiseFloor
 from elastocal.diagnosis.scene import scene_of
-from elastocal.diagnosis.separate_contest import Contest
-from elastocal.diagnosis.separate_pool import pool_of
-from elastocal.diagnosis.separate_rivals import RivalSet
-from elastocal.diagnosis.separate_rows import campaign_of, rows_of
+from elastocal.diagnosis.separate.contest import Contest
+from elastocal.diagnosis.separate.pool import pool_of
+from elastocal.diagnosis.separate.rivals import RivalSet
+from elastocal.diagnosis.separate.rows import campaign_of, rows_of
 
 COMPENSATOR = "gravity_compensator:joint2"
 

@@ -15,7 +15,7 @@ from elastocal.diagnosis.diagnose import diagnose
 from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.diagnosis.published import publish
 from elastocal.diagnosis.result import Curve, Untested
-from elastocal.diagnosis.separate_result import RivalPair
+from elastocal.diagnosis.separate.result import RivalPair
 from elastocal.identification.knowledge_schema import TABLES, KnowledgeTable
 from elastocal.identification.outlier import Outlier
 from elastocal.identification.robust.report import Finding

@@ -21,7 +21,7 @@ from elastocal.diagnosis.result import (
     StructureTest,
     Untested,
 )
-from elastocal.diagnosis.separate_result import ExtraPlan, RivalPair
+from elastocal.diagnosis.separate.result import ExtraPlan, RivalPair
 from elastocal.measurements import Measurements
 
 HOSTILE = "<script>alert(1)</script>\x1b[31m"

@@ -108,7 +108,7 @@ def _with_extra_poses(
     progress: Callable[[str], None],
 ) -> Diagnosis:  # fmt: skip
     """The diagnosis with the fewest of at most `most` poses that tell its rivals apart."""
-    from elastocal.diagnosis.separate import plan_extra
+    from elastocal.diagnosis.separate.plan import plan_extra
 
     progress("looking for poses that tell the rivals apart")
     return replace(

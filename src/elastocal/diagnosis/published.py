@@ -17,7 +17,7 @@ from elastocal.diagnosis.result import (
     NoiseFloor,
     Step,
 )
-from elastocal.diagnosis.separate_result import ExtraPlan
+from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.manipulator.model import Model
 
 SCHEMA = "elastocal/diagnosis/1"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.diagnosis.separate_result import ExtraPlan
+from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.manipulator.effects.base import Stage
 from elastocal.notebook import ForNotebooks
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from elastocal.diagnosis.result import Diagnosis, Finding, Interval, Step
-from elastocal.diagnosis.separate_result import ExtraPlan
+from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.report.diagnosis_verdict import hidden_below
 from elastocal.report.diagnosis_words import (
     driver_name,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from elastocal.diagnosis.result import Curve, Diagnosis, Finding, Location
-from elastocal.diagnosis.separate_result import ExtraPlan
+from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.report.diagnosis_words import (
     STAGES,
     capital,

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.separate_contest import Contest
+from elastocal.diagnosis.separate.contest import Contest
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, fit_set
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.diagnosis.scene import scene_of
-from elastocal.diagnosis.separate_noise import left_out, noise_found
-from elastocal.diagnosis.separate_rivals import CHANCE, RivalSet
+from elastocal.diagnosis.separate.noise import left_out, noise_found
+from elastocal.diagnosis.separate.rivals import CHANCE, RivalSet
 from elastocal.diagnosis.verdict import ALIKE
 
 # Alike, or so near (twice the deviate of 0.97, what a plan is to reach) that their evidence

@@ -12,10 +12,10 @@ from support.rivals import ECCENTRIC, JUMP_TIME, SCALE, campaign, diagnosis_of, 
 
 from elastocal.cell_workspace import Workspace
 from elastocal.diagnosis.result import Location
-from elastocal.diagnosis.separate import plan_extra
-from elastocal.diagnosis.separate_order import measuring_order
-from elastocal.diagnosis.separate_pool import Pool, load_forces
-from elastocal.diagnosis.separate_rivals import Suspects
+from elastocal.diagnosis.separate.order import measuring_order
+from elastocal.diagnosis.separate.plan import plan_extra
+from elastocal.diagnosis.separate.pool import Pool, load_forces
+from elastocal.diagnosis.separate.rivals import Suspects
 from elastocal.errors import InputError
 from elastocal.manipulator.limits import finite_ranges, joint_limits
 from elastocal.manipulator.model import Model

@@ -15,8 +15,8 @@ from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise import NoiseValues
 from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import scene_of
-from elastocal.diagnosis.separate import plan_extra
-from elastocal.diagnosis.separate_pool import joined
+from elastocal.diagnosis.separate.plan import plan_extra
+from elastocal.diagnosis.separate.pool import joined
 from elastocal.diagnosis.sums import direct
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
-from scipy.stats import norm
 
-from elastocal.diagnosis import separate_advice as advice
 from elastocal.diagnosis.baseline import Baseline, fit_baseline
 from elastocal.diagnosis.recorded_drivers import with_recorded_drivers
 from elastocal.diagnosis.result import Diagnosis
-from elastocal.diagnosis.separate_contest import Contest
-from elastocal.diagnosis.separate_neighbours import with_neighbours
-from elastocal.diagnosis.separate_order import measuring_order
-from elastocal.diagnosis.separate_pool import Pool, draw_pool, pool_of
-from elastocal.diagnosis.separate_result import ExtraPlan, RivalPair
-from elastocal.diagnosis.separate_rivals import RivalSet, Suspects, check_open
-from elastocal.diagnosis.separate_rows import campaign_of, rows_of
-from elastocal.diagnosis.separate_search import ENOUGH, expected, expected_of_random, fewest
+from elastocal.diagnosis.separate import advice
+from elastocal.diagnosis.separate.contest import Contest
+from elastocal.diagnosis.separate.judged import contests_of, judged, pairs_of, together
+from elastocal.diagnosis.separate.neighbours import with_neighbours
+from elastocal.diagnosis.separate.order import measuring_order
+from elastocal.diagnosis.separate.pool import Pool, draw_pool, pool_of
+from elastocal.diagnosis.separate.result import ExtraPlan
+from elastocal.diagnosis.separate.rivals import RivalSet, Suspects, check_open
+from elastocal.diagnosis.separate.search import ENOUGH, expected, expected_of_random, fewest
 from elastocal.diagnosis.thin import thinned
 from elastocal.errors import InsufficientDataError, require
 from elastocal.manipulator.model import Model
@@ -30,8 +28,6 @@ from elastocal.measurements import Measurements
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
-# A pair that all candidates together would not tell apart with this probability is inseparable.
-HOPE = 0.9
 NUMBERS = 20_000_000  # of the configurations' covariances that are held at once
 GAIN = 0.02  # of probability that a horizontal pull is worth mentioning for
 
@@ -51,7 +47,7 @@ def plan_extra(
     the sets that it calls indistinguishable, or what the unknown effect may be.  Candidates are
     feasible poses of the cell in the table's load states, after the campaign; their distances
     come from the columns of the fitted arm with all fitted parameters free (see
-    `separate_contest`).
+    `contest`).
 
     Raises InputError for a verdict that leaves no rivals, or fewer than one pose.
     """
@@ -77,12 +73,20 @@ def plan_extra(
         )  # fmt: skip
     except InsufficientDataError as error:
         return _nothing(list(suspects.sets), diagnosis, (str(error),))
+    return _chosen(base, pool, suspects, most, seed, notes, progress)
+
+
+def _chosen(
+    base: Baseline, pool: Pool, suspects: Suspects, most: int, seed: int, notes: list[str],
+    progress: Progress,
+) -> ExtraPlan:  # fmt: skip
+    """The plan from this pool, `notes` and what there is to say of it as its advice."""
     progress("extra poses: columns of the candidates")
-    drawn = _drawn(base, pool, suspects, seed)
+    drawn = contests_of(base, pool, suspects, seed)
     sets = [c.rivals for c in drawn]
-    contests, hopeless = _judged(drawn)
-    together = tuple(group for c in contests for group in _together(c))
-    for group in together:
+    contests, hopeless = judged(drawn)
+    groups = tuple(group for c in contests for group in together(c))
+    for group in groups:
         near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
         notes.append(advice.inseparable_advice(group, near, len(pool)))
     notes += advice.other_means(list(hopeless))
@@ -99,19 +103,19 @@ def plan_extra(
         pulled = _pulled(base, pool, suspects, seed)
         notes += _pull_notes(contests, hopeless, pulled, len(chosen), after, _newton(pool))
     if not worthwhile:
-        nothing = _nothing(sets, diagnosis, tuple(notes))
-        return replace(nothing, pairs=_pairs(contests, chosen), inseparable=together)
+        nothing = _nothing(sets, suspects.diagnosis, tuple(notes))
+        return replace(nothing, pairs=pairs_of(contests, chosen), inseparable=groups)
     rng = np.random.default_rng(seed)
     return ExtraPlan(
         rivals=_names(sets),
-        pairs=_pairs(contests, chosen),
-        plan=measuring_order(pool, chosen, table),
+        pairs=pairs_of(contests, chosen),
+        plan=measuring_order(pool, chosen, base.seen.table),
         n_poses=len(chosen),
         probability_before=expected(contests, ()),
         probability_after=after,
         probability_random=expected_of_random(contests, len(chosen), rng),
         separable=True,
-        inseparable=together,
+        inseparable=groups,
         advice=(*advice.recording_advice(sets), *notes),
     )
 
@@ -120,50 +124,6 @@ def _room(base: Baseline) -> int:
     """How many candidates fit into memory beside the data."""
     C, M = base.blocks.member.shape
     return max(NUMBERS // (M * base.seen.size) ** 2 - C, 0)
-
-
-def _drawn(base: Baseline, pool: Pool, suspects: Suspects, seed: int) -> list[Contest]:
-    """The contests of the diagnosis, with the candidates of a pool."""
-    campaign = campaign_of(base, pool, suspects.hypotheses, suspects.diagnosis)
-    sets = list(suspects.sets)
-    if suspects.unknown:
-        sets.append(suspects.unknown_set(campaign.so_far, campaign.noise))
-    return [Contest.of(s, rows_of(campaign, s), np.random.default_rng(seed)) for s in sets]
-
-
-def _judged(
-    contests: Sequence[Contest],
-) -> tuple[list[Contest], dict[tuple[str, str], float]]:
-    """Each contest in classes that the whole pool could tell apart, and the pairs that it could
-    not, with their distance in all of it."""
-    judged, hopeless = [], {}
-    for c in contests:
-        d = c.distances(c.squared(c.gram(range(len(c.rows.pool)))))
-        near = d < 2 * float(norm.ppf(HOPE))
-        classes = connected_components(near, directed=False)[1].astype(np.int64)
-        judged.append(c.in_classes(classes))
-        names = c.rivals.names
-        for a, b in zip(*np.nonzero(np.triu(near, 1)), strict=True):
-            hopeless[names[a], names[b]] = float(d[a, b])
-    return judged, hopeless
-
-
-def _together(c: Contest) -> Iterator[tuple[str, ...]]:
-    """The rivals of each class that has several."""
-    for k in np.unique(c.classes):
-        names = [name for name, own in zip(c.rivals.names, c.classes, strict=True) if own == k]
-        if len(names) > 1:
-            yield tuple(names)
-
-
-def _pairs(contests: Sequence[Contest], chosen: Sequence[int]) -> tuple[RivalPair, ...]:
-    out = []
-    for c in contests:
-        before, after = c.distances(c.before), c.distances(c.squared(c.gram(chosen)))
-        names = c.rivals.names
-        for a, b in zip(*np.triu_indices(len(names), 1), strict=True):
-            out.append(RivalPair(names[a], names[b], float(before[a, b]), float(after[a, b])))
-    return tuple(out)
 
 
 def _nothing(sets: Sequence[RivalSet], diagnosis: Diagnosis, notes: tuple[str, ...]) -> ExtraPlan:
@@ -191,7 +151,7 @@ def _pulled(base: Baseline, pool: Pool, suspects: Suspects, seed: int) -> list[C
     forces = np.vstack([pool.forces, _newton(pool) * np.eye(3)[:2]])
     table = base.seen.table
     wide = pool_of(base.model, base.x, table, pool.q, pool.approach, pool.time, forces)
-    return _drawn(base, wide, suspects, seed)
+    return contests_of(base, wide, suspects, seed)
 
 
 def _pull_notes(
@@ -199,7 +159,7 @@ def _pull_notes(
     pulled: Sequence[Contest], n: int, after: float, newton: float,
 ) -> list[str]:  # fmt: skip
     """Advice to pull sideways, where that helps."""
-    still = _judged(pulled)[1] if pulled else hopeless
+    still = judged(pulled)[1] if pulled else hopeless
     helped = [pair for pair in hopeless if pair not in still]
     notes = [advice.pull_separates(helped, newton)] if helped else []
     if pulled and n:

@@ -18,7 +18,7 @@ from elastocal.diagnosis.model_set import Item, packed_columns, with_items
 from elastocal.diagnosis.noise import NoiseValues
 from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene
-from elastocal.diagnosis.separate_rivals import RivalSet
+from elastocal.diagnosis.separate.rivals import RivalSet
 
 Array = NDArray[np.float64]
 

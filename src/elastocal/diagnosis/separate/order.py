@@ -9,7 +9,7 @@ from itertools import count, islice
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.separate_pool import Pool, time_step
+from elastocal.diagnosis.separate.pool import Pool, time_step
 from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]

@@ -15,11 +15,11 @@ from elastocal.diagnosis.model_set import Item, packed_columns
 from elastocal.diagnosis.noise import NoiseValues, covariance
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.separate_noise import left_out, noise_found
-from elastocal.diagnosis.separate_pool import Pool, joined
-from elastocal.diagnosis.separate_rivals import RivalSet
-from elastocal.diagnosis.separate_settings import imitations
-from elastocal.diagnosis.separate_starts import columns_of_starts
+from elastocal.diagnosis.separate.noise import left_out, noise_found
+from elastocal.diagnosis.separate.pool import Pool, joined
+from elastocal.diagnosis.separate.rivals import RivalSet
+from elastocal.diagnosis.separate.settings import imitations
+from elastocal.diagnosis.separate.starts import columns_of_starts
 from elastocal.manipulator.observation import observe
 
 Array = NDArray[np.float64]

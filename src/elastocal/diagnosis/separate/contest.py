@@ -26,8 +26,8 @@ from scipy.stats import norm
 
 from elastocal.diagnosis.alike import PLAUSIBLE
 from elastocal.diagnosis.evidence import evidence_of
-from elastocal.diagnosis.separate_rivals import RivalSet
-from elastocal.diagnosis.separate_rows import Rows, eliminated
+from elastocal.diagnosis.separate.rivals import RivalSet
+from elastocal.diagnosis.separate.rows import Rows, eliminated
 from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
 
 Array = NDArray[np.float64]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from elastocal.diagnosis.separate_rivals import RivalSet
+from elastocal.diagnosis.separate.rivals import RivalSet
 
 # What a look at something other than the arm's markers would settle, by effect.
 OTHER_MEANS = {

@@ -16,12 +16,12 @@ from elastocal.diagnosis.model_set import Item
 from elastocal.diagnosis.noise import NoiseValues
 from elastocal.diagnosis.result import NoiseFloor
 from elastocal.diagnosis.scene import widths
-from elastocal.diagnosis.separate_contest import DRAWS, Contest
-from elastocal.diagnosis.separate_pool import Pool, joined, pool_of
-from elastocal.diagnosis.separate_rivals import RivalSet
-from elastocal.diagnosis.separate_rows import campaign_of, rows_of
-from elastocal.diagnosis.separate_search import expected, expected_of_random, fewest
-from elastocal.diagnosis.separate_settings import SETTINGS, imitations
+from elastocal.diagnosis.separate.contest import DRAWS, Contest
+from elastocal.diagnosis.separate.pool import Pool, joined, pool_of
+from elastocal.diagnosis.separate.rivals import RivalSet
+from elastocal.diagnosis.separate.rows import campaign_of, rows_of
+from elastocal.diagnosis.separate.search import expected, expected_of_random, fewest
+from elastocal.diagnosis.separate.settings import SETTINGS, imitations
 from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
