@@ -49,6 +49,7 @@ def diagnosis_of(
         model_keys={"play_side": "load_and_approach"},
         noise=NoiseFloor(True, 1.0, SIGMA, (REPEATABILITY,) * 6, 0.2, None),
         probability_unknown=0.0,
+        probability_nothing=0.0,
     )
 
 

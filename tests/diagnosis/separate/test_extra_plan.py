@@ -128,6 +128,21 @@ def test_rivals_that_stay_alike_are_planned_for_as_one(narrow) -> None:
     assert extra.probability_before == pytest.approx(0.7)
 
 
+def test_what_may_be_none_of_the_rivals_is_counted(narrow) -> None:
+    """Noise alone, an effect that is no rival, something without a name: none gets named."""
+    model, table = narrow
+    sure = plan_extra(model, table, diagnosis_of({ECCENTRIC: 0.5, SCALE: 0.5}), most=1)
+    doubted = diagnosis_of({ECCENTRIC: 0.5, SCALE: 0.5, ("joint_hardening", "joint5"): 0.03})
+    doubted.indistinguishable = (doubted.indistinguishable[0][:2],)
+    doubted.probability_nothing, doubted.probability_unknown = 0.1, 0.02
+    extra = plan_extra(model, table, doubted, most=1)
+    for name in ("before", "after", "random"):
+        each = (getattr(found, f"probability_{name}") for found in (sure, extra))
+        assert next(each) * 0.85 == pytest.approx(next(each))
+    assert any("0.15 none of these rivals" in text for text in extra.advice)
+    assert not any("none of these rivals" in text for text in sure.advice)
+
+
 def test_what_the_verdict_had_no_room_for_is_a_rival(narrow) -> None:
     """A set names three effects; a plan that knew no others would promise what they break."""
     far, alike = ("encoder_scale", "joint2"), ("gear_second_harmonic", "joint3")

@@ -56,6 +56,14 @@ def too_few_advice(n: int, probability: float, reachable: float) -> str:
     )
 
 
+def none_of_them(missed: float, nothing: float) -> str:
+    """That the right answer may not be among the rivals."""
+    return (
+        f"with probability {missed:.2f} none of these rivals is at work (noise alone: "
+        f"{nothing:.2f}), which the probabilities count with: measure more poses of any kind first"
+    )
+
+
 def pull_advice(n: int, newton: float, without: float, with_pull: float) -> str:
     """That pulling sideways would help, and how much."""
     return (

@@ -28,6 +28,8 @@ from elastocal.measurements import Measurements
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
+# What a plan can aim at, and from which probability it goes without saying that one is at work.
+MOST_CERTAIN, MOSTLY = 0.99, 0.9
 NUMBERS = 20_000_000  # of the configurations' covariances that are held at once
 GAIN = 0.02  # of probability that a horizontal pull is worth mentioning for
 
@@ -72,7 +74,7 @@ def plan_extra(
             most=_room(base), seed=seed,
         )  # fmt: skip
     except InsufficientDataError as error:
-        return _nothing(list(suspects.sets), diagnosis, (str(error),))
+        return _nothing(suspects.sets, suspects, (str(error),))
     return _chosen(base, pool, suspects, most, seed, notes, progress)
 
 
@@ -90,20 +92,26 @@ def _chosen(
         near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
         notes.append(advice.inseparable_advice(group, near, len(pool)))
     notes += advice.other_means(list(hopeless))
+    covered = suspects.covered
+    if covered < MOSTLY:
+        notes.append(advice.none_of_them(1 - covered, suspects.diagnosis.probability_nothing))
+    # More poses may make up for a small doubt whether the right one is among the rivals.
+    enough = ENOUGH / covered if covered * MOST_CERTAIN >= ENOUGH else ENOUGH
     # Where what can be told apart is told apart already, only what cannot be is left.
-    worthwhile = any(c.open for c in contests) and expected(contests, ()) < ENOUGH
+    worthwhile = any(c.open for c in contests) and expected(contests, ()) < enough
     progress("extra poses: choosing")
-    chosen = fewest(contests, most) if worthwhile else []
+    chosen = fewest(contests, most, enough) if worthwhile else []
     after = expected(contests, chosen)
-    if after < ENOUGH or hopeless:
+    if after < enough or hopeless:
         progress("extra poses: what a horizontal pull would add")
-        if after < ENOUGH:
-            reachable = expected(contests, range(len(pool)))
-            notes.append(advice.too_few_advice(len(chosen), after, reachable))
+        if after < enough:
+            reachable = covered * expected(contests, range(len(pool)))
+            notes.append(advice.too_few_advice(len(chosen), covered * after, reachable))
         pulled = _pulled(base, pool, suspects, seed)
-        notes += _pull_notes(contests, hopeless, pulled, len(chosen), after, _newton(pool))
+        n, newton = len(chosen), _newton(pool)
+        notes += _pull_notes(contests, hopeless, pulled, n, after, newton, covered)
     if not worthwhile:
-        nothing = _nothing(sets, suspects.diagnosis, tuple(notes))
+        nothing = _nothing(sets, suspects, tuple(notes))
         return replace(nothing, pairs=pairs_of(contests, chosen), inseparable=groups)
     rng = np.random.default_rng(seed)
     return ExtraPlan(
@@ -111,9 +119,9 @@ def _chosen(
         pairs=pairs_of(contests, chosen),
         plan=measuring_order(pool, chosen, base.seen.table),
         n_poses=len(chosen),
-        probability_before=expected(contests, ()),
-        probability_after=after,
-        probability_random=expected_of_random(contests, len(chosen), rng),
+        probability_before=covered * expected(contests, ()),
+        probability_after=covered * after,
+        probability_random=covered * expected_of_random(contests, len(chosen), rng),
         separable=True,
         inseparable=groups,
         advice=(*advice.recording_advice(sets), *notes),
@@ -126,10 +134,11 @@ def _room(base: Baseline) -> int:
     return max(NUMBERS // (M * base.seen.size) ** 2 - C, 0)
 
 
-def _nothing(sets: Sequence[RivalSet], diagnosis: Diagnosis, notes: tuple[str, ...]) -> ExtraPlan:
+def _nothing(sets: Sequence[RivalSet], suspects: Suspects, notes: tuple[str, ...]) -> ExtraPlan:
     """No pose helps: the right one is named as often as the likeliest is right."""
     likeliest = [float(s.probability.max()) for s in sets]
-    p = float(np.prod(likeliest)) if sets else diagnosis.probability_unknown
+    p = float(np.prod(likeliest)) if sets else suspects.diagnosis.probability_unknown
+    p *= suspects.covered
     return ExtraPlan(_names(sets), (), None, 0, p, p, p, False, (), notes)
 
 
@@ -156,7 +165,7 @@ def _pulled(base: Baseline, pool: Pool, suspects: Suspects, seed: int) -> list[C
 
 def _pull_notes(
     contests: Sequence[Contest], hopeless: dict[tuple[str, str], float],
-    pulled: Sequence[Contest], n: int, after: float, newton: float,
+    pulled: Sequence[Contest], n: int, after: float, newton: float, covered: float,
 ) -> list[str]:  # fmt: skip
     """Advice to pull sideways, where that helps."""
     still = judged(pulled)[1] if pulled else hopeless
@@ -167,5 +176,7 @@ def _pull_notes(
         chosen = fewest(alike, n)
         reached = expected(alike, chosen)
         if reached > after + GAIN:
-            notes.append(advice.pull_advice(len(chosen), newton, after, reached))
+            notes.append(
+                advice.pull_advice(len(chosen), newton, covered * after, covered * reached)
+            )
     return notes

@@ -105,6 +105,15 @@ class Suspects:
         """Every effect that was tried, with its probability."""
         return {key: (item, self._probability[key]) for key, item in self._items.items()}
 
+    @property
+    def covered(self) -> float:
+        """Probability that the right answer is among the rivals: that there is something, and that
+        it is none of the effects that are no rivals."""
+        d, ours = self.diagnosis, set(self._rivals())
+        others = sum(p for key, p in self._probability.items() if key not in ours)
+        missed = d.probability_nothing + others + (0.0 if self.unknown else d.probability_unknown)
+        return min(max(1 - missed, 0.0), 1.0)
+
     def with_sets(self, sets: tuple[RivalSet, ...]) -> Suspects:
         """The same with other sets of rivals."""
         other = copy(self)
@@ -123,13 +132,17 @@ class Suspects:
                 [self._items[k] for k in self._found if k not in keys],
             )
 
+    def _rivals(self) -> list[tuple[str, str]]:
+        """The known rivals, and what is at work beside them."""
+        items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
+        keys = [item_key(item) for item in items] + self._found
+        return keys + self._likeliest() if self.unknown else keys
+
     @property
     def hypotheses(self) -> list[Hypothesis]:
         """Everything that may take part."""
-        items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
-        keys = [item_key(item) for item in items] + self._found
+        keys = self._rivals()
         if self.unknown:
-            keys += self._likeliest()
             # Torques, which may drive what is unknown, come from the compliances' columns.
             keys += [k for k in self._items if k[0] == "joint_compliance"]
         whats = [self._items[k].what for k in dict.fromkeys(keys)]

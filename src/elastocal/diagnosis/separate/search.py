@@ -24,18 +24,19 @@ WORTH = 1e-3  # relative fall of the error that an exchange is made for
 RANDOM_DRAWS = 32
 
 
-def fewest(contests: Sequence[Contest], most: int) -> list[int]:
-    """Candidates, at most `most`, of which ENOUGH is expected; `most` where fewer do not reach."""
+def fewest(contests: Sequence[Contest], most: int, enough: float = ENOUGH) -> list[int]:
+    """Candidates, at most `most`, with which the right one is named with a probability of
+    `enough`; `most` where fewer do not reach it."""
     chosen: list[int] = []
     while len(chosen) < min(most, len(contests[0].rows.pool)):
         chosen.append(_best(contests, chosen)[0])
-        if expected(contests, chosen) >= ENOUGH:
+        if expected(contests, chosen) >= enough:
             break
     _exchange(contests, chosen)
-    while len(chosen) > 1 and expected(contests, chosen) >= ENOUGH:
+    while len(chosen) > 1 and expected(contests, chosen) >= enough:
         fewer = _without_least(contests, chosen)
         _exchange(contests, fewer)
-        if expected(contests, fewer) < ENOUGH:
+        if expected(contests, fewer) < enough:
             break
         chosen = fewer
     return chosen
