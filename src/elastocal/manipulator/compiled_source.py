@@ -1,7 +1,7 @@
 """The C text of a tape: CasADi's generated code for one row, and a driver that loops over rows.
 
 CasADi writes one function of thousands of statements on one work array.  Compilers need time that
-grows faster than a function's length, so its statements are cut into functions of `PIECE`; they
+grows faster than a function's length, so its statements are cut into functions; they
 stay as CasADi wrote them but for the places where inputs are read and outputs stored.
 """
 
@@ -18,9 +18,13 @@ from elastocal.manipulator.backend_function import row_by_row
 # -O2, B of a KR 270 with 63 parameters (14 000 instructions), as compile time and time per row:
 # whole 2.4 s and 2.1 µs; 500 × 1 row 2.0 s and 3.5 µs; 500 × 8 2.1 s and 2.2 µs; 200 × 8 1.7 s and
 # 1.9 µs; 100 × 16 1.8 s and 2.1 µs; 200 × 32 1.8 s and 2.4 µs.  With 254 parameters (30 000
-# instructions): whole 8.4 s and 4.4 µs, 200 × 8 3.8 s and 5.3 µs.
-PIECE = 200
-ROWS = 8
+# instructions): whole 8.4 s and 4.4 µs, 200 × 8 3.8 s and 5.3 µs.  What is short compiles quickly
+# in long functions too, which hand on less through the work array: 3600 statements, 100 000 rows,
+# on another processor, beside CasADi's code compiled whole at -O3: 200 × 8 0.7 s and 1.24 times its
+# time, 1000 × 4 0.8 s and 1.17, 2000 × 4 0.9 s and 1.10.
+PIECE, LONG_PIECE = 200, 2000
+SHORT = 5000  # statements of a tape that is cut into long pieces
+ROWS = 4
 
 _READ = re.compile(r"arg\[(\d+)\]\? arg\[\d+\]\[(\d+)\] : 0")
 _STORE = re.compile(r"if \(res\[(\d+)\]!=0\) res\[\d+\]\[(\d+)\]=")
@@ -81,7 +85,8 @@ def c_source(function: ca.Function) -> str:
     if strange is not None:
         raise UnknownCode(strange.strip())
     registers = function.sz_w()
-    pieces = [statements[k : k + PIECE] for k in range(0, len(statements), PIECE)]
+    length = LONG_PIECE if len(statements) <= SHORT else PIECE
+    pieces = [statements[k : k + length] for k in range(0, len(statements), length)]
     helpers = text[: body.start()].replace("casadi_real casadi_", "static casadi_real casadi_")
     parts = [_PIECE.format(k=k, statements="\n".join(p)) for k, p in enumerate(pieces)]
     calls = "\n".join(_CALL.format(k=k, registers=registers) for k in range(len(pieces)))
