@@ -145,7 +145,17 @@ def test_the_noise_that_made_the_readings_is_found(truth: NoiseValues) -> None:
     assert found.shared == pytest.approx(truth.shared, abs=0.35)
 
 
-@pytest.mark.parametrize("n", [60, 400])
+def test_some_configurations_are_as_if_the_others_had_not_been_measured() -> None:
+    data = drawn(NOISE, 20, 4)
+    others = np.arange(20) % 3 != 0
+    left_out = data.left_out | others[:, None]
+    alone = likelihood(data.every(3), NOISE)
+    masked = likelihood(replace(data, left_out=left_out), NOISE)
+    assert alone[0] == pytest.approx(masked[0], rel=1e-12)
+    np.testing.assert_allclose(alone[1], masked[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [60, 400, 1100])
 def test_the_noise_found_is_the_most_probable_one(n: int) -> None:
     """No search from it or from the truth finds a twentieth of −2 log posterior more."""
     truth = NoiseValues(1.4, np.array([5e-6, 1.5e-5]), 0.6)

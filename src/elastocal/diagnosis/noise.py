@@ -84,6 +84,12 @@ class NoisyData:
         padded = np.concatenate([faulty, [True]])[self.blocks.member]
         return replace(self, left_out=np.repeat(padded, self.blocks.size, axis=1))
 
+    def every(self, step: int) -> NoisyData:
+        """The data of every `step`-th configuration alone."""
+        per_row = ("r", "X", "covariance", "G", "same_visit", "left_out")
+        blocks = replace(self.blocks, member=self.blocks.member[::step])
+        return replace(self, blocks=blocks, **{k: getattr(self, k)[::step] for k in per_row})
+
     @property
     def faulty(self) -> Mask:
         """Observations (N,) that are left out."""

@@ -20,16 +20,20 @@ from elastocal.diagnosis.projection import likelihood, posterior
 Array = NDArray[np.float64]
 
 STRIDE, ROUNDS = 1.5, 10  # of the logarithms
+SOME = 250  # configurations that show where the optimum is
 ENOUGH, LEVEL = 1e-3, 3e-3  # change of −2ℓ, and its slope, at which a search ends
 
 
 def fit_noise(data: NoisyData, start: NoiseValues | None = None) -> NoiseValues:
     """The most probable noise values, by a quasi-Newton search in their logarithms.
 
-    Where nothing is stated it starts from two ends, unless a start is given.
+    Where nothing is stated it starts from two ends, unless a start is given; with many
+    configurations it comes from some of them to all.
     """
     if start is not None:
         return _climbed(data, start)
+    if len(data.r) >= 2 * SOME:
+        return _climbed(data, fit_noise(data.every(len(data.r) // SOME)))
     starts = [NoiseValues.usual(data.G.shape[2])]
     if not data.stated:
         starts.append(_balanced(data))

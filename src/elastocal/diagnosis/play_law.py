@@ -42,12 +42,12 @@ def with_likelier_play(scene: Scene) -> Scene:
     under_other = replace(under_other, data=replace(under_other.data, left_out=scene.data.left_out))
     here, there = _likeliest(scene, noise), _likeliest(under_other, noise)
     if there.score <= here.score:
-        return replace(scene, other_play=doubt(here, there))
+        return scene.changed(other_play=doubt(here, there))
     rows = scene.columns.rows.copy()
     for h in play:
         rows[:, :, scene.columns.places[h.name, h.where]] = under_other.columns.of(h)
-    return replace(
-        scene, base=other, columns=replace(scene.columns, base=other, rows=rows),
+    return scene.changed(
+        base=other, columns=replace(scene.columns, base=other, rows=rows),
         other_play=doubt(there, here),
     )  # fmt: skip
 

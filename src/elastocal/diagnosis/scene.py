@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,6 +180,13 @@ class Scene:
         D = self.drives[h.name, h.where](self.base.seen.table, settings[None])[:, 0]
         rows = self.columns.entry(entry_key(h, self.base.model)) @ D
         return self.pack(rows) * size
+
+    def changed(self, **changes: Any) -> Scene:
+        """The same readings seen otherwise: their noise beside the fitted parameters stays."""
+        other = replace(self, **changes)
+        if "noise" in self.__dict__:
+            other.__dict__["noise"] = self.noise
+        return other
 
     def without(self, faulty: Mask) -> Scene:
         """The same with the observations where `faulty` (N,) holds left out."""
