@@ -13,6 +13,7 @@ from instrument import VARIANTS
 from records import Record
 from scipy.stats import norm
 from score import (
+    SURE,
     both_reported,
     claimed,
     is_unknown,
@@ -188,23 +189,25 @@ def _shrinkage(worlds: str, found: Sequence[Record]) -> Iterator[Row]:
 def _plan(poses: str, found: Sequence[Record]) -> Iterator[Row]:
     """Of the worlds for which extra poses were proposed and measured."""
     done = [r for r in found if r.get("extra")]
-    promised = [r for r in done if r["answer"]["extra_plan"]["probability_after"] >= NEARLY_CERTAIN]
-    worlds = f"extra poses after {poses}, ≥ 0.97 predicted"
 
-    def after(campaign: str) -> list[bool]:
-        return [
-            told_apart(r["truth"], r["answer"]["extra_plan"], r["extra"][campaign])
-            for r in promised
-        ]
+    def predicted(r: Record) -> float:
+        return float(r["answer"]["extra_plan"]["probability_after"])
 
-    planned = after("planned")
-    yield share(worlds, "told apart", planned, 0.95)
-    least = float(np.mean(after("random_twice"))) if promised else 0.0
-    yield share(worlds, "told apart, against twice as many random poses", planned, least)
-    yield share(worlds, "told apart with as many random poses", after("random"))
+    for least, bar in ((NEARLY_CERTAIN, 0.95), (SURE, 0.0), (0.0, 0.0)):
+        promised = [r for r in done if predicted(r) >= least]
+        worlds = f"extra poses after {poses}" + (f", ≥ {least:g} predicted" if least else "")
+        told = {name: _told_apart(promised, name) for name in ("planned", "random", "random_twice")}
+        mean = f" ({np.mean([predicted(r) for r in promised]):.3f} predicted)" if promised else ""
+        yield share(worlds, f"told apart{mean}", told["planned"], bar)
+        yield share(worlds, "… by as many random poses", told["random"])
+        yield share(worlds, "… by twice as many random poses", told["random_twice"])
     asked = [r for r in found if r["answer"] and r["answer"]["extra_plan"]]
     apart = [r["answer"]["extra_plan"]["separable"] for r in asked]
     yield share(f"rivals left after {poses}", "separable by poses, as said", apart)
+
+
+def _told_apart(found: Sequence[Record], campaign: str) -> list[bool]:
+    return [told_apart(r["truth"], r["answer"]["extra_plan"], r["extra"][campaign]) for r in found]
 
 
 def _runs(every: Records) -> Iterator[Row]:
