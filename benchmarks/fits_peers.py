@@ -147,7 +147,7 @@ def main() -> None:
         default=os.environ.get("ELASTOCAL_PEERS_PYTHON"),
         help="Python with FIGAROH and pybotics (default: ELASTOCAL_PEERS_PYTHON)",
     )
-    parser.add_argument("--quick", action="store_true", help="30 and 300 poses, one truth, 1 round")
+    parser.add_argument("--quick", action="store_true", help="one truth, 1 round")
     parser.add_argument("--every", action="store_true", help="the slow ways as well")
     parser.add_argument("--rounds", type=int, help="how often each fit runs (default: 3)")
     parser.add_argument("--truth", choices=TRUTHS, help="one truth instead of both")
@@ -165,7 +165,7 @@ def main() -> None:
     if rounds < 1:
         parser.error(f"--rounds takes 1 or more; found {rounds}")
     truths = (chosen.truth,) if chosen.truth else TRUTHS[: 1 if chosen.quick else 2]
-    sizes = tuple(chosen.poses or (SIZES[::2] if chosen.quick else SIZES))
+    sizes = tuple(chosen.poses or SIZES)
     contenders = [
         c for c in CONTENDERS if (c.own or python is not None) and (chosen.every or not c.slow)
     ]
