@@ -41,13 +41,13 @@ def folder(tmp_path):
 
 
 def test_it_runs_once_and_then_finds_nothing_to_do(folder):
-    first = study(folder, "--jobs", 1)
+    first = study(folder, "--jobs", 1, "--progress")
     assert first.exit_code == 0, first.stderr
     assert first.stdout == f"12 of 12 tasks done; results in {folder / 'results'}\n"
     assert "… 12/12 tasks" in first.stderr and "per minute" in first.stderr
     second = study(folder, "--jobs", 1, "--no-progress")
     assert second.exit_code == 0 and "12 of 12 tasks done (12 were there)" in second.stdout
-    assert second.stderr == ""
+    assert second.stderr == "" == study(folder, "--jobs", 1, "--progress", "--quiet").stderr
 
 
 def test_options_seed_output_and_only(folder, tmp_path):

@@ -43,8 +43,11 @@ def study(
         Path | None,
         typer.Option("-o", "--output", help="Folder of the results; default: FOLDER/results."),
     ] = None,
+    progress: Annotated[
+        bool, typer.Option("--progress/--no-progress", help="Rate and time left while it runs.")
+    ] = True,
     quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", "--no-progress", help="No progress.")
+        bool, typer.Option("--quiet", "-q", help="The same as --no-progress.")
     ] = False,
     only: Annotated[int | None, typer.Option(min=1, help="Run the first N tasks alone.")] = None,
     restart: Annotated[
@@ -73,7 +76,7 @@ def study(
     with opened(results) as dataset:
         if restart:
             dataset.clear()
-        with Stop() as stop, StudyProgress(not quiet) as shown:
+        with Stop() as stop, StudyProgress(progress and not quiet) as shown:
             runner = _runner(prepared, jobs, cluster, stop, shown.tell)
             ending = conduct(prepared, dataset, runner, stop, shown, only, retry_failed)
         typer.echo(_told(ending, results))
