@@ -102,7 +102,7 @@ def _contents(d: Diagnosis, model: Model) -> dict[str, Any]:
         "tone": "good" if d.verdict in ("explained", "nothing_significant") else "care",
         "verdict": lines,
         "steps": next_steps(d),
-        "warnings": [printable(w) for w in d.warnings],
+        "warnings": [capital(printable(w)) for w in d.warnings],
         "readings": f"{counted(d.n_readings, 'reading')} in "
         f"{counted(d.n_configurations, 'configuration')}",
         "boxes": _boxes(d),
