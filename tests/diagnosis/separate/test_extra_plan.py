@@ -11,7 +11,9 @@ from support.cells import DOWN, table_of
 from support.rivals import ECCENTRIC, JUMP_TIME, SCALE, campaign, diagnosis_of, measured
 
 from elastocal.cell_workspace import Workspace
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.result import Location
+from elastocal.diagnosis.separate.neighbours import with_neighbours
 from elastocal.diagnosis.separate.order import measuring_order
 from elastocal.diagnosis.separate.plan import plan_extra
 from elastocal.diagnosis.separate.pool import Pool, load_forces
@@ -126,6 +128,19 @@ def test_rivals_that_stay_alike_are_planned_for_as_one(narrow) -> None:
     assert extra.inseparable == (("gear_eccentricity:joint2", "link_mass_error:link2"),)
     assert extra.separable and extra.plan is not None
     assert extra.probability_before == pytest.approx(0.7)
+
+
+def test_an_unlisted_rival_is_as_probable_as_the_listed_ones_are(narrow) -> None:
+    """Given that there is something at all, as the probabilities of those listed are."""
+    model, table = narrow
+    alike = ("gear_second_harmonic", "joint3")
+    diagnosis = diagnosis_of({ECCENTRIC: 0.5, SCALE: 0.4, alike: 0.05})
+    diagnosis.indistinguishable = (diagnosis.indistinguishable[0][:2],)
+    diagnosis.probability_nothing = 0.5
+    suspects = Suspects(model, table, diagnosis)
+    base = fit_baseline(model, table)
+    (rivals,) = with_neighbours(base, diagnosis, suspects.sets, suspects.known)
+    np.testing.assert_allclose(rivals.probability, [0.5, 0.4, 0.1])
 
 
 def test_what_may_be_none_of_the_rivals_is_counted(narrow) -> None:

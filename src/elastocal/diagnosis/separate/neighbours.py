@@ -52,6 +52,9 @@ def with_neighbours(
         ]
         free = sorted(free, key=lambda key: near[key])[: max(MOST - len(s.rivals), 0)]
         rivals = [*s.rivals, *(known[key][0] for key in free)]
-        p = [*s.probability, *(known[key][1] for key in free)]
+        # Those named have their probability given that there is something, as these need, too.
+        something = max(1 - diagnosis.probability_nothing, 1e-9)
+        named = [known[item_key(item)][1] for item in s.rivals]
+        p = [*named, *(known[key][1] / something for key in free)]
         out.append(RivalSet.of(rivals, p, s.beside))
     return tuple(out)
