@@ -47,7 +47,7 @@ class Engine:
 @pytest.fixture
 def engine(monkeypatch):
     stand_in = Engine()
-    for name in ("diagnose", "separate"):
+    for name in ("diagnose", "separate.plan"):
         module = ModuleType(name)
         module.diagnose = stand_in.diagnose
         module.plan_extra = stand_in.plan_extra

@@ -44,10 +44,11 @@ def study(
         typer.Option("-o", "--output", help="Folder of the results; default: FOLDER/results."),
     ] = None,
     progress: Annotated[
-        bool, typer.Option("--progress/--no-progress", help="Rate and time left while it runs.")
+        bool,
+        typer.Option("--progress", show_default=False, help="Rate and time left: the default."),
     ] = True,
     quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="The same as --no-progress.")
+        bool, typer.Option("--quiet", "-q", "--no-progress", help="No progress.")
     ] = False,
     only: Annotated[int | None, typer.Option(min=1, help="Run the first N tasks alone.")] = None,
     restart: Annotated[

@@ -6,14 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.diagnosis.noise import NoiseValues
+from elastocal.diagnosis.noise import SMALLEST, NoiseValues
 from elastocal.diagnosis.result import Diagnosis
 
 
 def noise_found(diagnosis: Diagnosis) -> NoiseValues:
     """Factor, repeatability (joints,) and shared scatter."""
     found = diagnosis.noise
-    return NoiseValues(found.stated_factor, np.array(found.repeatability), found.shared)
+    joint = np.maximum(found.repeatability, SMALLEST)
+    return NoiseValues(found.stated_factor, joint, found.shared)
 
 
 def left_out(base: Baseline, diagnosis: Diagnosis) -> NDArray[np.bool_]:
