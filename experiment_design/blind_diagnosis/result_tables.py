@@ -26,7 +26,7 @@ from scipy.stats import norm
 from score import claims, is_unknown, location_right, one_effect, outright, sure
 from suites import FACTORS, SUITES
 
-from elastocal.studies.dataset import read_results
+from elastocal.studies import read_results
 
 DISTANCES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, np.inf)
 

@@ -15,8 +15,8 @@ from support.study_folders import SCRIPT, numbers, run_study, write_study
 from typer.testing import CliRunner
 
 from elastocal.cli import app
-from elastocal.cli.study_progress import StudyProgress
-from elastocal.studies.dataset import read_results
+from elastocal.cli.study import StudyProgress
+from elastocal.studies import read_results
 
 # A child may inherit that SIGINT is ignored; here it must not.
 PROGRAM = (
@@ -244,9 +244,9 @@ def test_a_study_on_a_cluster_is_interrupted_and_goes_on(tmp_path):
 
 def test_a_terminal_sees_a_bar_with_rate_and_time_left(monkeypatch):
     screen = Console(file=io.StringIO(), force_terminal=True, width=120)
-    monkeypatch.setattr("elastocal.cli.study_progress.console", lambda stderr: screen)
+    monkeypatch.setattr("elastocal.cli.study.console", lambda stderr: screen)
     with StudyProgress(True) as progress:
-        progress.begin(40, 10, 1)
-        progress.advance(True)
+        progress.show(40, 10, 1)
+        progress.show(40, 11, 2)
     last = screen.file.getvalue().rpartition("━")[2]
     assert "11/40 tasks" in last and "per minute" in last and "left, 2 failed" in last

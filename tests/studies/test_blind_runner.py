@@ -30,7 +30,7 @@ from support.study_scripts import study_of
 from visits import draw_poses
 from world_files import write_world
 
-from elastocal.studies.conduct import prepare
+from elastocal.studies import read_study
 
 study = study_of(FOLDER)
 ECCENTRIC, MASS, SCALE = (
@@ -340,9 +340,9 @@ def test_a_task_is_the_suites_world_of_that_name_under_the_studys_seed(monkeypat
 def test_what_the_study_returns_is_what_study_toml_lists(monkeypatch):
     monkeypatch.setattr(one_world, "_own_worker", Blindfold)
     monkeypatch.setattr(study, "named", lambda *_: task())
-    prepared = prepare(FOLDER, seed=5)
-    row = study.run(prepared.jobs[0].task, prepared.jobs[0].rng())
-    assert set(row) == set(prepared.definition.columns)
+    prepared = read_study(FOLDER, seed=5)
+    row = study.run(prepared.tasks[0].values, prepared.tasks[0].rng())
+    assert set(row) == set(prepared.sources.columns)
     assert row["verdict"] == NOTHING["verdict"] and row["seconds"] == 1.0
     assert json.loads(row["record"])["truth"]["effects"][0]["effect"] == "encoder_scale"
 

@@ -10,10 +10,8 @@ import pytest
 from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies.cluster import run_at
-from elastocal.studies.cluster_client import ClusterLostError, connect
-from elastocal.studies.dataset import read_results
-from elastocal.studies.stopping import Stop
+from elastocal.studies import ClusterLostError, StudyStop, read_results, run_cluster
+from elastocal.studies.study_run import connect
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
@@ -63,10 +61,8 @@ def marked(tmp_path, lethal=None, count=12, sleep=0.02):
 
 
 def at(address, stop=None, told=None):
-    stop, told = stop or Stop(), [] if told is None else told
-    return lambda study: (
-        lambda jobs: run_at(address, study.package, study.digest, jobs, stop, told.append)
-    )
+    stop, told = stop or StudyStop(), [] if told is None else told
+    return lambda study: lambda tasks: run_cluster(study, tasks, address, stop, told.append)
 
 
 def begun(marks):
@@ -159,7 +155,7 @@ def test_a_task_that_raises_fails_alone(cluster, tmp_path):
 
 def test_a_stop_waits_for_what_is_out_and_the_rest_runs_later(cluster, tmp_path):
     folder, marks = marked(tmp_path, count=30)
-    stop = Stop()
+    stop = StudyStop()
 
     def ask():
         while len(list(marks.iterdir())) < 6:
@@ -182,18 +178,18 @@ def test_a_cluster_in_the_configuration_of_dask(cluster, tmp_path):
 
 
 def test_no_scheduler_is_told(monkeypatch):
-    monkeypatch.setattr("elastocal.studies.cluster_client.ANSWER", 0.5)
+    monkeypatch.setattr("elastocal.studies.study_run.ANSWER", 0.5)
     nothing = dask.config.set({"scheduler-address": None})
     with nothing, pytest.raises(InputError, match="names no scheduler"):
         connect("config")
     with pytest.raises(InputError, match="no scheduler answers"):
         connect("tcp://127.0.0.1:9")
-    with pytest.raises(InputError, match="--cluster"):
+    with pytest.raises(InputError, match="cluster=nowhere at all"):
         connect("nowhere at all")
 
 
 def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path, monkeypatch):
-    monkeypatch.setattr("elastocal.studies.cluster.PATIENCE", 1.0)
+    monkeypatch.setattr("elastocal.studies.study_run.PATIENCE", 1.0)
     folder, marks = marked(tmp_path, count=200, sleep=0.05)
     cluster = distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0"

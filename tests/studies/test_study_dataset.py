@@ -9,12 +9,9 @@ import pytest
 from support.study_folders import SCRIPT, TOML, here, numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies import recorder
-from elastocal.studies.conduct import prepare
-from elastocal.studies.dataset import Dataset, opened, read_results
-from elastocal.studies.execution import execute
-from elastocal.studies.recorder import Recorder
-from elastocal.studies.table import Table
+from elastocal.studies import read_results, read_study, study_results
+from elastocal.studies.study_folder import execute
+from elastocal.studies.study_results import Recorder, StudyResults, opened
 
 
 @pytest.fixture
@@ -84,7 +81,7 @@ def test_results_of_another_study_are_refused(folder, results, script, toml, tol
     write_study(folder, script, toml)
     with pytest.raises(InputError, match=told) as refused:
         run_study(folder, results)
-    assert "--restart" in str(refused.value)
+    assert "restart=True" in str(refused.value)
     pd.testing.assert_frame_equal(numbers(results), before)
 
 
@@ -108,17 +105,16 @@ def test_more_tasks_of_the_same_kind_at_the_end_go_on(tmp_path):
 
 
 def outcomes_of(folder, results):
-    study = prepare(folder)
+    study = read_study(folder)
     results.mkdir()
-    table = Table(study.jobs, study.package.columns, "0")
-    return Dataset(results), table, [execute(study.package, study.digest, j) for j in study.jobs]
+    return StudyResults(results), study, [execute(study.sources, task) for task in study.tasks]
 
 
 def test_a_write_that_is_interrupted_is_made_again_and_nothing_is_twice(
     folder, tmp_path, monkeypatch
 ):
-    dataset, table, outcomes = outcomes_of(folder, tmp_path / "r")
-    write, calls = Dataset.write, []
+    dataset, study, outcomes = outcomes_of(folder, tmp_path / "r")
+    write, calls = StudyResults.write, []
 
     def interrupted_after(self, number, lines):
         write(self, number, lines)
@@ -126,8 +122,8 @@ def test_a_write_that_is_interrupted_is_made_again_and_nothing_is_twice(
         if len(calls) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Dataset, "write", interrupted_after)
-    with pytest.raises(KeyboardInterrupt), Recorder(dataset, table) as recording:
+    monkeypatch.setattr(StudyResults, "write", interrupted_after)
+    with pytest.raises(KeyboardInterrupt), Recorder(dataset, study, "0") as recording:
         for outcome in outcomes[:4]:
             recording.add(outcome)
         recording.flush()
@@ -136,8 +132,8 @@ def test_a_write_that_is_interrupted_is_made_again_and_nothing_is_twice(
 
 
 def test_a_result_is_written_although_the_next_one_takes_long(folder, tmp_path):
-    dataset, table, outcomes = outcomes_of(folder, tmp_path / "r")
-    with Recorder(dataset, table, soonest=0.01) as recording:
+    dataset, study, outcomes = outcomes_of(folder, tmp_path / "r")
+    with Recorder(dataset, study, "0", soonest=0.01) as recording:
         recording.add(outcomes[0])
         for _ in range(1000):
             if dataset.parts():
@@ -149,7 +145,7 @@ def test_a_result_is_written_although_the_next_one_takes_long(folder, tmp_path):
 
 
 def test_a_timed_write_that_fails_ends_the_run(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder, "LATEST", 0.01)
+    monkeypatch.setattr(study_results, "LATEST", 0.01)
 
     def full(self, number, table):
         raise OSError(28, "No space left on device")
@@ -162,6 +158,6 @@ def test_a_timed_write_that_fails_ends_the_run(folder, tmp_path, monkeypatch):
 
         return runner
 
-    monkeypatch.setattr(Dataset, "write", full)
+    monkeypatch.setattr(StudyResults, "write", full)
     with pytest.raises(OSError, match="No space left"):
         run_study(folder, tmp_path / "r", slowly, soonest=0.01)

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from support.study_folders import run_study, write_study
 
-from elastocal.studies.conduct import prepare
-from elastocal.studies.dataset import read_results
+from elastocal.studies import read_results, read_study
 
 PAGE = Path(__file__).parents[2] / "docs" / "studies.md"
 
@@ -20,4 +19,4 @@ def test_the_study_shown_runs(tmp_path):
     assert (ending.done, ending.failed) == (1, 0)
     frame = read_results(tmp_path / "r")
     assert frame["error"].abs().max() < 1.0  # µrad/(N·m)
-    assert prepare(folder).module.summary(frame).startswith("| readings per pose |")
+    assert read_study(folder).module.summary(frame).startswith("| readings per pose |")

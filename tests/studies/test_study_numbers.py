@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support.study_folders import here, numbers, on_processes, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies.conduct import prepare
+from elastocal.studies import read_study
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def whole(folder):
 
 
 def test_seeds_are_those_of_spawn(folder):
-    jobs = prepare(folder).jobs
+    jobs = read_study(folder).tasks
     for child, job in zip(np.random.SeedSequence(11).spawn(len(jobs)), jobs, strict=True):
         assert job.rng().random() == np.random.default_rng(child).random()
 

@@ -6,10 +6,8 @@ import pytest
 from support.study_folders import SCRIPT, TOML, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies.conduct import prepare
-from elastocal.studies.definition import read_definition
-from elastocal.studies.execution import execute
-from elastocal.studies.package import Package, pack
+from elastocal.studies import read_study
+from elastocal.studies.study_folder import Sources, execute
 
 WITH_PARTS = """\
 from pathlib import Path
@@ -37,14 +35,14 @@ def folder(tmp_path):
     return folder
 
 
-def result_of(study, package=None):
-    return execute(package or study.package, study.digest, study.jobs[0])
+def result_of(study, sources=None):
+    return execute(sources or study.sources, study.tasks[0])
 
 
 def test_a_part_that_changed_is_imported_anew(folder):
-    assert result_of(prepare(folder)).rows[0]["mean"] == 42
+    assert result_of(read_study(folder)).rows[0]["mean"] == 42
     (folder / "study_part_of_test.py").write_text("FACTOR = 30  # another length\n")
-    assert result_of(prepare(folder)).rows[0]["mean"] == 630
+    assert result_of(read_study(folder)).rows[0]["mean"] == 630
 
 
 def test_two_studies_may_have_parts_of_one_name(folder, tmp_path):
@@ -52,40 +50,40 @@ def test_two_studies_may_have_parts_of_one_name(folder, tmp_path):
     (other / "study_part_of_test.py").write_text("FACTOR = 3\n")
     (other / "data").mkdir()
     (other / "data" / "number.txt").write_text("1")
-    first, second = prepare(folder), prepare(other)
+    first, second = read_study(folder), read_study(other)
     assert result_of(first).rows[0]["mean"] == 42
     assert result_of(second).rows[0]["mean"] == 3
 
 
 def test_every_file_that_is_part_of_the_study_counts(folder):
-    digests = {pack(read_definition(folder)).digest}
+    digests = {read_study(folder).sources.digest}
     for name in ("study.py", "study_part_of_test.py", "data/number.txt"):
         with open(folder / name, "a") as handle:
             handle.write(" ")
-        digests.add(pack(read_definition(folder)).digest)
+        digests.add(read_study(folder).sources.digest)
     assert len(digests) == 4
     (folder / "notes.md").write_text("no part of it")
-    assert pack(read_definition(folder)).digest in digests
+    assert read_study(folder).sources.digest in digests
 
 
 def test_a_worker_without_the_folder_unpacks_it(folder, tmp_path, monkeypatch):
-    study = prepare(folder)
-    monkeypatch.setattr("elastocal.studies.package._LOADED", {})
-    elsewhere = Package(tmp_path / "not here", study.package.contents, study.package.columns)
+    study = read_study(folder)
+    monkeypatch.setattr("elastocal.studies.study_folder._LOADED", {})
+    elsewhere = Sources(tmp_path / "not here", study.sources.contents, study.sources.columns)
     assert result_of(study, elsewhere).rows[0]["mean"] == 42
     module = sys.modules["study_part_of_test"]
     assert not module.__file__.startswith(str(folder))
 
 
 def test_a_worker_of_another_version_refuses(folder):
-    study = prepare(folder)
-    package = Package(folder, study.package.contents, study.package.columns, version="0.0.1")
-    assert "this worker has elastocal" in result_of(study, package).error
+    study = read_study(folder)
+    sources = Sources(folder, study.sources.contents, study.sources.columns, version="0.0.1")
+    assert "this worker has elastocal" in result_of(study, sources).error
 
 
 def refused(folder, *options):
     with pytest.raises(InputError) as error:
-        prepare(folder, None, options)
+        read_study(folder, None, options)
     return str(error.value)
 
 
@@ -142,7 +140,7 @@ def test_wrong_tasks_are_told(tmp_path, old, new, told):
         ("replicats=3", "no option 'replicats' (did you mean 'replicates'?)"),
         ("replicates=3.5", "takes a whole number"),
         ("replicates=true", "takes a whole number"),
-        ("replicates", "--set takes KEY=VALUE"),
+        ("replicates", "options: takes KEY=VALUE"),
         ("scale=big", "takes a number"),
     ],
 )
@@ -151,6 +149,6 @@ def test_a_wrong_option_is_told(tmp_path, assignment, told):
 
 
 def test_options_reach_tasks(tmp_path):
-    study = prepare(write_study(tmp_path / "study"), None, ["replicates = 2", "scale=3"])
-    assert len(study.jobs) == 4
-    assert study.definition.options["scale"] == 3.0
+    study = read_study(write_study(tmp_path / "study"), None, ["replicates = 2", "scale=3"])
+    assert len(study.tasks) == 4
+    assert study.options["scale"] == 3.0

@@ -6,8 +6,7 @@ import sys
 import pytest
 from support.study_folders import here, on_processes, run_study, write_study
 
-from elastocal.studies.dataset import read_results
-from elastocal.studies.stopping import Stop
+from elastocal.studies import StudyStop, read_results
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -39,7 +38,7 @@ def stopped(tmp_path, grace=60.0, script=SIGNALLED, times=1, name="SIGINT", wait
     script = script % {"times": times, "name": name, "wait": wait}
     folder = write_study(tmp_path / "study", script)
     told = []
-    with Stop(grace, told.append) as stop:
+    with StudyStop(grace, told.append) as stop:
         runner = lambda study: on_processes(study, 1, stop)  # noqa: E731
         ending = run_study(folder, tmp_path / "r", runner, stop=stop, soonest=0.0)
     assert len(told) == 1 and told[0].startswith("stopping: the running tasks have")
@@ -66,7 +65,7 @@ def test_a_task_that_takes_too_long_to_end_is_dropped(tmp_path):
 
 def test_the_handlers_that_were_there_are_put_back():
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with Stop():
+    with StudyStop():
         assert signal.getsignal(signal.SIGINT) != before[0]
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
@@ -74,7 +73,7 @@ def test_the_handlers_that_were_there_are_put_back():
 def test_a_signal_that_was_ignored_stays_ignored():
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with Stop() as stop:
+        with StudyStop() as stop:
             signal.raise_signal(signal.SIGINT)
             assert not stop.asked
     finally:

@@ -8,11 +8,10 @@ from typing import Any
 
 import pandas as pd
 
-from elastocal.studies.conduct import Ending, Study, conduct, prepare
-from elastocal.studies.dataset import opened, read_results
-from elastocal.studies.execution import execute
-from elastocal.studies.local import run_local
-from elastocal.studies.stopping import Stop
+from elastocal.studies import Study, StudyStop, read_results, read_study, run_local
+from elastocal.studies import run_study as run_prepared
+from elastocal.studies.study_folder import execute
+from elastocal.studies.study_run import Ending
 
 SCRIPT = """\
 def tasks(options):
@@ -45,42 +44,26 @@ def write_study(folder: Path, script: str = SCRIPT, toml: str = TOML) -> Path:
     return folder
 
 
-class Watched:
-    """What a watcher was told."""
-
-    def __init__(self) -> None:
-        self.begun: tuple[int, int, int] | None = None
-        self.seen: list[bool] = []
-
-    def begin(self, total: int, done: int, failed: int) -> None:
-        self.begun = (total, done, failed)
-
-    def advance(self, failed: bool) -> None:
-        self.seen.append(failed)
-
-
 def here(study: Study, order: Callable[[list[Any]], list[Any]] = list, stop_after: int = 10**9):
     """A runner in this process that takes the tasks in `order` and ends after so many."""
 
     def runner(jobs) -> Iterator[Any]:
         for job in order(list(jobs))[:stop_after]:
-            yield execute(study.package, study.digest, job)
+            yield execute(study.sources, job)
 
     return runner
 
 
-def on_processes(study: Study, workers: int, stop: Stop | None = None):
-    stop = stop or Stop()
-    return lambda jobs: run_local(study.package, study.digest, jobs, workers, stop)
+def on_processes(study: Study, workers: int, stop: StudyStop | None = None):
+    return lambda tasks: run_local(study, tasks, workers, stop or StudyStop())
 
 
 def run_study(
-    folder: Path, results: Path, runner=None, seed: int | None = None, stop=None, **how: Any
+    folder: Path, results: Path, runner=None, seed: int | None = None, **how: Any
 ) -> Ending:
     """The study in `folder` run into `results` by `runner(study)`, by default in this process."""
-    study = prepare(folder, seed)
-    with opened(results) as dataset:
-        return conduct(study, dataset, (runner or here)(study), stop or Stop(), Watched(), **how)
+    study = read_study(folder, seed)
+    return run_prepared(study, results, runner=(runner or here)(study), **how)
 
 
 def numbers(results: Path) -> pd.DataFrame:

@@ -1,10 +1,26 @@
 """Scripted studies: many independent tasks, on the local cores or on a Dask cluster.
 
 A study is a folder with a `study.py` (what to compute), a `study.toml` (seed, options, columns)
-and, once it has run, a Parquet dataset of results.  The way of a task:
+and, once it has run, a Parquet dataset of results.  `study_folder` reads the folder and carries
+out one task, `study_run` hands the tasks to workers, `study_results` is the dataset.
 
-    definition → package (what a worker needs) → job → execution → recorder → dataset
-
-`local` and `cluster` hand jobs to workers; they know nothing of what a job computes, and only
-the one process that the user started writes.
+    study = read_study("experiment_design/coverage", options=["replicates=200"])
+    run_study(study, "look", jobs=4)
+    frame = read_results("look")
 """
+
+from elastocal.studies.study_folder import Study, read_study
+from elastocal.studies.study_results import read_results
+from elastocal.studies.study_run import (
+    ClusterLostError,
+    StudyStop,
+    run_cluster,
+    run_local,
+    run_study,
+    summarise,
+)
+
+__all__ = [
+    "ClusterLostError", "Study", "StudyStop", "read_results", "read_study", "run_cluster",
+    "run_local", "run_study", "summarise",
+]  # fmt: skip

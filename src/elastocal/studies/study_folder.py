@@ -1,0 +1,385 @@
+"""A study as its folder states it, its tasks, and one of them carried out in whatever process.
+
+The folder holds `study.py` (what to compute) and `study.toml` (seed, options, files, columns).
+What a worker needs of it travels as `Sources`; their hash, the seed and the task's values say
+whether a result on disk is of this very task.
+"""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import importlib.util
+import json
+import shutil
+import sys
+import tempfile
+import threading
+import time
+import tomllib
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from elastocal import __version__
+from elastocal.errors import InputError, require
+from elastocal.files import read_text
+from elastocal.nearest import did_you_mean, listed, quoted
+
+RESERVED = ("task", "task_hash", "task_row", "task_seconds", "elastocal", "task_error")
+TAKEN = f"{', '.join(RESERVED)} are columns of every study"
+# What a column takes, by its unit in study.toml; every other unit is that of a number.
+Row = dict[str, Any]
+KINDS: dict[str, tuple[str, type, tuple[type, ...]]] = {
+    "yes/no": ("true or false", bool, (bool, np.bool_)),
+    "count": ("a whole number", int, (int, np.integer)),
+    "text": ("text", str, (str,)),
+}
+NUMBER = ("a number", float, (int, float, np.integer, np.floating))
+
+_LOADED: dict[str, ModuleType] = {}
+_FOLDERS: set[Path] = set()
+_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The .py files of a study's folder and the files that study.toml names, by their names.
+
+    Sent to each worker: one that has the same folder with the same contents uses it there, any
+    other unpacks this one, so a cluster needs no shared file system.  `columns` maps each column
+    of the results to its unit, or to `text`, `yes/no` or `count`, which are types.
+    """
+
+    folder: Path
+    contents: Mapping[str, bytes]
+    columns: Mapping[str, str]
+    version: str = __version__
+
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        """SHA-256 by file name."""
+        return {name: hashlib.sha256(data).hexdigest() for name, data in self.contents.items()}
+
+    @cached_property
+    def digest(self) -> str:
+        """One SHA-256 of all names and contents."""
+        lines = [f"{name} {value}" for name, value in sorted(self.digests.items())]
+        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class StudyTask:
+    """One task: its place in the study, its values as JSON text, and what makes it the same."""
+
+    index: int
+    text: str
+    seed: int
+    hash: str
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The values, a copy of their own at each call."""
+        values: dict[str, Any] = json.loads(self.text)
+        return values
+
+    def rng(self) -> np.random.Generator:
+        """Child `index` of SeedSequence(seed): the same as .spawn(n)[index], for every n.
+
+        So the numbers depend on the seed and on the task's place, not on who computes it, when,
+        or how many tasks there are.
+        """
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(self.index,)))
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study ready to run, with seed and options settled and its tasks in their order."""
+
+    folder: Path
+    title: str
+    seed: int
+    options: Mapping[str, Any]
+    sources: Sources
+    module: ModuleType
+    tasks: tuple[StudyTask, ...]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task: its rows, or `error` (one line) and `trace` (the traceback)."""
+
+    index: int
+    rows: tuple[Row, ...] = ()
+    seconds: float = 0.0
+    error: str | None = None
+    trace: str = ""
+
+
+class StudyFile(BaseModel):
+    """The keys of study.toml."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    title: str = Field("", description="text")
+    seed: int = Field(ge=0, description="a whole number from 0")
+    files: list[str] = Field([], description='a list of names, as in files = ["cell.toml"]')
+    options: dict[str, Any] = Field({}, description="a table: write [options]")
+    columns: dict[str, str] = Field(
+        min_length=1,
+        description='the unit of what run() returns, as in rms_um = "µm" ("" for none, or text, '
+        "yes/no, count)",
+    )
+
+
+def read_study(folder: str | Path, seed: int | None = None, options: Iterable[str] = ()) -> Study:
+    """Returns the study in `folder`, with another seed, and options as KEY=VALUE, where given.
+
+    Raises InputError where the folder, study.toml, study.py, an option or a task is wrong.
+    """
+    folder = Path(folder)
+    require(folder.is_dir(), f"{folder}: no such folder; name the folder of a study")
+    for name, what in (("study.py", "tasks() and run()"), ("study.toml", "seed and columns")):
+        require(
+            (folder / name).is_file(),
+            f"{folder}: holds no {name}; a study has one, with its {what}",
+        )
+    path = folder / "study.toml"
+    stated = _read_toml(path)
+    for name in stated.columns:
+        require(name not in RESERVED, f"{path}: columns.{name} cannot be a column; {TAKEN}")
+    for name in stated.files:
+        require(
+            not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts,
+            f"{path}: key files names {quoted(name)}, outside the folder; a cluster cannot reach "
+            "it, copy it into the folder",
+        )
+        require(
+            (folder / name).is_file(),
+            f"{path}: key files names {quoted(name)}, which is no file of the folder",
+        )
+    seed = stated.seed if seed is None else seed
+    chosen = _with_options(path, stated.options, options)
+    sources = read_sources(folder, stated.files, stated.columns)
+    module = load(sources)
+    tasks = tuple(_tasks(folder, module, chosen, sources, seed))
+    title = stated.title or folder.resolve().name
+    return Study(folder, title, seed, chosen, sources, module, tasks)
+
+
+def _read_toml(path: Path) -> StudyFile:
+    try:
+        return StudyFile.model_validate(tomllib.loads(read_text(path, "study file", 1_000_000)))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML ({error}); correct it there") from None
+    except ValidationError as error:
+        known, found = StudyFile.model_fields, error.errors()
+        # A misspelt key is the cause, the key then missing only its consequence.
+        first = min(found, key=lambda problem: problem["type"] != "extra_forbidden")
+        key = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            hint = f"{did_you_mean(key, known)}; known are {listed(known)}"
+            raise InputError(f"{path}: unknown key {quoted(key)}{hint}") from None
+        shown = quoted(None if first["type"] == "missing" else first["input"])
+        takes = known[str(first["loc"][0])].description
+        raise InputError(f"{path}: key {key} takes {takes}; found {shown}") from None
+
+
+def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str]) -> dict[str, Any]:
+    """The defaults, with KEY=VALUE in their place; a value is of its default's type."""
+    options = dict(defaults)
+    kinds = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+    for text in given:
+        key, equals, value = (part.strip() for part in text.partition("="))
+        require(bool(equals), f"options: takes KEY=VALUE; found {quoted(text)}")
+        require(
+            key in options,
+            f"options: {text}: {path} has no option {quoted(key)}{did_you_mean(key, options)}; "
+            f"it has {listed(options) or 'none'}",
+        )
+        default = defaults[key]
+        if not isinstance(default, str) or value.startswith(('"', "'")):
+            try:
+                found = tomllib.loads(f"value = {value}")["value"]
+            except tomllib.TOMLDecodeError:
+                found = None
+            value = float(found) if type(default) is float and type(found) is int else found
+        kind = kinds.get(type(default), f"a TOML value like {quoted(default)}")
+        require(type(value) is type(default), f"options: {text}: takes {kind}, as in study.toml")
+        options[key] = value
+    return options
+
+
+def read_sources(folder: Path, files: Iterable[str], columns: Mapping[str, str]) -> Sources:
+    """Returns the sources of a study as its folder stands now."""
+    folder = folder.resolve()
+    names = {path.relative_to(folder) for path in folder.rglob("*.py")}
+    hidden = {n for n in names if any(p.startswith(".") or p == "__pycache__" for p in n.parts)}
+    parts = sorted({n.as_posix() for n in names - hidden} | set(files))
+    return Sources(folder, {name: (folder / name).read_bytes() for name in parts}, columns)
+
+
+def _tasks(
+    folder: Path, module: ModuleType, options: Mapping[str, Any], sources: Sources, seed: int
+) -> Iterable[StudyTask]:
+    script = folder / "study.py"
+    for name in ("tasks", "run"):
+        require(
+            callable(getattr(module, name, None)),
+            f"{script}: defines no function {name}(); a study has tasks(options) "
+            "and run(task, rng)",
+        )
+    found = calling(folder, "tasks()", lambda: list(module.tasks(dict(options))))
+    require(bool(found), f"{script}: tasks() gives no task with these options; nothing to do")
+    for index, task in enumerate(found):
+        where = f"{script}, task {index}"
+        if not isinstance(task, Mapping):
+            kind = type(task).__name__
+            raise InputError(f"{where}: is a {kind}; tasks() gives a dict for each task")
+        for key in task:
+            require(
+                isinstance(key, str) and key not in RESERVED,
+                f"{where}: {quoted(key)} cannot be a key; keys are text, and {TAKEN}",
+            )
+            require(
+                key not in sources.columns,
+                f"study.toml: columns.{key} is also a value of the tasks; rename one of them",
+            )
+        try:
+            text = json.dumps(dict(task), allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"{where}: {error}; use plain JSON values (numbers, text, true/false, lists, dicts)"
+            ) from None
+        whole = f"{sources.digest}\n{seed}\n{index}\n{json.dumps(json.loads(text), sort_keys=True)}"
+        yield StudyTask(index, text, seed, hashlib.sha256(whole.encode()).hexdigest())
+
+
+def load(sources: Sources) -> ModuleType:
+    """Returns the module study.py, imported once per process and digest.
+
+    Raises InputError with file and line where importing it fails.
+    """
+    with _LOCK:
+        if sources.digest not in _LOADED:
+            folder = _standing(sources)
+            _forget_others()
+            _FOLDERS.add(folder)
+            sys.path.insert(0, str(folder))
+            name = f"elastocal_study_{sources.digest[:16]}"
+            imported = calling(folder, "importing study.py", lambda: _import(name, folder))
+            _LOADED[sources.digest] = imported
+        return _LOADED[sources.digest]
+
+
+def _import(name: str, folder: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, folder / "study.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and pickle look a class's module up by its name
+    spec.loader.exec_module(module)
+    return module
+
+
+def _standing(sources: Sources) -> Path:
+    """The study's folder where it stands here with these very contents, else a copy of it."""
+    try:
+        if all((sources.folder / n).read_bytes() == d for n, d in sources.contents.items()):
+            return sources.folder
+    except OSError:
+        pass
+    folder = Path(tempfile.mkdtemp(prefix="elastocal-study-")).resolve()
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    for name, data in sources.contents.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    return folder
+
+
+def _forget_others() -> None:
+    """Drop what other studies, or an earlier state of this one, imported from their folders.
+
+    A worker outlives a study, and two studies may both have a scenarios.py.
+    """
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        own = name.startswith("elastocal_study_")
+        if file and not own and any(Path(file).is_relative_to(folder) for folder in _FOLDERS):
+            del sys.modules[name]
+    sys.path[:] = [place for place in sys.path if place not in map(str, _FOLDERS)]
+    importlib.invalidate_caches()
+
+
+def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
+    """Returns the value of `call`, which is code of the study in `folder`.
+
+    Raises InputError that names the study's file and line where it raises anything.
+    """
+    try:
+        return call()
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        file, line = str(folder.resolve() / "study.py"), 1
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [f for f in frames if Path(f.filename).is_relative_to(folder.resolve())]
+        if isinstance(error, SyntaxError) and error.filename:
+            file, line = error.filename, error.lineno or 1
+        elif own:
+            file, line = own[-1].filename, own[-1].lineno or 1
+        raise InputError(
+            f"{file}, line {line}: {what} raised {type(error).__name__}: {error}; correct it there"
+        ) from error
+
+
+def execute(sources: Sources, task: StudyTask) -> Outcome:
+    """Returns what came of the task: whatever its code raises becomes an outcome."""
+    begun = time.perf_counter()
+    rows: tuple[Row, ...] = ()
+    error, trace = None, ""
+    try:
+        if sources.version != __version__:
+            raise RuntimeError(
+                f"this worker has elastocal {__version__}, the study was started with "
+                f"{sources.version}; install the same there"
+            )
+        found = load(sources).run(task.values, task.rng())
+        rows = _checked_rows(found, sources.columns, task.values)
+    except (Exception, SystemExit) as caught:
+        error, trace = f"{type(caught).__name__}: {caught}", traceback.format_exc()
+    return Outcome(task.index, rows, time.perf_counter() - begun, error, trace)
+
+
+def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> tuple[Row, ...]:
+    """What run() returned, as rows of plain values of the types that `columns` states."""
+    rows = [found] if isinstance(found, Mapping) else found
+    if not isinstance(rows, list | tuple) or not all(isinstance(row, Mapping) for row in rows):
+        raise TypeError(
+            f"run() returned {type(found).__name__}; it returns a dict or a list of them"
+        )
+    for name in (name for row in rows for name in row):
+        if name in task:
+            raise ValueError(f"run() returned {name!r}, which is a value of the task itself")
+        if name not in columns:
+            raise ValueError(
+                f"run() returned {name!r}{did_you_mean(str(name), columns)}, which [columns] "
+                f"of study.toml does not list (there are {listed(columns)})"
+            )
+    return tuple({n: _plain(n, row.get(n), unit) for n, unit in columns.items()} for row in rows)
+
+
+def _plain(name: str, value: Any, unit: str) -> Any:
+    """`value` as bool, int, float or str after the column's unit; None stays None."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    takes, made, accepted = KINDS.get(unit, NUMBER)
+    is_bool = isinstance(value, bool | np.bool_)
+    if value is not None and not (isinstance(value, accepted) and is_bool == (made is bool)):
+        raise TypeError(f"column {name!r} takes {takes}; found {type(value).__name__}")
+    return None if value is None else made(value)

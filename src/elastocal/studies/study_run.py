@@ -1,0 +1,517 @@
+"""A study run: tasks on joblib's processes or a Dask cluster, recorded as they come, stopped.
+
+Workers know nothing of what a task computes, and only the one process that the user started
+writes.  However a run ends, what was done by then is kept, and the next one goes on from there.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import signal
+import subprocess
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import CancelledError
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, ModuleType
+from typing import Any, Protocol, Self
+
+import elastocal
+from elastocal import __version__
+from elastocal.errors import ElastocalError, InputError
+from elastocal.files import atomic_write_text
+from elastocal.nearest import quoted
+from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
+from elastocal.studies.study_results import (
+    SOONEST,
+    Recorder,
+    StudyResults,
+    opened,
+    read_results,
+    schema_of,
+)  # fmt: skip
+
+GRACE = 30.0  # s that running tasks are waited for
+ANSWER = 10.0  # s in which a scheduler answers
+PATIENCE = 60.0  # s without a scheduler before the run gives up
+# What limits threads of linear algebra: the processes share the cores.
+THREADS = (
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS",
+)  # fmt: skip
+
+Outcomes = Generator[Outcome, None, None]
+
+
+class StudyStop:
+    """Ctrl-C and SIGTERM: in a `with` block, `asked` says that no more tasks may be handed out.
+
+    A second signal, or `grace` seconds after the first, raises KeyboardInterrupt, and `check`
+    raises it again: CasADi catches one inside a solver and returns where the search stood, and
+    such a result must not be kept.
+    """
+
+    def __init__(self, grace: float = GRACE, tell: Callable[[str], None] | None = None) -> None:
+        self.asked = self._now = False
+        self._grace, self._tell = grace, tell or _write
+        self._before: dict[int, Any] = {}
+        self._timer: threading.Timer | None = None
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt where it came to that before."""
+        if self._now:
+            raise KeyboardInterrupt
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # only it may set handlers
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+                    self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        while self._before:
+            signal.signal(*self._before.popitem())
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.asked:
+            self._now = True
+            raise KeyboardInterrupt
+        self.asked = True
+        self._tell(
+            f"stopping: the running tasks have {self._grace:.0f} s to end (Ctrl-C again: at once)"
+        )
+        self._timer = threading.Timer(self._grace, os.kill, (os.getpid(), number))
+        self._timer.daemon = True
+        self._timer.start()
+
+
+def _write(message: str) -> None:
+    # In a signal handler: the buffer of sys.stderr may be in use by what was interrupted.
+    os.write(2, f"\nelastocal: {message}\n".encode())
+
+
+class Crew(Protocol):
+    """Worker processes, wherever they are."""
+
+    tries: int  # of a task whose process dies: the first, where others may be to blame, and alone
+
+    def places(self) -> int:
+        """Returns how many tasks can be out at once now."""
+
+    def submit(self, *call: Any) -> Any:
+        """Returns the future of a call."""
+
+    def deaths(self, error: Exception) -> int:
+        """Returns how many processes died under the task; none where it was another error."""
+
+    def close(self, out: list[Any]) -> None:
+        """End, without waiting for the futures that are out."""
+
+
+def hand_out(crew: Crew, sources: Sources, tasks: Sequence[StudyTask], stop: StudyStop) -> Outcomes:
+    """Outcomes as they come, none twice; no new task goes out once `stop` is asked for.
+
+    No task waits at a worker: what is out is what is waited for on Ctrl-C.  A process that dies
+    may have died of another task that was out, so those that were have further tries at the end,
+    each alone; one whose processes still die is an outcome with an error.
+    """
+    waiting, suspects = deque(tasks), deque[StudyTask]()
+    out: dict[Any, StudyTask] = {}
+    ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    tried: Counter[int] = Counter()
+    died: Counter[int] = Counter()
+    try:
+        while True:
+            places = crew.places()
+            while not stop.asked and len(out) < places and (waiting or (suspects and not out)):
+                task = (waiting or suspects).popleft()
+                future = crew.submit(execute, sources, task)
+                out[future] = task
+                future.add_done_callback(ended.put)
+            if not out and (stop.asked or not (waiting or suspects)):
+                return
+            try:
+                future = ended.get(timeout=1.0 if out else 0.1)
+            except queue.Empty:
+                continue
+            task = out.pop(future)
+            try:
+                outcome = future.result()
+            except Exception as error:  # execute() returns what a task raises
+                deaths = crew.deaths(error)
+                tried[task.index] += 1
+                died[task.index] += deaths
+                if deaths and tried[task.index] < crew.tries:
+                    suspects.append(task)
+                    continue
+                line = f"the worker could not run it: {type(error).__name__}: {error}"
+                if deaths:
+                    line = (
+                        f"its worker process died {died[task.index]} times (out of memory, killed, "
+                        "or crashed in a library)"
+                    )
+                outcome = Outcome(task.index, error=line, trace=f"{line}\n{error}\n")
+            yield outcome
+    finally:
+        crew.close(list(out))
+
+
+def run_local(
+    study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: StudyStop
+) -> Outcomes:
+    """Outcomes of tasks on the cores of this machine; with `jobs` of 1 in this process."""
+    import joblib
+
+    jobs = jobs or joblib.cpu_count()
+    if jobs > 1 and tasks:
+        yield from hand_out(Processes(jobs), study.sources, tasks, stop)
+        return
+    for task in tasks:
+        if stop.asked:
+            return
+        yield execute(study.sources, task)
+
+
+class Processes:
+    """Processes on this machine: joblib's, replaced by new ones when one of them dies."""
+
+    tries = 3
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self._pool: Any = None
+
+    def places(self) -> int:
+        return self._number
+
+    def submit(self, *call: Any) -> Any:
+        from joblib import cpu_count
+        from joblib.externals.loky import ProcessPoolExecutor
+
+        threads = str(max(cpu_count() // self._number, 1))
+        while True:
+            if self._pool is None:
+                self._pool = ProcessPoolExecutor(
+                    self._number,
+                    initializer=_ignore_interrupts,
+                    env={name: os.environ.get(name, threads) for name in THREADS},
+                )
+            try:
+                return self._pool.submit(*call)
+            except BrokenProcessPool:
+                self._pool = None
+
+    def deaths(self, error: Exception) -> int:
+        return int(isinstance(error, BrokenProcessPool))
+
+    def close(self, out: list[Any]) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(kill_workers=bool(out))
+
+
+def _ignore_interrupts() -> None:
+    """In a worker process: Ctrl-C reaches the whole terminal, and its task is to end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class ClusterLostError(ElastocalError):
+    """The scheduler went away; what was done is kept."""
+
+    exit_code = 1
+
+
+def run_cluster(
+    study: Study,
+    tasks: Sequence[StudyTask],
+    address: str,
+    stop: StudyStop,
+    tell: Callable[[str], None],
+) -> Outcomes:
+    """Outcomes of tasks on the Dask cluster at `address`, or that of Dask's configuration.
+
+    Raises InputError where `connect` does, ClusterLostError where the scheduler goes away.
+    """
+    if tasks:
+        yield from hand_out(DaskWorkers(connect(address), tell), study.sources, tasks, stop)
+
+
+class DaskWorkers:
+    """The workers of a Dask cluster, which gives the tasks of a dead one to another.
+
+    `distributed` itself rather than joblib's backend for it: each task has its own future, so
+    one that killed more workers than the cluster allows (distributed.scheduler.allowed-failures)
+    fails alone, where joblib gives up the whole run.
+    """
+
+    def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
+        self.tries = 1
+        self._client, self._tell, self._told = client, tell, False
+        self._places, self._seen, self._looked = 0, time.monotonic(), float("-inf")
+
+    def places(self) -> int:
+        """Returns the threads of all workers, looked up once a second at most.
+
+        Raises ClusterLostError where the scheduler is gone for PATIENCE seconds.
+        """
+        now = time.monotonic()
+        if self._client.status != "running":
+            if now - self._seen > PATIENCE or self._client.status == "closed":
+                raise self._lost()
+            return 0
+        self._seen = now
+        if now - self._looked > 1.0:
+            threads = self._client.nthreads().values()
+            self._places, self._looked = sum(threads), now
+            if max(threads, default=0) > 1:
+                self.tries = 2  # a worker may have died of another task that it ran
+            if not threads and not self._told:
+                self._tell("the cluster has no worker; waiting for one")
+            self._told = not threads
+        return self._places
+
+    def submit(self, *call: Any) -> Any:
+        return self._client.submit(*call, pure=False)  # no other call may answer for this one
+
+    def deaths(self, error: Exception) -> int:
+        if isinstance(error, CancelledError | OSError):
+            raise self._lost() from None
+        killed = isinstance(error, dask_distributed().scheduler.KilledWorker)
+        return int(error.allowed_failures) + 1 if killed else 0
+
+    def close(self, out: list[Any]) -> None:
+        if out and self._client.status == "running":
+            self._client.cancel(out, force=True)
+        self._client.close()
+
+    def _lost(self) -> ClusterLostError:
+        return ClusterLostError(
+            f"the scheduler at {self._client.scheduler.address} went away or cancelled the tasks; "
+            "what was done is kept, and the same command goes on with the rest"
+        )
+
+
+def connect(address: str) -> Any:
+    """Returns a client of the scheduler at `address`, or in Dask's configuration ("config").
+
+    Raises InputError where distributed is not installed, there is no scheduler, or a worker
+    lacks this version of elastocal.
+    """
+    distributed = dask_distributed()
+    import dask
+
+    where = dask.config.get("scheduler-address", None) if address == "config" else address
+    if where is None:
+        raise InputError(
+            "cluster=config: Dask's configuration names no scheduler; set "
+            "DASK_SCHEDULER_ADDRESS or scheduler-address, or give cluster=tcp://HOST:8786"
+        )
+    # Its log lines tell of dead workers with tracebacks; what matters is told by the study.
+    for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        client = distributed.Client(where, timeout=ANSWER, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"cluster={where}: no scheduler answers ({error}); check the address, or start one "
+            "with: dask scheduler"
+        ) from None
+    try:
+        found = client.run(_version)
+    except Exception as error:  # of the worker: whatever its Python lacks
+        client.close()
+        raise InputError(
+            f"cluster={where}: a worker cannot import elastocal ({error}); install "
+            f"elastocal {__version__} where the workers run"
+        ) from None
+    for worker, version in found.items():
+        if version != __version__:
+            client.close()
+            raise InputError(
+                f"cluster={where}: worker {worker} has elastocal {version}, here it is "
+                f"{__version__}; install the same there"
+            )
+    return client
+
+
+def _version() -> str:
+    return __version__
+
+
+def dask_distributed() -> ModuleType:
+    """Returns the module distributed.
+
+    Raises InputError where it is not installed.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise InputError(
+            "cluster=ADDRESS needs dask.distributed; run: pip install 'elastocal[cluster]'"
+        ) from None
+    module: ModuleType = distributed
+    return module
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Of `total` tasks (those asked for), `done` have a result and `failed` an error."""
+
+    total: int
+    before: int
+    done: int
+    failed: int
+    stopped: bool
+
+    @property
+    def complete(self) -> bool:
+        return self.done + self.failed == self.total
+
+
+def run_study(
+    study: Study,
+    output: str | Path,
+    *,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    only: int | None = None,
+    restart: bool = False,
+    retry_failed: bool = False,
+    stop: StudyStop | None = None,
+    progress: Callable[[int, int, int], None] = lambda total, ended, failed: None,
+    tell: Callable[[str], None] = print,
+    runner: Callable[[Sequence[StudyTask]], Outcomes] | None = None,
+    soonest: float = SOONEST,
+) -> Ending:
+    """Run the tasks that have no result yet (of the first `only`) and record what comes.
+
+    They run in `jobs` processes (by default one per core), on the Dask scheduler at `cluster`, or
+    as `runner` has it.  `restart` discards the results that are in the folder `output`,
+    `retry_failed` those that are errors; `progress` takes the number of tasks, of those that
+    ended and of those that failed.  However the run ends, what was done by then is written.
+
+    Raises InputError where the results in `output` are of another seed, source or task,
+    ClusterLostError where the scheduler goes away.
+    """
+    stop = stop or StudyStop()
+    if runner is None and cluster is not None:
+        dask_distributed()
+        runner = lambda tasks: run_cluster(study, tasks, cluster, stop, tell)  # noqa: E731
+    elif runner is None:
+        runner = lambda tasks: run_local(study, tasks, jobs, stop)  # noqa: E731
+    version = source_version()
+    with opened(Path(output)) as results:
+        if restart:
+            results.clear()
+        failures = _known(study, results)
+        if retry_failed and any(failures.values()):
+            results.drop_failed()
+            failures = {index: False for index, failed in failures.items() if not failed}
+        results.state(
+            {
+                "schema": "elastocal/study/1",
+                "title": study.title,
+                "seed": study.seed,
+                "options": dict(study.options),
+                "tasks": len(study.tasks),
+                "columns": dict(study.sources.columns),
+                "sources": study.sources.digests,
+                "elastocal": version,
+            }
+        )
+        wanted = study.tasks[:only]
+        left = [task for task in wanted if task.index not in failures]
+        total, before = len(wanted), len(wanted) - len(left)
+        ended, failed = before, sum(failures.get(task.index, False) for task in wanted)
+        progress(total, ended, failed)
+        recording = Recorder(results, study, version, soonest)
+        try:
+            with recording, closing(runner(left)) as outcomes:
+                for outcome in outcomes:
+                    stop.check()
+                    recording.add(outcome)
+                    failed += outcome.error is not None
+                    ended += 1
+                    progress(total, ended, failed)
+        except KeyboardInterrupt:
+            if not stop.asked:
+                raise
+    return Ending(total, before, ended - failed, failed, stop.asked)
+
+
+def _known(study: Study, results: StudyResults) -> dict[int, bool]:
+    """Whether it failed, by index of each task that the results hold.
+
+    Raises InputError where a task there is not the study's task of that index now.
+    """
+    whole = results.read(schema_of(study))
+    if whole is None:
+        return {}
+    names = ("task", "task_hash", "task_error")
+    lines = sorted(zip(*(whole[name].to_pylist() for name in names), strict=True))
+    lines = [line for line in lines if line[0] < len(study.tasks)]
+    for index, hashed, _ in lines:
+        if study.tasks[index].hash != hashed:
+            told = "; ".join(_changes(study, results.stated())) or f"task {index} was another one"
+            raise InputError(
+                f"{results.folder}: holds results of another study: {told}. "
+                "Run with restart=True to discard them, or with output=NEW to keep them"
+            )
+    return {index: error is not None for index, _, error in lines}
+
+
+def _changes(now: Study, before: dict[str, Any]) -> list[str]:
+    """What differs from the study that the results are of, in words."""
+    told = []
+    sources, digests = before.get("sources", {}), now.sources.digests
+    changed = [n for n in sorted({*sources, *digests}) if sources.get(n) != digests.get(n)]
+    if sources and changed:
+        told.append(f"{', '.join(changed)} changed since")
+    if before.get("seed", now.seed) != now.seed:
+        told.append(f"the seed was {before['seed']}, now it is {now.seed}")
+    options = before.get("options", {})
+    for name, value in now.options.items():
+        if options.get(name, value) != value:
+            told.append(f"option {name} was {quoted(options[name])}, now it is {quoted(value)}")
+    return told
+
+
+def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
+    """Returns what summary(frame) of study.py says, also written to `page`; None without one.
+
+    `frame` has the rows of the study's tasks in their order.  Raises InputError with file and
+    line where summary() raises or gives no text.
+    """
+    summary = getattr(study.module, "summary", None)
+    if summary is None:
+        return None
+    frame = read_results(output)
+    frame = frame[frame["task"] < len(study.tasks)]
+    text = calling(study.folder, "summary()", lambda: summary(frame))
+    if not isinstance(text, str):
+        kind = type(text).__name__
+        raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
+    atomic_write_text(page, text.rstrip("\n") + "\n")
+    return text
+
+
+def source_version() -> str:
+    """Version of elastocal, with the commit where it stands in a git checkout: 0.1.0+gabc1234."""
+    here = Path(elastocal.__file__).parent
+    try:
+        command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--exclude=*"]
+        told = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        tracked = ["git", "-C", str(here), "ls-files", "--error-unmatch", "__init__.py"]
+        subprocess.run(tracked, capture_output=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return __version__
+    return f"{__version__}+g{told.stdout.strip()}"
