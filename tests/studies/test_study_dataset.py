@@ -116,9 +116,9 @@ def test_a_write_that_is_interrupted_is_made_again_and_nothing_is_twice(
     dataset, study, outcomes = outcomes_of(folder, tmp_path / "r")
     write, calls = StudyResults.write, []
 
-    def interrupted_after(self, number, lines):
-        write(self, number, lines)
-        calls.append(number)
+    def interrupted_after(self, part, lines):
+        write(self, part, lines)
+        calls.append(part.name)
         if len(calls) == 1:
             raise KeyboardInterrupt
 
@@ -127,7 +127,7 @@ def test_a_write_that_is_interrupted_is_made_again_and_nothing_is_twice(
         for outcome in outcomes[:4]:
             recording.add(outcome)
         recording.flush()
-    assert calls == [1, 1]
+    assert calls == ["part-000001.parquet"] * 2
     assert set(read_results(tmp_path / "r")["task"]) == {0, 1, 2, 3}
 
 
@@ -147,7 +147,7 @@ def test_a_result_is_written_although_the_next_one_takes_long(folder, tmp_path):
 def test_a_timed_write_that_fails_ends_the_run(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(study_results, "LATEST", 0.01)
 
-    def full(self, number, table):
+    def full(self, part, lines):
         raise OSError(28, "No space left on device")
 
     def slowly(study):

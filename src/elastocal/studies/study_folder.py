@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import atexit
 import hashlib
-import importlib.util
+import importlib
 import json
 import shutil
 import sys
@@ -19,11 +19,14 @@ import time
 import tomllib
 import traceback
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path, PurePosixPath
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -196,20 +199,20 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
     options = dict(defaults)
     kinds = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
     for text in given:
-        key, equals, value = (part.strip() for part in text.partition("="))
+        key, equals, written = (part.strip() for part in text.partition("="))
         require(bool(equals), f"options: takes KEY=VALUE; found {quoted(text)}")
         require(
             key in options,
             f"options: {text}: {path} has no option {quoted(key)}{did_you_mean(key, options)}; "
             f"it has {listed(options) or 'none'}",
         )
-        default = defaults[key]
-        if not isinstance(default, str) or value.startswith(('"', "'")):
-            try:
-                found = tomllib.loads(f"value = {value}")["value"]
-            except tomllib.TOMLDecodeError:
-                found = None
-            value = float(found) if type(default) is float and type(found) is int else found
+        default, value = defaults[key], None
+        with suppress(tomllib.TOMLDecodeError):
+            value = tomllib.loads(f"value = {written}")["value"]
+        if isinstance(default, str) and not written.startswith(('"', "'")):
+            value = written
+        if type(default) is float and type(value) is int:
+            value = float(value)
         kind = kinds.get(type(default), f"a TOML value like {quoted(default)}")
         require(type(value) is type(default), f"options: {text}: takes {kind}, as in study.toml")
         options[key] = value
@@ -273,27 +276,19 @@ def load(sources: Sources) -> ModuleType:
             _FOLDERS.add(folder)
             sys.path.insert(0, str(folder))
             name = f"elastocal_study_{sources.digest[:16]}"
-            imported = calling(folder, "importing study.py", lambda: _import(name, folder))
-            _LOADED[sources.digest] = imported
+            loader = SourceFileLoader(name, str(folder / "study.py"))
+            module = module_from_spec(cast(ModuleSpec, spec_from_loader(name, loader)))
+            sys.modules[name] = module  # dataclasses and pickle look a class's module up there
+            calling(folder, "importing study.py", lambda: loader.exec_module(module))
+            _LOADED[sources.digest] = module
         return _LOADED[sources.digest]
-
-
-def _import(name: str, folder: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, folder / "study.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses and pickle look a class's module up by its name
-    spec.loader.exec_module(module)
-    return module
 
 
 def _standing(sources: Sources) -> Path:
     """The study's folder where it stands here with these very contents, else a copy of it."""
-    try:
+    with suppress(OSError):
         if all((sources.folder / n).read_bytes() == d for n, d in sources.contents.items()):
             return sources.folder
-    except OSError:
-        pass
     folder = Path(tempfile.mkdtemp(prefix="elastocal-study-")).resolve()
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for name, data in sources.contents.items():

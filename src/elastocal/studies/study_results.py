@@ -10,7 +10,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
@@ -90,14 +90,18 @@ class StudyResults:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def parts(self) -> dict[int, Path]:
-        """The files by their numbers."""
-        found = sorted(self.folder.glob("part-*.parquet"))
-        return {int(path.stem.partition("-")[2]): path for path in found}
+    def parts(self) -> list[Path]:
+        """Returns the files of the results."""
+        return sorted(self.folder.glob("part-*.parquet"))
 
-    def write(self, number: int, lines: pyarrow.Table) -> None:
-        """Write part `number` (again), whole or not at all."""
-        path = self.folder / f"part-{number:06d}.parquet"
+    def new_part(self) -> Path:
+        """Returns the path of the part that comes next."""
+        numbers = [path.stem.partition("-")[2] for path in self.parts()]
+        number = max((int(number) for number in numbers if number.isdigit()), default=0) + 1
+        return self.folder / f"part-{number:06d}.parquet"
+
+    def write(self, path: Path, lines: pyarrow.Table) -> None:
+        """Write the part `path` (again), whole or not at all."""
         temporary = self.folder / f".{path.name}.tmp"
         try:
             with open(temporary, "wb") as handle:
@@ -110,15 +114,15 @@ class StudyResults:
                 temporary.unlink()
             raise
 
-    def read(self, schema: pyarrow.Schema | None = None) -> pyarrow.Table | None:
+    def read(self, study: Study | None = None) -> pyarrow.Table | None:
         """Returns all lines, or None where there is no part yet.
 
-        Raises InputError where a part is damaged, has other columns than `schema` (or than the
+        Raises InputError where a part is damaged, has other columns than `study` (or than the
         first part), or two lines are the same row of the same task.
         """
-        pa = arrow()
-        tables = []
-        for path in self.parts().values():
+        pa, tables = arrow(), []
+        schema = None if study is None else schema_of(study)
+        for path in self.parts():
             try:
                 table = pa.parquet.ParquetFile(path).read()
             except (pa.ArrowException, OSError) as error:
@@ -150,21 +154,31 @@ class StudyResults:
     def drop_failed(self) -> None:
         """Remove the lines of failed tasks, part by part."""
         pa = arrow()
-        for number, path in self.parts().items():
+        for path in self.parts():
             table = pa.parquet.ParquetFile(path).read()
             good = table.filter(table["task_error"].is_null())
             if not good.num_rows:
                 path.unlink()
             elif good.num_rows < table.num_rows:
-                self.write(number, good)
+                self.write(path, good)
 
     def clear(self) -> None:
         """Remove all results."""
-        for path in [*self.parts().values(), self.folder / STATEMENT, self.folder / FAILURES]:
+        for path in [*self.parts(), self.folder / STATEMENT, self.folder / FAILURES]:
             path.unlink(missing_ok=True)
 
-    def state(self, statement: Mapping[str, Any]) -> None:
+    def state(self, study: Study, version: str) -> None:
         """Write down what the results are of: seed, options, hashes of the sources."""
+        statement = {
+            "schema": "elastocal/study/1",
+            "title": study.title,
+            "seed": study.seed,
+            "options": dict(study.options),
+            "tasks": len(study.tasks),
+            "columns": dict(study.sources.columns),
+            "sources": study.sources.digests,
+            "elastocal": version,
+        }
         text = json.dumps(statement, indent=1, ensure_ascii=False, allow_nan=False)
         atomic_write_text(self.folder / STATEMENT, text + "\n")
 
@@ -181,7 +195,7 @@ class Recorder:
     """Collects outcomes in a `with` block and writes them; at its end all of them are written.
 
     One line per row that a task returned; a task that returned none, or failed, has one line
-    whose `task_row` is null.  A timer writes too, so that a result is kept although the next one
+    whose `task_row` is null.  A thread writes too, so that a result is kept although the next one
     takes an hour.  Whatever interrupts a write, the same batch is written again under the same
     name, so nothing is lost and nothing is there twice.
     """
@@ -191,31 +205,24 @@ class Recorder:
     ) -> None:
         self._results, self._tasks, self._version = results, study.tasks, version
         self._schema, self._soonest = schema_of(study), soonest
-        self._begun = time.monotonic()
         self._lock = threading.Lock()
-        # Number of the open part and what goes into it.  One attribute: an interrupt that fell
-        # between a new number and a new list would write the batch twice.
-        self._open: tuple[int, list[Outcome]] = (max(results.parts(), default=0) + 1, [])
-        self._timer: threading.Timer | None = None
+        self._done = threading.Event()
         self._failure: BaseException | None = None
+        # The open part and what goes into it.  One attribute: an interrupt that fell between a
+        # new part and a new list would write the batch twice.
+        self._open: tuple[Path, list[Outcome]] = (results.new_part(), [])
 
     def add(self, outcome: Outcome) -> None:
-        """Take an outcome; raises what an earlier write on the timer raised."""
+        """Take an outcome; raises what an earlier write of the thread raised."""
         if self._failure is not None:
             raise self._failure
         with self._lock:
             self._open[1].append(outcome)
-        if self._timer is None or not self._timer.is_alive():
-            elapsed = time.monotonic() - self._begun
-            wait = max(self._soonest, min(elapsed / 50, LATEST))
-            self._timer = threading.Timer(wait, self._on_time)
-            self._timer.daemon = True
-            self._timer.start()
 
     def flush(self) -> None:
         """Write what is open."""
         with self._lock:
-            number, outcomes = self._open
+            part, outcomes = self._open
             if not outcomes:
                 return
             for outcome in outcomes:
@@ -224,8 +231,8 @@ class Recorder:
                     with open(self._results.folder / FAILURES, "a", encoding="utf-8") as log:
                         log.write(f"task {outcome.index} {task}\n{outcome.trace}\n")
             lines = [line for outcome in outcomes for line in self._lines(outcome)]
-            self._results.write(number, arrow().Table.from_pylist(lines, schema=self._schema))
-            self._open = (number + 1, [])
+            self._results.write(part, arrow().Table.from_pylist(lines, schema=self._schema))
+            self._open = (self._results.new_part(), [])
 
     def _lines(self, outcome: Outcome) -> Iterator[dict[str, Any]]:
         task = self._tasks[outcome.index]
@@ -242,18 +249,21 @@ class Recorder:
         if not outcome.rows:
             yield common
 
-    def _on_time(self) -> None:
+    def _now_and_then(self) -> None:
+        begun, wait = time.monotonic(), self._soonest
         try:
-            self.flush()
+            while not self._done.wait(wait):
+                self.flush()
+                wait = max(self._soonest, min((time.monotonic() - begun) / 50, LATEST))
         except BaseException as error:
             self._failure = error
 
     def __enter__(self) -> Self:
+        threading.Thread(target=self._now_and_then, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
+        self._done.set()
         self.flush()
 
 

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
@@ -21,22 +21,15 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, ModuleType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import elastocal
 from elastocal import __version__
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import ElastocalError, InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.nearest import quoted
 from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
-from elastocal.studies.study_results import (
-    SOONEST,
-    Recorder,
-    StudyResults,
-    opened,
-    read_results,
-    schema_of,
-)  # fmt: skip
+from elastocal.studies.study_results import SOONEST, Recorder, StudyResults, opened, read_results
 
 GRACE = 30.0  # s that running tasks are waited for
 ANSWER = 10.0  # s in which a scheduler answers
@@ -100,25 +93,9 @@ def _write(message: str) -> None:
     os.write(2, f"\nelastocal: {message}\n".encode())
 
 
-class Crew(Protocol):
-    """Worker processes, wherever they are."""
-
-    tries: int  # of a task whose process dies: the first, where others may be to blame, and alone
-
-    def places(self) -> int:
-        """Returns how many tasks can be out at once now."""
-
-    def submit(self, *call: Any) -> Any:
-        """Returns the future of a call."""
-
-    def deaths(self, error: Exception) -> int:
-        """Returns how many processes died under the task; none where it was another error."""
-
-    def close(self, out: list[Any]) -> None:
-        """End, without waiting for the futures that are out."""
-
-
-def hand_out(crew: Crew, sources: Sources, tasks: Sequence[StudyTask], stop: StudyStop) -> Outcomes:
+def hand_out(
+    crew: Processes | DaskWorkers, sources: Sources, tasks: Sequence[StudyTask], stop: StudyStop
+) -> Outcomes:
     """Outcomes as they come, none twice; no new task goes out once `stop` is asked for.
 
     No task waits at a worker: what is out is what is waited for on Ctrl-C.  A process that dies
@@ -128,8 +105,7 @@ def hand_out(crew: Crew, sources: Sources, tasks: Sequence[StudyTask], stop: Stu
     waiting, suspects = deque(tasks), deque[StudyTask]()
     out: dict[Any, StudyTask] = {}
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    tried: Counter[int] = Counter()
-    died: Counter[int] = Counter()
+    died = defaultdict[int, list[int]](list)
     try:
         while True:
             places = crew.places()
@@ -148,16 +124,15 @@ def hand_out(crew: Crew, sources: Sources, tasks: Sequence[StudyTask], stop: Stu
             try:
                 outcome = future.result()
             except Exception as error:  # execute() returns what a task raises
-                deaths = crew.deaths(error)
-                tried[task.index] += 1
-                died[task.index] += deaths
-                if deaths and tried[task.index] < crew.tries:
+                deaths = died[task.index]
+                deaths.append(crew.deaths(error))
+                if deaths[-1] and len(deaths) < crew.tries:
                     suspects.append(task)
                     continue
                 line = f"the worker could not run it: {type(error).__name__}: {error}"
-                if deaths:
+                if deaths[-1]:
                     line = (
-                        f"its worker process died {died[task.index]} times (out of memory, killed, "
+                        f"its worker process died {sum(deaths)} times (out of memory, killed, "
                         "or crashed in a library)"
                     )
                 outcome = Outcome(task.index, error=line, trace=f"{line}\n{error}\n")
@@ -285,8 +260,7 @@ class DaskWorkers:
     def deaths(self, error: Exception) -> int:
         if isinstance(error, CancelledError | OSError):
             raise self._lost() from None
-        killed = isinstance(error, dask_distributed().scheduler.KilledWorker)
-        return int(error.allowed_failures) + 1 if killed else 0
+        return int(getattr(error, "allowed_failures", -1)) + 1  # as a KilledWorker has
 
     def close(self, out: list[Any]) -> None:
         if out and self._client.status == "running":
@@ -310,11 +284,11 @@ def connect(address: str) -> Any:
     import dask
 
     where = dask.config.get("scheduler-address", None) if address == "config" else address
-    if where is None:
-        raise InputError(
-            "cluster=config: Dask's configuration names no scheduler; set "
-            "DASK_SCHEDULER_ADDRESS or scheduler-address, or give cluster=tcp://HOST:8786"
-        )
+    require(
+        where is not None,
+        "cluster=config: Dask's configuration names no scheduler; set DASK_SCHEDULER_ADDRESS or "
+        "scheduler-address, or give cluster=tcp://HOST:8786",
+    )
     # Its log lines tell of dead workers with tracebacks; what matters is told by the study.
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -327,19 +301,13 @@ def connect(address: str) -> Any:
         ) from None
     try:
         found = client.run(_version)
+        wrong = [(worker, version) for worker, version in found.items() if version != __version__]
+        told = "".join(f"worker {worker} has elastocal {version}" for worker, version in wrong[:1])
     except Exception as error:  # of the worker: whatever its Python lacks
+        told = f"a worker cannot import elastocal ({error})"
+    if told:
         client.close()
-        raise InputError(
-            f"cluster={where}: a worker cannot import elastocal ({error}); install "
-            f"elastocal {__version__} where the workers run"
-        ) from None
-    for worker, version in found.items():
-        if version != __version__:
-            client.close()
-            raise InputError(
-                f"cluster={where}: worker {worker} has elastocal {version}, here it is "
-                f"{__version__}; install the same there"
-            )
+        raise InputError(f"cluster={where}: {told}; install elastocal {__version__} there, as here")
     return client
 
 
@@ -348,10 +316,7 @@ def _version() -> str:
 
 
 def dask_distributed() -> ModuleType:
-    """Returns the module distributed.
-
-    Raises InputError where it is not installed.
-    """
+    """Returns the module distributed; raises InputError where it is not installed."""
     try:
         import distributed
     except ImportError:
@@ -416,18 +381,7 @@ def run_study(
         if retry_failed and any(failures.values()):
             results.drop_failed()
             failures = {index: False for index, failed in failures.items() if not failed}
-        results.state(
-            {
-                "schema": "elastocal/study/1",
-                "title": study.title,
-                "seed": study.seed,
-                "options": dict(study.options),
-                "tasks": len(study.tasks),
-                "columns": dict(study.sources.columns),
-                "sources": study.sources.digests,
-                "elastocal": version,
-            }
-        )
+        results.state(study, version)
         wanted = study.tasks[:only]
         left = [task for task in wanted if task.index not in failures]
         total, before = len(wanted), len(wanted) - len(left)
@@ -453,7 +407,7 @@ def _known(study: Study, results: StudyResults) -> dict[int, bool]:
 
     Raises InputError where a task there is not the study's task of that index now.
     """
-    whole = results.read(schema_of(study))
+    whole = results.read(study)
     if whole is None:
         return {}
     names = ("task", "task_hash", "task_error")
