@@ -95,6 +95,7 @@ def test_a_changed_study_is_refused_and_started_anew_on_demand(folder):
     study(folder, "--jobs", 1)
     told = study(folder, "--jobs", 1, "--seed", 4)
     assert told.exit_code == 2 and "the seed was 11, now it is 4" in told.stderr
+    assert "Run with --restart to discard them, or with -o NEW to keep them" in told.stderr
     assert study(folder, "--jobs", 1, "--seed", 4, "--restart").exit_code == 0
     assert study(folder, "--jobs", 1, "--seed", 4).exit_code == 0
 
@@ -103,6 +104,8 @@ def test_a_changed_study_is_refused_and_started_anew_on_demand(folder):
     ("arguments", "told"),
     [
         (("--set", "replicats=3"), "did you mean 'replicates'?"),
+        (("--set", "scale=big"), "--set scale=big: takes a number, as in study.toml"),
+        (("--cluster", "tcp://nowhere at all"), "--cluster tcp://nowhere at all: no scheduler"),
         (("--jobs", "2", "--cluster", "config"), "--jobs is for this machine"),
         (("-o", "{folder}"), "holds study.py, study.toml, which no study wrote"),
     ],

@@ -10,6 +10,7 @@ from support.study_folders import SCRIPT, TOML, here, numbers, run_study, write_
 
 from elastocal.errors import InputError
 from elastocal.studies import read_results, read_study, study_results
+from elastocal.studies import run_study as run_prepared
 from elastocal.studies.study_folder import execute
 from elastocal.studies.study_results import Recorder, StudyResults, opened
 
@@ -92,6 +93,35 @@ def test_a_column_of_a_taken_name_is_refused(tmp_path, name, told):
     folder = write_study(tmp_path / "study", SCRIPT, f'{TOML}{name} = ""\n')
     with pytest.raises(InputError, match=f"columns.{name} .*{told}"):
         run_study(folder, tmp_path / "r")
+
+
+def test_values_of_no_common_type_come_back_as_they_were(tmp_path):
+    tasks = '[{"n": 4, "at": [1, 2.5]}, {"n": 4, "at": "x"}, {"n": 4}]'
+    script = SCRIPT.replace('[{"n": n, "label"', f'{tasks} or [{{"n": n, "label"')
+    folder = write_study(tmp_path / "study", script)
+    run_study(folder, tmp_path / "r")
+    assert list(read_results(tmp_path / "r")["at"])[::2] == [[1, 2.5], "x", None]
+    assert set(pd.read_parquet(tmp_path / "r")["at"]) == {"[1, 2.5]", '"x"', "null"}
+    assert run_study(folder, tmp_path / "r").before == 3
+
+
+def test_a_finished_study_needs_no_cluster(folder, results):
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    ending = run_prepared(read_study(folder), results, cluster="tcp://127.0.0.1:9")
+    assert (ending.before, ending.done) == (12, 12)
+
+
+def test_a_cluster_that_cannot_be_reached_costs_no_results(folder, results, monkeypatch):
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    monkeypatch.setattr("elastocal.studies.study_run.ANSWER", 0.5)
+    with pytest.raises(InputError, match="no scheduler answers"):
+        run_prepared(read_study(folder), results, cluster="tcp://127.0.0.1:9", restart=True)
+    assert len(numbers(results)) == 24
+
+
+def test_a_part_of_another_name_is_read_and_not_written_over(folder, results):
+    (results / "part-000001.parquet").rename(results / "part-elsewhere.parquet")
+    assert run_study(folder, results).before == 12 and len(numbers(results)) == 24
 
 
 def test_more_tasks_of_the_same_kind_at_the_end_go_on(tmp_path):

@@ -30,6 +30,11 @@ def test_seeds_are_those_of_spawn(folder):
         assert job.rng().random() == np.random.default_rng(child).random()
 
 
+def test_results_written_by_earlier_versions_are_of_the_same_tasks(folder):
+    tasks = read_study(folder).tasks
+    assert [tasks[0].hash[:12], tasks[11].hash[:12]] == ["b64fc264a489", "a3faaff86a35"]
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_they_do_not_depend_on_the_number_of_processes(folder, whole, tmp_path, workers):
     ending = run_study(folder, tmp_path, lambda study: on_processes(study, workers))

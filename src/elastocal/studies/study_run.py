@@ -364,8 +364,8 @@ def run_study(
     `retry_failed` those that are errors; `progress` takes the number of tasks, of those that
     ended and of those that failed.  However the run ends, what was done by then is written.
 
-    Raises InputError where the results in `output` are of another seed, source or task,
-    ClusterLostError where the scheduler goes away.
+    Raises InputError where the results in `output` are of another seed, source or task, or the
+    cluster cannot be reached; ClusterLostError where the scheduler goes away.
     """
     stop = stop or StudyStop()
     if runner is None and cluster is not None:
@@ -376,6 +376,8 @@ def run_study(
     version = source_version()
     with opened(Path(output)) as results:
         if restart:
+            if cluster is not None:
+                connect(cluster).close()  # one that cannot be reached must not cost the results
             results.clear()
         failures = _known(study, results)
         if retry_failed and any(failures.values()):
