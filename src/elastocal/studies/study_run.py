@@ -19,11 +19,11 @@ from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, Self
 
-import elastocal
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, require
 from elastocal.files import atomic_write_text
@@ -370,9 +370,9 @@ def run_study(
     stop = stop or StudyStop()
     if runner is None and cluster is not None:
         dask_distributed()
-        runner = lambda tasks: run_cluster(study, tasks, cluster, stop, tell)  # noqa: E731
+        runner = partial(run_cluster, study, address=cluster, stop=stop, tell=tell)
     elif runner is None:
-        runner = lambda tasks: run_local(study, tasks, jobs, stop)  # noqa: E731
+        runner = partial(run_local, study, jobs=jobs, stop=stop)
     version = source_version()
     with opened(Path(output)) as results:
         if restart:
@@ -462,12 +462,13 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
 
 def source_version() -> str:
     """Version of elastocal, with the commit where it stands in a git checkout: 0.1.0+gabc1234."""
-    here = Path(elastocal.__file__).parent
+    here = Path(__file__)
+    git = partial(
+        subprocess.run, cwd=here.parent, capture_output=True, text=True, timeout=10, check=True
+    )
     try:
-        command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--exclude=*"]
-        told = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-        tracked = ["git", "-C", str(here), "ls-files", "--error-unmatch", "__init__.py"]
-        subprocess.run(tracked, capture_output=True, timeout=10, check=True)
+        told = git(["git", "describe", "--always", "--dirty", "--exclude=*"])
+        git(["git", "ls-files", "--error-unmatch", here.name])
     except (OSError, subprocess.SubprocessError):
         return __version__
     return f"{__version__}+g{told.stdout.strip()}"
