@@ -13,7 +13,7 @@ from scipy.optimize import differential_evolution
 
 from elastocal.cell_reader import read_cell
 from elastocal.design.candidates import draw
-from elastocal.design.criteria.trace import TraceCriterion
+from elastocal.planning.criteria import TraceCriterion
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space
 from elastocal.design.polish.searches import Searches

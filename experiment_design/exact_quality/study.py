@@ -20,7 +20,7 @@ from elastocal.design.exact.plan import exact_plan
 from elastocal.design.exact.pool import random_plan
 from elastocal.design.exact.regular import regular_plan
 from elastocal.design.problem import DesignProblem
-from elastocal.design.relaxation.relax import relax
+from elastocal.planning.relaxation import relax
 
 EQUAL = 1e-9
 

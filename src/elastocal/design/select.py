@@ -16,8 +16,8 @@ from elastocal.design.options import EFFORTS, DesignOptions
 from elastocal.design.plan import Certificate
 from elastocal.design.polish.coordinate_ascent import polish
 from elastocal.design.polish.searches import Searches
-from elastocal.design.relaxation.relax import Relaxed, relax
 from elastocal.design.setup import Pool, Setup
+from elastocal.planning.relaxation import Relaxed, relax
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.design.augment import Done
-from elastocal.design.criteria.base import Criterion
-from elastocal.design.criteria.choose import make_criterion
 from elastocal.design.information import PoseInformation
 from elastocal.design.parameters import (
     NUISANCE,
@@ -33,6 +31,8 @@ from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.manipulator.model import Model
 from elastocal.nearest import listed
+from elastocal.planning.criteria import make_criterion
+from elastocal.planning.criterion import Criterion
 from elastocal.simulation.simulate import draw_errors, values_from
 
 Array = NDArray[np.float64]

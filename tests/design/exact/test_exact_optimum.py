@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.design.criteria.choose import make_criterion
 from elastocal.design.exact.exchange import exchange
 from elastocal.design.exact.plan import exact_plan
 from elastocal.design.problem import DesignProblem
-from elastocal.design.relaxation.relax import relax
+from elastocal.planning.criteria import make_criterion
+from elastocal.planning.relaxation import relax
 
 
 def is_optimal(problem: DesignProblem, seed: int, **options) -> bool:

@@ -12,7 +12,7 @@ from elastocal.design.exact.contribution import information_without, values_with
 from elastocal.design.exact.exchange import best_addition
 from elastocal.design.exact.greedy import fitted, greedy_plan
 from elastocal.design.exact.pool import Prices
-from elastocal.design.relaxation.relax import relax
+from elastocal.planning.relaxation import relax
 
 
 @settings(max_examples=25, deadline=None)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from small_pools import random_problem
 
-from elastocal.design.criteria.choose import make_criterion
 from elastocal.design.exact.plan import exact_plan
 from elastocal.design.exact.regular import regular_plan
 from elastocal.design.problem import DesignProblem
 from elastocal.errors import InputError, InsufficientDataError
+from elastocal.planning.criteria import make_criterion
 
 
 class Memory:

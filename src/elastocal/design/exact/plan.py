@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from elastocal.design.criteria.base import Gradient
 from elastocal.design.exact.escape import SOFT, search
 from elastocal.design.exact.exchange import TIE, exchange
 from elastocal.design.exact.finished import Checkpoint, Finished, load_finished, save_finished
@@ -17,6 +16,7 @@ from elastocal.design.exact.regular import check_enough, is_regular, regular_pla
 from elastocal.design.exact.rounding import round_weights
 from elastocal.design.problem import Array, DesignProblem, IntArray
 from elastocal.errors import InsufficientDataError, require
+from elastocal.planning.criterion import Gradient
 
 Progress = Callable[[str], None]
 

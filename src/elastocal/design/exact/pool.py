@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from elastocal.design.criteria.base import Gradient
 from elastocal.design.problem import Array, DesignProblem, IntArray
+from elastocal.planning.criterion import Gradient
 
 # Candidates of a group that the search looks at per pose of its share, before all of them.
 NEAR_PER_POSE = 50

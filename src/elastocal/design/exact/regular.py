@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from elastocal.design.criteria.factor import SINGULAR, factorise
 from elastocal.design.exact.pool import admissible, random_plan, without
 from elastocal.design.problem import Array, DesignProblem, IntArray
 from elastocal.errors import InsufficientDataError
+from elastocal.planning.information_matrices import SINGULAR, factorise
 
 # Ridges, as shares of a candidate's mean information, under which a regular plan is looked for.
 RIDGES = (1e-3, 1e-6, 1e-9)

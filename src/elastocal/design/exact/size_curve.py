@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from elastocal.design.exact.exchange import IMPROVEMENT
 from elastocal.design.exact.plan import ExactPlan, Progress, exact_plan
 from elastocal.design.problem import DesignProblem
-from elastocal.design.relaxation.relax import Relaxed, relax
 from elastocal.errors import InsufficientDataError, require
+from elastocal.planning.relaxation import Relaxed, relax
 
 ProblemOf = Callable[[int], DesignProblem]
 

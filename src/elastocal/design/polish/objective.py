@@ -9,10 +9,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.design.criteria.base import Criterion
 from elastocal.design.information import PoseInformation
 from elastocal.manipulator.symbolic import SymbolicArm
 from elastocal.manipulator.symbolic_rows import configuration_rows
+from elastocal.planning.criterion import Criterion
 
 Array = NDArray[np.float64]
 
