@@ -271,8 +271,10 @@ class GCriterion(ScenarioCriterion):
         return 1e6 * float(np.sqrt(value))
 
     def term(self, s: int) -> Term | None:
+        if self.order != np.inf:
+            return None
         A = self.A[s]
-        return TraceTerm(A.transpose(0, 2, 1) @ A) if self.order == np.inf else None
+        return TraceTerm(A.transpose(0, 2, 1) @ A)
 
     def cone(self, cp: ModuleType, s: int, M: Any, root: Array, unit: float) -> Cone:
         if self.order != np.inf:

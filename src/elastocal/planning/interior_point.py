@@ -162,12 +162,14 @@ def pieces_of(criterion: Criterion, scenarios: int) -> Pieces | None:
         return None
     base = criterion.base if isinstance(criterion, Worst) else criterion
     assert isinstance(base, ScenarioCriterion)
-    found = [base.term(s) for s in range(scenarios)]
-    terms = tuple(term for term in found if term is not None)
-    if len(terms) < scenarios or not (worst or all(term.count == 1 for term in terms)):
-        return None
+    terms = []
+    for s in range(scenarios):
+        term = base.term(s)
+        if term is None or not (worst or term.count == 1):
+            return None
+        terms.append(term)
     count = sum(term.count for term in terms)
-    return Pieces(terms, np.eye(count) if worst else np.full((1, count), 1.0 / count))
+    return Pieces(tuple(terms), np.eye(count) if worst else np.full((1, count), 1.0 / count))
 
 
 @dataclass(frozen=True)
