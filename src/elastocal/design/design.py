@@ -13,14 +13,11 @@ from elastocal.design.augment import Done, measured, next_number
 from elastocal.design.candidates import draw
 from elastocal.design.checkpoint import Checkpoint
 from elastocal.design.checks import check_cell
-from elastocal.design.exact.contribution import values_without
-from elastocal.design.exact.size_curve import size_curve
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space
 from elastocal.design.options import EFFORTS, DesignOptions
 from elastocal.design.ordered import ordered
 from elastocal.design.plan import Candidates, Chance, Plan, SizePoint
-from elastocal.design.polish.searches import Searches
 from elastocal.design.random_plans import RandomPlans, random_plans
 from elastocal.design.readings import load_states, readings_each
 from elastocal.design.reasons import predicted, reasons
@@ -32,6 +29,9 @@ from elastocal.errors import InsufficientDataError, require
 from elastocal.manipulator.model import Model
 from elastocal.nearest import did_you_mean, listed, quoted
 from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.exact_plan import size_curve
+from elastocal.planning.exchange import values_without
+from elastocal.planning.polish import Searches
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

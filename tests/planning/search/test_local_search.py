@@ -13,8 +13,14 @@ import pytest
 
 from elastocal.cell import Array, PolarNoise, Tracker
 from elastocal.design.candidates import sobol
-from elastocal.design.polish.local_search import LocalSearch, search_all
-from elastocal.design.polish.objective import Goal, PlanValue, Sensitivity, symbolic_blocks
+from elastocal.planning.polish import (
+    Goal,
+    LocalSearch,
+    PlanValue,
+    Sensitivity,
+    search_all,
+    symbolic_blocks,
+)
 
 Build = Callable[..., Any]
 SEEN = Tracker(position=np.array([3.0, -1.0, 0.5]), noise=PolarNoise(1e-5, 3e-7, 1.5e-5, 6e-6))

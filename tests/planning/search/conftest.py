@@ -19,12 +19,12 @@ from elastocal.design.candidates import Candidates, draw
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.information import PoseInformation
 from elastocal.design.joint_space import JointSpace, joint_space
-from elastocal.design.polish.searches import Searches
 from elastocal.design.problem import DesignProblem
 from elastocal.design.readings import LoadStates, load_states
 from elastocal.manipulator.model import Model
 from elastocal.planning.criteria import make_criterion
 from elastocal.planning.criterion import Criterion
+from elastocal.planning.polish import Searches
 
 EFFECTS = tuple(f"joint_compliance:joint{i}" for i in (2, 3, 4))
 LOAD = np.array([[0.0, 0.0, -200.0]])

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from elastocal.cell import Array
 from elastocal.cell_workspace import Solid
 from elastocal.design.feasibility.shapes import coal_shape
-from elastocal.design.polish.covers import (
-    MOST,
+from elastocal.planning.pose_margins import (
+    MOST_SPHERES,
     ROUNDING,
     excess,
     signed_distance,
@@ -68,7 +68,7 @@ def test_spheres_cover_the_solid(solid: Solid) -> None:
     centres, radius = sphere_cover(solid)
     nearest = np.linalg.norm(inside[:, None] - centres, axis=2).min(axis=1)
     assert (nearest <= radius).all()
-    assert len(centres) <= MOST**2
+    assert len(centres) <= MOST_SPHERES**2
     # No point of the cover is further than its radius from the solid.
     assert (distances(solid, centres) <= TINY).all()
     assert excess(solid) >= 0 and excess(SOLIDS[0]) == 0

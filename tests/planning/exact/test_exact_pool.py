@@ -8,10 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.design.exact.contribution import information_without, values_without
-from elastocal.design.exact.exchange import best_addition
-from elastocal.design.exact.greedy import fitted, greedy_plan
-from elastocal.design.exact.pool import Prices
+from elastocal.planning.exact_plan import Prices
+from elastocal.planning.exchange import (
+    best_addition,
+    fitted,
+    greedy_plan,
+    information_without,
+    values_without,
+)
 from elastocal.planning.relaxation import relax
 
 
@@ -54,7 +58,7 @@ def test_something_is_ruled_out():
 def test_the_best_addition_is_that_of_trying_all(name, prior, monkeypatch):
     """With one candidate evaluated at first, so that the bound decides when to stop; with much
     known before Φ is nearly linear and the bound is close."""
-    monkeypatch.setattr("elastocal.design.exact.exchange.FIRST", 1)
+    monkeypatch.setattr("elastocal.planning.exchange.FIRST", 1)
     for seed in range(20):
         problem = random_problem(name, seed)
         problem = replace(problem, prior=prior * np.eye(problem.blocks.shape[-1])[None])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.design.exact.exchange import exchange
-from elastocal.design.exact.plan import exact_plan
 from elastocal.design.problem import DesignProblem
 from elastocal.planning.criteria import make_criterion
+from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.exchange import exchange
 from elastocal.planning.relaxation import relax
 
 
@@ -97,7 +97,7 @@ def neighbours(problem: DesignProblem, chosen) -> np.ndarray:
 )
 def test_no_single_exchange_on_the_whole_pool_betters_the_plan(name, most, weights, monkeypatch):
     """With few near candidates, so that most of the pool is seen by the last passes alone."""
-    monkeypatch.setattr("elastocal.design.exact.pool.NEAR_PER_POSE", 2)
+    monkeypatch.setattr("elastocal.planning.exact_plan.NEAR_PER_POSE", 2)
     problem = medium(name, 1, most)
     given = {
         "none": lambda: None,

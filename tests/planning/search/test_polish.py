@@ -12,8 +12,8 @@ import pytest
 from elastocal.cell import Array, PolarNoise, Tracker
 from elastocal.cell_workspace import HalfSpace, Solid, Workspace
 from elastocal.design.candidates import sobol
-from elastocal.design.polish.coordinate_ascent import polish
 from elastocal.errors import InputError
+from elastocal.planning.polish import polish
 
 Build = Callable[..., Any]
 POST = np.eye(4)

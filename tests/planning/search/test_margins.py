@@ -18,7 +18,7 @@ from elastocal.cell_workspace import (
     Workspace,
 )
 from elastocal.design.candidates import sobol
-from elastocal.design.polish.margins import margins
+from elastocal.planning.pose_margins import margins
 
 Build = Callable[..., Any]
 DOWN = np.array([0.0, 0.0, -200.0])

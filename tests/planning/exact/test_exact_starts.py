@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from small_pools import random_problem
 
-from elastocal.design.exact.plan import exact_plan
-from elastocal.design.exact.regular import regular_plan
 from elastocal.design.problem import DesignProblem
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.planning.criteria import make_criterion
+from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.exchange import regular_plan
 
 
 class Memory:
@@ -175,7 +175,7 @@ def test_a_regular_plan_is_found_where_no_exchange_leads_to_it(large):
 @pytest.mark.parametrize("given", [False, True])
 def test_a_nuisance_parameter_that_no_near_candidate_shows_is_determined(given, monkeypatch):
     """Candidates 0 and 1 show the last parameter and nothing else: worthless but indispensable."""
-    monkeypatch.setattr("elastocal.design.exact.pool.NEAR_PER_POSE", 2)
+    monkeypatch.setattr("elastocal.planning.exact_plan.NEAR_PER_POSE", 2)
     blocks = np.random.default_rng(0).normal(size=(1, 40, 2, 5))
     blocks[..., 4] = 0.0
     blocks[:, :2] = 0.0
