@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf
 
 from elastocal.errors import InsufficientDataError, require
 
@@ -87,6 +86,8 @@ def factorise(M: Array) -> InformationFactor:
 
 def _one_by_one(M: Array) -> tuple[Array, NDArray[np.bool_]]:
     """numpy refuses a whole stack for one bad matrix; LAPACK itself says which one it is."""
+    from scipy.linalg.lapack import dpotrf
+
     p = M.shape[-1]
     L = np.tile(np.eye(p), (*M.shape[:-2], 1, 1))
     definite = np.zeros(M.shape[:-2], dtype=bool)
