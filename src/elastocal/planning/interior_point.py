@@ -77,7 +77,7 @@ class Restricted:
 
 
 @dataclass(frozen=True)
-class Pieces:
+class SmoothPieces:
     """Φ(M) = max_j Φ_j, Φ_j = Σ_t mix_jt φ_t(M_s(t)⁻¹).
 
     `terms`: one Term per scenario s; the columns of `mix` (J, T) ≥ 0 are their functions in order.
@@ -105,7 +105,7 @@ class Pieces:
 class LocalPieces:
     """The pieces at one M: V (S, p, p), `values` Φ_j (J,), C = ∂φ/∂V of each scenario's terms."""
 
-    pieces: Pieces
+    pieces: SmoothPieces
     V: Array
     values: Array
     C: list[Array]
@@ -151,7 +151,7 @@ class LocalPieces:
         return 0.5 * (H + H.T)
 
 
-def pieces_of(criterion: Criterion, scenarios: int) -> Pieces | None:
+def pieces_of(criterion: Criterion, scenarios: int) -> SmoothPieces | None:
     """The criterion as a maximum of smooth pieces, from its terms; None where it is none.
 
     These are E and its O3, whose pieces would be all directions, and the mean over several
@@ -169,7 +169,7 @@ def pieces_of(criterion: Criterion, scenarios: int) -> Pieces | None:
             return None
         terms.append(term)
     count = sum(term.count for term in terms)
-    return Pieces(tuple(terms), np.eye(count) if worst else np.full((1, count), 1.0 / count))
+    return SmoothPieces(tuple(terms), np.eye(count) if worst else np.full((1, count), 1.0 / count))
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,9 @@ class Multipliers:
         return max(float(np.abs(np.log(value / centre)).max()) for value, centre in pairs)
 
 
-def solve(pieces: Pieces, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Array]:
+def solve(
+    pieces: SmoothPieces, task: Restricted, start: Array, accuracy: float
+) -> tuple[Array, Array]:
     """Weights w (k,) whose log Φ is within `accuracy` of the least, and multipliers μ (J,).
 
     `start` (k,) strictly inside its bounds with the right sums per level.
@@ -267,7 +269,12 @@ def _newton(
 
 
 def _search(
-    pieces: Pieces, task: Restricted, point: BarrierPoint, dw: Array, decrement: float, sigma: float
+    pieces: SmoothPieces,
+    task: Restricted,
+    point: BarrierPoint,
+    dw: Array,
+    decrement: float,
+    sigma: float,
 ) -> BarrierPoint | None:
     """The longest of halved steps that decreases F_σ enough; None where rounding allows none."""
     length = min(_step_to_boundary(point.w, dw), _step_to_boundary(task.most - point.w, -dw))
@@ -314,7 +321,7 @@ def _step_to_boundary(value: Array, step: Array) -> float:
 class NewtonMaster:
     """The master problem by this interior point."""
 
-    def __init__(self, pieces: Pieces) -> None:
+    def __init__(self, pieces: SmoothPieces) -> None:
         self._pieces = pieces
 
     def __call__(self, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Gradient]:
