@@ -24,13 +24,12 @@ import numpy as np
 from peer_kr270 import Arm, evolved, prepared
 from peer_tools import ONE_THREAD, Row, Seconds, peer, required, seconds_of, starts, table, timed
 
-from elastocal.design.criteria.determinant import DeterminantCriterion
-from elastocal.design.exact.exchange import exchange
-from elastocal.design.exact.plan import exact_plan
-from elastocal.design.exact.rounding import round_weights
-from elastocal.design.polish.coordinate_ascent import polish
 from elastocal.design.problem import DesignProblem
-from elastocal.design.relaxation.relax import relax
+from elastocal.planning.criteria import DeterminantCriterion
+from elastocal.planning.exact_plan import exact_plan, round_weights
+from elastocal.planning.exchange import exchange
+from elastocal.planning.polish import polish
+from elastocal.planning.relaxation import relax
 
 SEED = 1
 POOL, POSES = 1000, 30  # of the UR10

@@ -13,16 +13,16 @@ from scipy.optimize import differential_evolution
 
 from elastocal.cell_reader import read_cell
 from elastocal.design.candidates import draw
-from elastocal.design.criteria.trace import TraceCriterion
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space
-from elastocal.design.polish.searches import Searches
 from elastocal.design.problem import DesignProblem
 from elastocal.design.readings import load_states
 from elastocal.design.setup import Known, Pool, Setup, set_up
 from elastocal.design.target_poses import test_poses
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
+from elastocal.planning.criteria import TraceCriterion
+from elastocal.planning.polish import Searches
 
 Array = NDArray[np.float64]
 

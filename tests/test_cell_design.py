@@ -188,8 +188,7 @@ def test_the_criterion_for_a_combination_may_be_asked_for_later(read):
         # wrong values
         ("[design]\nposes = 0", ["design.poses", "whole number >= 1", "0"]),
         ("[design]\nposes = 3.0", ["design.poses", "whole number"]),
-        ("[design]\ncriterion = 'test_poses'", ["did you mean 'test_pose'"]),
-        ("[design]\ncriterion = 'c'", ["design.combination is missing", '"joint2.compliance"']),
+        ("[design]\ncriterion = 3", ["design.criterion", "the name of a planning criterion"]),
         ("[design]\ncombination = { a = 0 }", ["no factor other than zero"]),
         ("[design]\ncombination = { joint2.compliance = 1 }", ["combination.joint2", "in quotes"]),
         ("[design]\nloads_N = [0, 0, -2600]", ["design.loads_N", "list of forces", "[[0, 0, 0]"]),

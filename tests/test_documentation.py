@@ -17,7 +17,9 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 # Made from the code when the site is built; tests/documentation/test_generated_pages.py has them.
-GENERATED = {DOCS / "reference" / f"{name}.md" for name in ("effects", "commands", "cell-keys")}
+GENERATED = {
+    DOCS / "reference" / f"{name}.md" for name in ("effects", "commands", "criteria", "cell-keys")
+}
 
 
 def toml_blocks(page: str) -> list[str]:

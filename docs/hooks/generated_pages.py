@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import cell_keys_page
 import commands_page
+import criteria_page
 import effects_page
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 PAGES = {
     "reference/effects.md": effects_page.page,
     "reference/commands.md": commands_page.page,
+    "reference/criteria.md": criteria_page.page,
     "reference/cell-keys.md": cell_keys_page.page,
 }
 

@@ -6,8 +6,8 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from elastocal.design.criteria.choose import make_criterion
 from elastocal.design.problem import Array, DesignProblem, IntArray
+from elastocal.planning.criteria import make_criterion
 
 CRITERIA = ("test_pose", "D", "E")
 ROWS = 3

@@ -15,12 +15,10 @@ import numpy as np
 import pandas as pd
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.design.exact.exchange import exchange
-from elastocal.design.exact.plan import exact_plan
-from elastocal.design.exact.pool import random_plan
-from elastocal.design.exact.regular import regular_plan
 from elastocal.design.problem import DesignProblem
-from elastocal.design.relaxation.relax import relax
+from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.exchange import exchange, random_plan, regular_plan
+from elastocal.planning.relaxation import relax
 
 EQUAL = 1e-9
 

@@ -19,11 +19,11 @@ from elastocal.design.candidates import draw
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space
 from elastocal.design.readings import ALL_LOADS, load_states
-from elastocal.design.relaxation.relax import relax
 from elastocal.design.setup import Known, set_up
 from elastocal.design.shares import shares_of
 from elastocal.design.target_poses import TargetPoses
 from elastocal.manipulator.model import Model
+from elastocal.planning.relaxation import relax
 
 CANDIDATES = 20_000
 SETS = 5  # sets of twenty test poses, drawn over the joint limits

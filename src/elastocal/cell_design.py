@@ -10,9 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-CriterionName = Literal[
-    "test_pose", "D", "A", "E", "G", "I", "c", "O1", "O2", "O3", "O4", "O5"
-]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class DesignSpec:
-    """`levels` joint → values and `per_level` their numbers of poses (for at most one joint);
+    """`criterion`: the name of one that planning has.
+
+    `levels` joint → values and `per_level` their numbers of poses (for at most one joint);
     `loads` (L, 3) N: forces under which poses are measured, all of them at every pose, or one of
     them chosen per pose where `load_choice`; `repeats` readings each.  `repeatability` m: standard
     deviation of a deviation common to a configuration's readings, per direction; `marker_sigma`
@@ -83,7 +82,7 @@ class DesignSpec:
     D, A, E and O count (default all but base and markers); `combination` name → factor for c."""
 
     poses: int | None = None
-    criterion: CriterionName = "test_pose"
+    criterion: str = "test_pose"
     levels: dict[str, tuple[float, ...]] = field(default_factory=dict)
     per_level: tuple[int, ...] = ()
     repeats: int = 1

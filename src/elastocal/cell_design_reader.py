@@ -38,7 +38,7 @@ def read_design(path: Path, table: DesignTable, markers: tuple[str, ...]) -> Des
     poses = _poses(path, table.poses, levels, per_level)
     sigma = table.marker_sigma_um or {}
     check_markers(path, ("design", "marker_sigma_um"), sigma, markers)
-    _check_criterion(path, table)
+    _check_combination(path, table)
     target, repeatability = table.target_um, table.repeatability_um
     return DesignSpec(
         poses=poses,
@@ -128,13 +128,8 @@ def _loads(path: Path, loads: list[list[float]]) -> np.ndarray:
     return forces
 
 
-def _check_criterion(path: Path, table: DesignTable) -> None:
+def _check_combination(path: Path, table: DesignTable) -> None:
     combination = table.combination or {}
-    if table.criterion == "c" and not combination:
-        raise InputError(
-            f'{path}: key design.combination is missing; beside criterion = "c" it takes factors '
-            'by parameter, as in { "joint2.compliance" = 1.0 }'
-        )
     if combination and not any(combination.values()):
         raise InputError(
             f"{path}: key design.combination has no factor other than zero; give the combination "

@@ -81,6 +81,10 @@ CELLS = {
         BARE + TEST_POSES.replace("q_deg", "load_N = [500, 500, 0]\nq_deg"), 1,
         ("position at test pose", "joint1.compliance", "no feasible pose shows"),
     ),
+    "a criterion that is none": (
+        altered(DEFLECTION, criterion='"test_poses"'), 2,
+        ("cell.toml: key design.criterion takes", '"O4" or "O5"', "did you mean 'test_pose'"),
+    ),
     "c without a combination": (
         altered(DEFLECTION, criterion='"c"'), 2, ("cell.toml", "design.combination", "missing"),
     ),
@@ -136,13 +140,15 @@ def test_a_cell_that_no_plan_fits(tmp_path, text, code, fragments):
 # id: (options, exit code, fragments of the message)
 OPTIONS = {
     "criterion": (("--criterion", "d"), 2, ("--criterion 'd'", "did you mean 'D'", "O5")),
-    "criterion c": (("--criterion", "c"), 2, ("cell.toml", "no combination", "combination = {")),
+    "criterion c": (
+        ("--criterion", "c"), 2, ("cell.toml", "combination is missing", "combination = {"),
+    ),
     "effort": (("--effort", "quik"), 2, ("'quik'", "did you mean 'quick'")),
     "curve of words": (("--curve", "10,many"), 2, ("--curve", "10,15,20", "many")),
     "curve of nothing": (("--curve", "0,3"), 2, ("curve", "0, 3")),
     "curve beyond the candidates": (("--curve", "3,99"), 2, ("99 poses", "60 candidates")),
     "target in µm for D": (
-        ("--criterion", "D", "--target", "9"), 2, ("test_pose, I and G", "not with D"),
+        ("--criterion", "D", "--target", "9"), 2, ("test_pose, G and I", "not with D"),
     ),
     "target that cannot be met": (
         ("--target", "0.01"), 1,

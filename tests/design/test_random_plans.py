@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support.design_commands import BARE, DEFLECTION, altered, planned, write_cell
 
-from elastocal.design.criteria.choose import make_criterion
 from elastocal.design.plan import Chance
 from elastocal.design.problem import DesignProblem
 from elastocal.design.random_plans import random_plans
+from elastocal.planning.criteria import make_criterion
 
 P, R = 4, 2  # parameters, rows of a pose
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cell_keys_page
 import commands_page
+import criteria_page
 import effects_page
 import pytest
 import typer
@@ -12,6 +13,7 @@ import typer
 from elastocal.cli import app
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.effects.base import Effect
+from elastocal.planning.criteria import CRITERIA
 
 DOCS = Path(__file__).parents[2] / "docs"
 EFFECTS = effects_page.page()
@@ -34,6 +36,18 @@ def test_parameters_stand_with_unit_and_size():
     assert "`time_constant_s` (default 1800, 60 to 1000000)" in EFFECTS
     distortion = EFFECTS.split("### `tracker_distortion`")[1]
     assert "- **Not with** `observe` = `distance`" in distortion
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_every_criterion_says_what_it_is_and_whether_it_has_a_bound(name):
+    page = criteria_page.page()
+    criterion = CRITERIA[name]
+    row = next(line for line in page.splitlines() if line.startswith(f"| [`{name}`]"))
+    assert criterion.title and criterion.title in row
+    assert row.endswith("yes |" if criterion.certifiable else "no |")
+    part = page.split(f"## `{name}` ", 1)[1].split("\n## ", 1)[0]
+    assert criterion.__doc__.strip().splitlines()[0] in part
+    assert ("**No bound**" in part) != criterion.certifiable
 
 
 def test_every_verb_and_option_is_on_the_page():

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperOption
 
 from elastocal.cli.app import (
     CellFile,
@@ -36,7 +37,23 @@ if TYPE_CHECKING:
     from elastocal.identification.constrained.prior import GaussianPrior
 
 
-@app.command()
+def _criteria() -> list[str]:
+    from elastocal.planning.criteria import CRITERIA
+
+    return list(CRITERIA)
+
+
+class NamingCriteria(TyperCommand):
+    """A command whose help lists the criteria that there are; only help waits for them."""
+
+    def format_help(self, *args: Any) -> None:
+        for parameter in self.params:
+            if isinstance(parameter, TyperOption) and parameter.name == "criterion":
+                parameter.help = f"{', '.join(_criteria())}; default as the cell says."
+        super().format_help(*args)
+
+
+@app.command(cls=NamingCriteria)
 @reporting_errors
 def design(
     cell: CellFile,
@@ -44,13 +61,15 @@ def design(
     poses: Annotated[int | None, typer.Option(min=1, help="Number of poses.")] = None,
     criterion: Annotated[
         str | None,
-        typer.Option(help="test_pose, D, A, E, G, I, c, O1 to O5; default as the cell says."),
+        typer.Option(
+            help="What makes a plan good; default as the cell says.", autocompletion=_criteria
+        ),
     ] = None,
     target: Annotated[
         float | None,
         typer.Option(
             metavar="µm",
-            help="Find the smallest number of poses that reaches this, in µm (test_pose, I, G).",
+            help="Find the smallest number of poses that reaches this, for a criterion in µm.",
         ),
     ] = None,
     curve: Annotated[
@@ -169,18 +188,17 @@ def _target(target: float | None, poses: int | None) -> float | None:
 
 def _read(path: Path, asked: dict[str, Any]) -> Cell:
     """The cell, with what the command line says of [design] in its place."""
-    from elastocal.cell_design import CriterionName
     from elastocal.cell_reader import read_cell
     from elastocal.manipulator.effects import CATALOGUE
     from elastocal.nearest import did_you_mean, listed, quoted
+    from elastocal.planning.criteria import CRITERIA
 
     cell = read_cell(path, known_effects=tuple(CATALOGUE))
-    names = get_args(CriterionName)
     name = asked["criterion"]
-    if name is not None and name not in names:
+    if name is not None and name not in CRITERIA:
         raise InputError(
-            f"--criterion {quoted(name)} is unknown{did_you_mean(name, names)}; there are "
-            f"{listed(names)}"
+            f"--criterion {quoted(name)} is unknown{did_you_mean(name, CRITERIA)}; there are "
+            f"{listed(CRITERIA)}"
         )
     changes = {key: value for key, value in asked.items() if value is not None}
     if "poses" in changes:

@@ -24,9 +24,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from elastocal.design.criteria.base import Array, Gradient
 from elastocal.design.problem import DesignProblem, IntArray
 from elastocal.errors import require
+from elastocal.planning.criterion import Gradient
+from elastocal.planning.information_matrices import Array
 
 
 def lower_bound(problem: DesignProblem, weights: Array) -> float:
@@ -38,7 +39,8 @@ def lower_bound(problem: DesignProblem, weights: Array) -> float:
     """
     require(
         problem.criterion.certifiable,
-        f"criterion {problem.criterion.name} has no certified bound: 1/Φ is not concave",
+        f"criterion {problem.criterion.name} {problem.criterion.without_bound}, so it has no "
+        "certified bound",
     )
     M = problem.information(weights)
     if not np.isfinite(problem.criterion.value(M)):

@@ -19,12 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.design.candidates import CHUNK, sobol
-from elastocal.design.criteria.base import Gradient
-from elastocal.design.polish.local_search import search_all
-from elastocal.design.polish.objective import Sensitivity
-from elastocal.design.polish.searches import Searches, distinct, trials
 from elastocal.design.problem import DesignProblem
 from elastocal.errors import require
+from elastocal.planning.criterion import Gradient
+from elastocal.planning.polish import Searches, Sensitivity, distinct, search_all, trials
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

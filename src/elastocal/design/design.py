@@ -13,14 +13,11 @@ from elastocal.design.augment import Done, measured, next_number
 from elastocal.design.candidates import draw
 from elastocal.design.checkpoint import Checkpoint
 from elastocal.design.checks import check_cell
-from elastocal.design.exact.contribution import values_without
-from elastocal.design.exact.size_curve import size_curve
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space
 from elastocal.design.options import EFFORTS, DesignOptions
 from elastocal.design.ordered import ordered
 from elastocal.design.plan import Candidates, Chance, Plan, SizePoint
-from elastocal.design.polish.searches import Searches
 from elastocal.design.random_plans import RandomPlans, random_plans
 from elastocal.design.readings import load_states, readings_each
 from elastocal.design.reasons import predicted, reasons
@@ -31,6 +28,10 @@ from elastocal.design.target_poses import test_poses
 from elastocal.errors import InsufficientDataError, require
 from elastocal.manipulator.model import Model
 from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.exact_plan import size_curve
+from elastocal.planning.exchange import values_without
+from elastocal.planning.polish import Searches
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -77,7 +78,7 @@ class _Design:
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
-        _check_combination(self.model)
+        _check_criterion(self.model)
         self.states = load_states(self.cell)
         self.space = joint_space(self.cell, self.chain)
         self.feasibility = Feasibility(self.cell, self.chain)
@@ -196,10 +197,12 @@ class _Design:
     def _target(self, setup: Setup, target: float) -> float:
         """Φ of a target in m."""
         unit_value, unit = setup.criterion.reported(1.0)
+        metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]
         require(
             unit == "µm",
-            f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria test_pose, "
-            f"I and G, not with {self.cell.design.criterion}; drop it, or compare by --curve",
+            f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria "
+            f"{_joined(metric, 'and')}, not with {self.cell.design.criterion}; drop it, or "
+            "compare numbers of poses by a curve",
         )
         return (target * 1e6 / unit_value) ** 2
 
@@ -252,19 +255,32 @@ class _Design:
         )  # fmt: skip
 
 
-def _check_combination(model: Model) -> None:
-    """`[design] combination` is there where criterion c needs it, and names parameters."""
+def _check_criterion(model: Model) -> None:
+    """The criterion is known; `[design] combination` is there where it is needed, and names
+    parameters."""
     cell = model.cell
-    where = f"{cell.path or cell.name}: [design]"
+    where, asked = cell.path or cell.name, cell.design.criterion
+    takes = _joined([f'"{name}"' for name in CRITERIA], "or")
+    require(
+        asked in CRITERIA,
+        f"{where}: key design.criterion takes {takes}; found {quoted(asked)}"
+        f"{did_you_mean(asked, CRITERIA)}",
+    )
     names = cell.design.combination
     require(
-        bool(names) or cell.design.criterion != "c",
-        f"{where} states no combination, which criterion c makes certain; add it, as in "
+        bool(names) or "combination" not in CRITERIA[asked].needs,
+        f'{where}: key design.combination is missing; beside criterion = "{asked}" it takes '
+        "factors by parameter, as in "
         f'combination = {{ "{next(iter(model.names), "joint2.compliance")}" = 1.0 }}',
     )
     for name in names:
         require(
             name in model.names,
-            f"{where} combination names {quoted(name)}, which is no parameter of the model"
-            f"{did_you_mean(name, model.names)}; there are {listed(model.names)}",
+            f"{where}: [design] combination names {quoted(name)}, which is no parameter of the "
+            f"model{did_you_mean(name, model.names)}; there are {listed(model.names)}",
         )
+
+
+def _joined(names: list[str], word: str) -> str:
+    """a, b and c."""
+    return f"{', '.join(names[:-1])} {word} {names[-1]}"

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.design.criteria.base import Criterion
 from elastocal.design.order.execution import Execution
 from elastocal.design.random_plans import RandomPlans
 from elastocal.design.reasons import Predicted, Reason
 from elastocal.manipulator.model import Model
 from elastocal.notebook import ForNotebooks
+from elastocal.planning.criterion import Criterion
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.design.criteria.base import Criterion
 from elastocal.errors import require
+from elastocal.planning.criterion import Criterion
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

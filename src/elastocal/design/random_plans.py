@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.design.exact.pool import random_plan
 from elastocal.design.problem import DesignProblem
+from elastocal.planning.exchange import random_plan
 
 Array = NDArray[np.float64]
 

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from elastocal.design.certificate import efficiency
 from elastocal.design.checkpoint import Checkpoint
 from elastocal.design.continuum import Continuum, estimate
-from elastocal.design.exact.plan import exact_plan
 from elastocal.design.options import EFFORTS, DesignOptions
 from elastocal.design.plan import Certificate
-from elastocal.design.polish.coordinate_ascent import polish
-from elastocal.design.polish.searches import Searches
-from elastocal.design.relaxation.relax import Relaxed, relax
 from elastocal.design.setup import Pool, Setup
+from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.polish import Searches, polish
+from elastocal.planning.relaxation import Relaxed, relax
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

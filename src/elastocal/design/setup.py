@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.design.augment import Done
-from elastocal.design.criteria.base import Criterion
-from elastocal.design.criteria.choose import make_criterion
 from elastocal.design.information import PoseInformation
 from elastocal.design.parameters import (
     NUISANCE,
@@ -33,6 +31,8 @@ from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.manipulator.model import Model
 from elastocal.nearest import listed
+from elastocal.planning.criteria import criterion_named, make_criterion
+from elastocal.planning.criterion import Criterion
 from elastocal.simulation.simulate import draw_errors, values_from
 
 Array = NDArray[np.float64]
@@ -132,7 +132,7 @@ def set_up(
     information = replace(information, columns=kept, sizes=sizes[kept])
     interest = interest_of(model, found)
     A, warnings = None, _unseen(model, found, free)
-    if spec.criterion in ("test_pose", "I", "G"):
+    if "test_poses" in criterion_named(spec.criterion).needs:
         rows = np.stack([prediction_rows(information, targets, x) for x in scenarios])
         A = on_kept(model, rows, found)
         warnings += _held(model, found, remaining_bias(rows[0], targets.weight, found))
@@ -146,6 +146,8 @@ def set_up(
         combination=_combination(model, found),
         unit=_unit(model),
         n_poses=n_poses,
+        names=information.names,
+        sizes=information.sizes,
         robust=spec.robust,
     )
     prior = np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0)

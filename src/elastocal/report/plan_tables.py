@@ -7,6 +7,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from elastocal.design.plan import Plan
+from elastocal.planning.criteria import CRITERIA
 from elastocal.report.console_table import titled
 from elastocal.report.page import Table
 from elastocal.report.plan_rows import curve_rows, interval_rows, pose_rows, reason_rows
@@ -125,7 +126,8 @@ def _candidate_line(plan: Plan) -> tuple[str, str]:
 def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
     c = plan.certificate
     if c.efficiency_pool is None:
-        return [("Certificate", f"none: {plan.criterion} is not convex, so no bound is known.")]
+        reason = CRITERIA[plan.criterion].without_bound
+        return [("Certificate", f"none: {plan.criterion} {reason}, so no bound is known.")]
     told = "" if plan.bound_reported is None else f" (bound {plan.bound_reported:.4g} {plan.unit})"
     lines = [
         (

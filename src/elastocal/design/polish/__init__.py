@@ -1,1 +1,0 @@
-"""Continuous improvement of a plan's poses: local search with joint limits and clearances."""

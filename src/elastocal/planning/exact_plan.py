@@ -1,0 +1,533 @@
+"""The best exact plan found from many starts, and the fewest poses that meet a target.
+
+A relaxed optimum is rounded, or a plan built up, and improved by exchange; the result is the same
+for one seed however the work is spread or interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.design.problem import DesignProblem
+from elastocal.errors import InsufficientDataError, require
+from elastocal.planning.criterion import Gradient
+from elastocal.planning.exchange import (
+    IMPROVEMENT,
+    SOFT,
+    TIE,
+    check_enough,
+    exchange,
+    fitted,
+    greedy_plan,
+    is_regular,
+    iterated_search,
+    random_plan,
+    regular_plan,
+)
+from elastocal.planning.information_matrices import Array, IntArray
+from elastocal.planning.relaxation import Relaxed, relax
+
+Progress = Callable[[str], None]
+
+
+ProblemOf = Callable[[int], DesignProblem]
+# Candidates of a group that the search looks at per pose of its share, before all of them.
+NEAR_PER_POSE = 50
+# A better plan must be better by more than rounding: relative slack of what is ruled out.
+SLACK = 1e-9
+# A candidate without weight counts as this share of the smallest weight of its group: it is used
+# only where those with weight cannot fill the share under the cap.
+FLOOR = 1e-6
+
+
+@dataclass(frozen=True)
+class ExactPlan:
+    """`chosen` (n_poses,): candidate indices, sorted, repeated where measured more than once.
+
+    `value` is Φ; no single exchange on the whole pool lowers it.  `starts` were made, each ended
+    at one of `values` (starts,) after altogether `passes` passes of exchanges.
+    """
+
+    chosen: IntArray
+    value: float
+    starts: int
+    passes: int
+    values: Array
+
+
+def exact_plan(
+    problem: DesignProblem,
+    *,
+    relaxed_weights: Array | None = None,
+    tangent: Gradient | None = None,
+    warm: IntArray | None = None,
+    starts: int = 10,
+    seed: int = 0,
+    jobs: int = 1,
+    checkpoint: ArrayStore | None = None,
+    progress: Progress = lambda message: None,
+) -> ExactPlan:
+    """The plan of least Φ found from `starts` starts: exchange and iterated local search each.
+
+    The first start is `warm`, a plan that may have other shares, else the rounded relaxation
+    (`relaxed_weights` (N,), any weights), else greedy.  It and the prices at the relaxed weights
+    rule out the candidates that no better plan contains, and order the others; further starts
+    (roundings drawn at random, greedy, random plans) search what remains.  Each start has its own
+    generator, spawned from `seed`, and none sees another's result: the plan does not depend on
+    `jobs`, the number of processes (−1: all cores; joblib must be installed), nor on whether the
+    work was interrupted and taken up again from `checkpoint`.
+
+    Raises InputError where relaxed_weights do not match, starts < 1 or jobs = 0;
+    InsufficientDataError where no plan of these shares determines all parameters.
+    """
+    N = problem.n_candidates
+    if relaxed_weights is not None:
+        shape = relaxed_weights.shape
+        require(shape == (N,), f"relaxed weights have shape {shape}; the pool needs {(N,)}")
+    require(starts >= 1, f"an exact plan needs at least one start, got {starts}")
+    require(jobs != 0, "jobs is the number of processes, or -1 for all cores; got 0")
+    check_enough(problem)
+    seeds = np.random.SeedSequence(seed).spawn(starts)
+    done = load_finished(checkpoint, problem, seed, starts)
+
+    def keep(k: int, finished: Finished) -> None:
+        done[k] = finished
+        save_finished(checkpoint, done, seed)
+        best = min(f.value for f in done.values())
+        progress(f"exact plan: start {len(done)} of {starts}, best {best:.6g}")
+
+    if tangent is None and relaxed_weights is not None:
+        tangent = _tangent(problem, relaxed_weights)
+    if 0 not in done:
+        begun = None if warm is None else fitted(problem, warm)
+        keep(0, _start(_PrunedPool.of(problem, tangent, relaxed_weights), 0, seeds[0], begun))
+    first = done[0]
+    if tangent is None:
+        tangent = _tangent(problem, np.bincount(first.chosen, minlength=N).astype(float))
+    pool = _PrunedPool.of(problem, tangent, relaxed_weights, first)
+    later = [k for k in range(starts) if k not in done]
+    for k, finished in _run(pool, later, seeds, jobs):
+        keep(k, finished)
+    return _best(problem, [done[k] for k in range(starts)])
+
+
+def _tangent(problem: DesignProblem, weights: Array) -> Gradient | None:
+    """(Φ, G) at weights (N,), softened where Φ has a kink: one of the directions that count
+    alike there says little about the others.  None where M(w) is singular."""
+    M = problem.information(weights)
+    return problem.criterion.softened(SOFT).gradient(M) if is_regular(M) else None
+
+
+@dataclass(frozen=True)
+class _PrunedPool:
+    """Candidates `kept` of the whole pool as a problem of their own, those `near` looked at first,
+    relaxed weights and a regular plan that is `known`, all by their places in `kept`."""
+
+    problem: DesignProblem
+    kept: IntArray
+    near: IntArray
+    weights: Array | None
+    known: IntArray | None = None
+
+    @classmethod
+    def of(
+        cls,
+        problem: DesignProblem,
+        tangent: Gradient | None,
+        weights: Array | None,
+        first: Finished | None = None,
+    ) -> _PrunedPool:
+        """All candidates, or those that may be in a better plan than `first`."""
+        if tangent is None:
+            everything = np.arange(problem.n_candidates)
+            return cls(problem, everything, everything, weights)
+        prices = Prices.of(problem, tangent)
+        kept = prices.may_better(np.inf if first is None else first.value)
+        rest = restrict(problem, kept)
+        near = Prices(prices.d[kept], prices.upper[kept]).near(rest)
+        known = None if first is None else np.searchsorted(kept, first.chosen)
+        return cls(rest, kept, near, None if weights is None else weights[kept], known)
+
+
+def _start(
+    pool: _PrunedPool, k: int, seed: np.random.SeedSequence, begun: IntArray | None = None
+) -> Finished:
+    """Start k, all of it: from `begun` or a plan of its kind, near candidates first, then all."""
+    rng = np.random.default_rng(seed)
+    problem = pool.problem
+    chosen = _begin(pool, k, rng) if begun is None else begun
+    chosen = _regular(pool, chosen, rng)
+    kept = np.union1d(pool.near, chosen)
+    found = iterated_search(restrict(problem, kept), np.searchsorted(kept, chosen), rng)
+    final = exchange(problem, kept[found.chosen])
+    return Finished(pool.kept[final.chosen], final.value, found.passes + final.passes)
+
+
+def _begin(pool: _PrunedPool, k: int, rng: np.random.Generator) -> IntArray:
+    """The plan that start k begins from."""
+    problem, weights = pool.problem, pool.weights
+    if weights is not None and k == 0:
+        return round_weights(problem, weights)
+    if k == (0 if weights is None else 1):
+        return pool.near[greedy_plan(restrict(problem, pool.near))]
+    if weights is not None and k % 2 == 0:
+        return round_weights(problem, weights, rng)
+    return pool.near[random_plan(restrict(problem, pool.near), rng)]
+
+
+def _regular(pool: _PrunedPool, chosen: IntArray, rng: np.random.Generator) -> IntArray:
+    """`chosen` or a plan near it that determines all parameters, of near candidates if it can."""
+    kept = np.union1d(pool.near, chosen)
+    nearby = restrict(pool.problem, kept)
+    try:
+        return kept[regular_plan(nearby, np.searchsorted(kept, chosen), rng)]
+    except InsufficientDataError:
+        return regular_plan(pool.problem, chosen, rng) if pool.known is None else pool.known
+
+
+def _run(
+    pool: _PrunedPool, which: list[int], seeds: list[np.random.SeedSequence], jobs: int
+) -> Iterator[tuple[int, Finished]]:
+    """The starts `which`, as each is finished."""
+    if jobs == 1 or len(which) < 2:
+        for k in which:
+            yield k, _start(pool, k, seeds[k])
+        return
+    from joblib import Parallel, delayed
+
+    tasks = (delayed(_numbered)(pool, k, seeds[k]) for k in which)
+    yield from Parallel(jobs, return_as="generator_unordered")(tasks)
+
+
+def _numbered(pool: _PrunedPool, k: int, seed: np.random.SeedSequence) -> tuple[int, Finished]:
+    return k, _start(pool, k, seed)
+
+
+def _best(problem: DesignProblem, done: list[Finished]) -> ExactPlan:
+    """The best of all starts; of equal ones the first in the order of their candidates."""
+    values = np.array([f.value for f in done])
+    tied = [f.chosen.tolist() for f in done if f.value <= values.min() * (1 + TIE)]
+    # Candidates ruled out cannot better a plan, but for what rounding leaves: looked at once more.
+    final = exchange(problem, np.array(min(tied)))
+    passes = sum(f.passes for f in done) + final.passes
+    return ExactPlan(final.chosen, final.value, len(done), passes, values)
+
+
+def restrict(problem: DesignProblem, kept: IntArray) -> DesignProblem:
+    """The same problem with the candidates `kept` (k,), sorted, alone."""
+    if len(kept) == problem.n_candidates:
+        return problem
+    return replace(problem, blocks=problem.blocks[:, kept], group=problem.group[kept])
+
+
+@dataclass(frozen=True)
+class Prices:
+    """First-order prices d (N,) of the candidates, −∂Φ/∂w_i at a tangent, and what they exclude.
+
+    1/Φ is concave and of degree 1, so that its tangent (Φ, G) lies above it: every plan has
+    1/Φ(plan) ≤ (⟨G, prior⟩ + Σ_i plan_i d_i)/Φ².  `upper` (N,) is the largest right side over the
+    plans that contain i; inf where Φ is not certifiable.
+    """
+
+    d: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, problem: DesignProblem, tangent: Gradient) -> Prices:
+        """Prices by the tangent (Φ, G) of Φ, or of any information function below it."""
+        d = problem.sensitivity(tangent.G)
+        if not problem.criterion.certifiable:
+            return cls(d, np.full(len(d), np.inf))
+        best, lost = float((tangent.G * problem.prior).sum()), np.full(len(d), np.inf)
+        for label in np.flatnonzero(problem.shares):
+            members = np.flatnonzero(problem.group == label)
+            dearest = np.sort(np.repeat(d[members], problem.most))[-problem.shares[label] :]
+            best += dearest.sum()
+            lost[members] = np.maximum(dearest[0] - d[members], 0.0)
+        return cls(d, (best - lost) / tangent.value**2)
+
+    def may_better(self, value: float) -> IntArray:
+        """Candidates that a plan with Φ < `value` can contain; the others are ruled out.
+
+        Harman & Pronzato (2007, Statistics & Probability Letters 77, 90–94) drop what no relaxed
+        optimum contains; against a known plan such an inequality drops what no better plan does.
+        """
+        return np.flatnonzero(self.upper > (1 - SLACK) / value)
+
+    def near(self, problem: DesignProblem) -> IntArray:
+        """The dearest candidates of every group, NEAR_PER_POSE for each pose of its share.
+
+        The K of the KL exchange (Atkinson & Donev 1989, Applied Statistics 38, 515–526).
+        """
+        kept = [np.empty(0, dtype=np.int64)]
+        for label, share in enumerate(problem.shares):
+            members = np.flatnonzero(problem.group == label)
+            order = np.argsort(-self.d[members], kind="stable")
+            kept.append(members[order[: NEAR_PER_POSE * share]])
+        return np.sort(np.concatenate(kept))
+
+
+def efficient_rounding(weights: Array, n: int, most: int | None = None) -> IntArray:
+    """Counts ν (k,) with Σ ν_i = n that lose least against positive weights w (k,), k ≤ n.
+
+    Starts from ν_i = ⌈(n − k/2) w_i⌉; a pose too few goes where ν_i/w_i is smallest, one too many
+    is taken where (ν_i − 1)/w_i is largest.  Among all roundings this has the largest
+    min_i ν_i/(n w_i), which bounds the efficiency of the rounded plan for every criterion
+    (Pukelsheim & Rieder 1992, Biometrika 79, 763–770).  With `most`, ν_i ≤ most ≥ n/k.
+    """
+    w = weights / weights.sum()
+    cap = n if most is None else most
+    counts = np.clip(np.ceil((n - len(w) / 2) * w), 1, cap).astype(np.int64)
+    while counts.sum() < n:
+        counts[np.argmin(np.where(counts < cap, counts / w, np.inf))] += 1
+    while counts.sum() > n:
+        counts[np.argmax(np.where(counts > 1, (counts - 1) / w, -np.inf))] -= 1
+    return counts
+
+
+def round_weights(
+    problem: DesignProblem, weights: Array, rng: np.random.Generator | None = None
+) -> IntArray:
+    """A plan (n_poses,), sorted, from relaxed weights (N,): shares and cap hold exactly.
+
+    A relaxed optimum spreads over more candidates than a share has poses, so in every group the
+    largest weights are rounded efficiently and the rest dropped.  With `rng` those kept are drawn
+    without replacement in proportion to their weights (the largest log w_i + Gumbel noise), for
+    starts that differ.
+    """
+    plan = [np.empty(0, dtype=np.int64)]
+    for label, share in enumerate(problem.shares):
+        members = np.flatnonzero(problem.group == label)
+        if share == 0:
+            continue
+        w = np.maximum(weights[members], 0.0)
+        positive = int(np.count_nonzero(w))
+        w = np.maximum(w, FLOOR * w[w > 0].min() if positive else 1.0)
+        fewest = -(-int(share) // problem.most)
+        kept = min(max(fewest, positive), int(share))
+        score = np.log(w) if rng is None else np.log(w) + rng.gumbel(size=len(w))
+        order = np.argsort(-score, kind="stable")[:kept]
+        counts = efficient_rounding(w[order], int(share), problem.most)
+        plan.append(np.repeat(members[order], counts))
+    return np.sort(np.concatenate(plan))
+
+
+class ArrayStore(Protocol):
+    """Where named arrays are kept, whole or not at all."""
+
+    def load(self) -> dict[str, NDArray[Any]] | None:
+        """What was saved last, None if nothing was."""
+
+    def save(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Keep `state` instead of what was saved before."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """Where a start ended: its plan (n_poses,), sorted, Φ, and the passes it took."""
+
+    chosen: IntArray
+    value: float
+    passes: int
+
+
+def save_finished(checkpoint: ArrayStore | None, done: Mapping[int, Finished], seed: int) -> None:
+    """Keep all starts `done` so far, by their numbers."""
+    if checkpoint is None:
+        return
+    checkpoint.save(
+        {
+            "seed": np.array(seed),
+            "start": np.array(list(done)),
+            "chosen": np.array([f.chosen for f in done.values()]),
+            "value": np.array([f.value for f in done.values()]),
+            "passes": np.array([f.passes for f in done.values()]),
+        }
+    )
+
+
+def load_finished(
+    checkpoint: ArrayStore | None, problem: DesignProblem, seed: int, starts: int
+) -> dict[int, Finished]:
+    """The starts that need not be made again; none where they are of another problem or seed."""
+    state = None if checkpoint is None else checkpoint.load()
+    if state is None or int(state["seed"]) != seed or not _belongs(state, problem):
+        return {}
+    numbered = zip(state["start"], state["chosen"], state["value"], state["passes"], strict=True)
+    return {
+        int(k): Finished(chosen, float(value), int(passes))
+        for k, chosen, value, passes in numbered
+        if k < starts
+    }
+
+
+def _belongs(state: Mapping[str, NDArray[Any]], problem: DesignProblem) -> bool:
+    """Do the saved plans fit the problem, with the values saved with them?"""
+    chosen = state["chosen"]
+    if chosen.shape[1:] != (problem.n_poses,) or chosen.max(initial=-1) >= problem.n_candidates:
+        return False
+    for plan, value in zip(chosen, state["value"], strict=True):
+        shares = np.bincount(problem.group[plan], minlength=len(problem.shares))
+        if not np.array_equal(shares, problem.shares):
+            return False
+        now = problem.criterion.value(problem.prior + problem.sum_of(plan))
+        if not np.isclose(now, value, rtol=1e-9, atol=0):
+            return False
+    return True
+
+
+@dataclass(frozen=True)
+class SizedPlan:
+    """The best plan found of `n_poses` poses, its Φ `value`, and the certified lower `bound` on Φ
+    of every plan of so many; None where the criterion has none."""
+
+    n_poses: int
+    value: float
+    bound: float | None
+    plan: ExactPlan
+
+
+@dataclass(frozen=True)
+class SizeCurve:
+    """All sizes tried, ascending.
+
+    `smallest`: the fewest poses with a plan found that meets the target, None if none does or no
+    target was given.  `excluded`: the certified bound excludes the target for every plan of so
+    many poses or fewer; with `smallest` − 1 = `excluded` the answer is proved on the pool.
+    """
+
+    points: tuple[SizedPlan, ...]
+    smallest: int | None
+    excluded: int
+
+
+def size_curve(
+    problem_of: ProblemOf,
+    numbers: Iterable[int],
+    target: float | None = None,
+    *,
+    between: tuple[int, int] = (1, 100),
+    starts: int = 10,
+    seed: int = 0,
+    jobs: int = 1,
+    progress: Progress = lambda message: None,
+) -> SizeCurve:
+    """The best plans found of the given `numbers` of poses, and the fewest with Φ ≤ `target`.
+
+    `problem_of(n)` states the problem of n poses, on the same candidates for all n.  Where no
+    group's share falls with n, Φ of the points does not rise: the smaller plan, extended, is one
+    of the starts of the larger (O2 and O4, which more information may raise, excepted).  The
+    bound falls with n too; bisection finds the first n in `between` at which it allows the target.
+    From there plans are sought with doubled steps, then between the last that failed and the
+    first that met it.
+
+    Raises InputError for no number and no target, an empty range, or a target that is not
+    positive; InsufficientDataError where no plan of one of `numbers` determines all parameters.
+    """
+    wanted = sorted(set(numbers))
+    require(bool(wanted) or target is not None, "a size curve needs numbers of poses or a target")
+    sizes = _Sizes(problem_of, starts, seed, jobs, progress)
+    for n in wanted:
+        sizes.point(n)
+    if target is None:
+        return SizeCurve(sizes.points(), None, 0)
+    low, high = between
+    require(1 <= low <= high, f"no number of poses lies between {low} and {high}")
+    require(target > 0, f"the target must be positive, got {target}")
+    allowed = _first_with(lambda n: (sizes.bound(n) or 0.0) <= target, low, high + 1)
+    _seek(sizes, target, allowed, high)
+    points = sizes.points()
+    smallest = min((p.n_poses for p in points if p.value <= target), default=None)
+    return SizeCurve(points, smallest, allowed - 1)
+
+
+def _seek(sizes: _Sizes, target: float, low: int, high: int) -> None:
+    """Plans until the fewest poses that meet the target, or `high`, are among them."""
+
+    def meets(n: int) -> bool:
+        try:
+            return sizes.point(n).value <= target
+        except InsufficientDataError:
+            if n == high:
+                raise
+            return False
+
+    n, step, failed = min(low, high), 1, low - 1
+    while not meets(n):
+        if n == high:
+            return
+        failed, n, step = n, min(n + step, high), 2 * step
+    _first_with(meets, failed + 1, n)
+
+
+def _first_with(holds: Callable[[int], bool], low: int, high: int) -> int:
+    """The smallest n in [low, high] where a monotone condition holds, taken to hold at high."""
+    while low < high:
+        middle = (low + high) // 2
+        if holds(middle):
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@dataclass(frozen=True)
+class _Sizes:
+    """Plans and relaxations by number of poses, each begun from the next smaller one."""
+
+    problem_of: ProblemOf
+    starts: int
+    seed: int
+    jobs: int
+    progress: Progress
+    found: dict[int, SizedPlan] = field(default_factory=dict)
+    relaxed: dict[int, Relaxed] = field(default_factory=dict)
+
+    def points(self) -> tuple[SizedPlan, ...]:
+        return tuple(self.found[n] for n in sorted(self.found))
+
+    def bound(self, n: int) -> float | None:
+        relaxed = self._relaxation(n, self.problem_of(n))
+        return None if relaxed is None else relaxed.bound
+
+    def point(self, n: int) -> SizedPlan:
+        if n not in self.found:
+            self._plan(n)
+            for larger in sorted(m for m in self.found if m > n):
+                # Found before a smaller one that turns out better: extend that one instead.
+                smaller = self.found[max(m for m in self.found if m < larger)]
+                if self.found[larger].value > smaller.value * (1 + IMPROVEMENT):
+                    self._plan(larger)
+        return self.found[n]
+
+    def _plan(self, n: int) -> None:
+        problem = self.problem_of(n)
+        relaxed = self._relaxation(n, problem)
+        smaller = [m for m in self.found if m < n]
+        plan = exact_plan(
+            problem,
+            relaxed_weights=None if relaxed is None else relaxed.weights,
+            tangent=None if relaxed is None else relaxed.tangent,
+            warm=self.found[max(smaller)].plan.chosen if smaller else None,
+            starts=self.starts,
+            seed=self.seed,
+            jobs=self.jobs,
+        )
+        bound = None if relaxed is None else relaxed.bound
+        self.found[n] = SizedPlan(n, plan.value, bound, plan)
+        told = "" if bound is None else f", bound {bound:.6g}"
+        self.progress(f"{n} poses: {plan.value:.6g}{told}")
+
+    def _relaxation(self, n: int, problem: DesignProblem) -> Relaxed | None:
+        if not problem.criterion.certifiable:
+            return None
+        if n not in self.relaxed:
+            near = min(self.relaxed, key=lambda m: abs(m - n), default=None)
+            start = None if near is None else self.relaxed[near].weights
+            self.relaxed[n] = relax(problem, start=start)
+        return self.relaxed[n]

@@ -1,0 +1,364 @@
+"""Exchange: a plan of whole poses that none of the pool betters in another's place.
+
+Plans are sorted indices (n_poses,) into the candidates.  Here is what an exchange starts from
+(random, greedy, regular plans), the exchange of single poses itself, and the iterated search that
+leaves its local optima; `exact_plan` runs it from many starts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.design.problem import DesignProblem
+from elastocal.errors import InsufficientDataError
+from elastocal.planning.information_matrices import SINGULAR, Array, IntArray, factorise
+
+Mask = NDArray[np.bool_]
+
+# Relative gain in Φ below which an exchange is not made: rounding must not decide.
+IMPROVEMENT = 1e-9
+# Values that differ less are equal, and the candidate that comes first in the pool is taken.
+TIE = 1e-11
+# Candidates evaluated at first; each further batch is larger by GROWTH.
+FIRST, GROWTH = 32, 4
+# Ridges, as shares of a candidate's mean information, under which a regular plan is looked for.
+RIDGES = (1e-3, 1e-6, 1e-9)
+ATTEMPTS = 20
+# Singular values of a block, relative to its largest, below which a direction is not shown.
+SHOWN = 1e-10
+# Changes in vain after which a start is done, and how many poses each of them moves at most.
+PATIENCE = 12
+MOVED = 8
+# Order of the power means that stand for a maximum: smooth, and within a few per cent of it.
+SOFT = 30.0
+
+
+@dataclass(frozen=True)
+class Exchanged:
+    """Sorted plan (n_poses,), its Φ, and the number of passes over its poses."""
+
+    chosen: IntArray
+    value: float
+    passes: int
+
+
+@dataclass(frozen=True)
+class _State:
+    """A plan with Φ, the sensitivities d (N,) of all candidates at its information, and which of
+    them (N,) may be measured once more."""
+
+    chosen: IntArray
+    value: float
+    d: Array
+    free: Mask
+
+    @classmethod
+    def of(cls, problem: DesignProblem, chosen: IntArray) -> _State:
+        gradient = problem.criterion.gradient(problem.prior + problem.sum_of(chosen))
+        free = np.bincount(chosen, minlength=problem.n_candidates) < problem.most
+        return cls(chosen, gradient.value, problem.sensitivity(gradient.G), free)
+
+
+def exchange(problem: DesignProblem, chosen: IntArray) -> Exchanged:
+    """Exchanges within the groups until none of them lowers Φ by more than 1e-9 of its value.
+
+    In each pass every pose, the least contributing first, is exchanged for the candidate of its
+    group, among all, that is best in its place (Cook & Nachtsheim 1980, Technometrics 22,
+    315–324).  `chosen` (n_poses,) must be sorted and its information regular, else
+    InsufficientDataError.
+
+    1/Φ is concave: j → i can only lower Φ where d_i > d_j, and leaves
+    1/Φ ≤ 1/Φ₋ + d_i⁻/Φ₋², Φ₋ and d⁻ being those of the plan without j.  Candidates are therefore
+    evaluated in the order of that bound until the best found exceeds all that are left: the result
+    is that of evaluating the whole pool, for a few per cent of its candidates.
+    """
+    state = _State.of(problem, chosen)
+    passes, improved = 0, True
+    while improved:
+        passes, improved = passes + 1, False
+        poses = np.unique(state.chosen)
+        for out in poses[np.argsort(state.d[poses], kind="stable")]:
+            better = _exchanged(problem, state, int(out))
+            if better is not None:
+                state, improved = better, True
+    return Exchanged(state.chosen, state.value, passes)
+
+
+def _exchanged(problem: DesignProblem, state: _State, out: int) -> _State | None:
+    """The plan with the best candidate in the place of `out`; None where none betters it."""
+    into = state.free & (problem.group == problem.group[out])
+    into[out] = False
+    if problem.criterion.certifiable:
+        into &= state.d > state.d[out] + IMPROVEMENT * state.value
+    candidates = np.flatnonzero(into)
+    if not len(candidates):
+        return None
+    rest = without(state.chosen, out)
+    best = best_addition(problem, problem.prior + problem.sum_of(rest), candidates, state.value)
+    if best is None:
+        return None
+    better = _State.of(problem, np.sort(np.append(rest, best)))
+    # Formed anew: where M is nearly singular, the prediction may promise what rounding takes.
+    return better if better.value < state.value * (1 - IMPROVEMENT) else None
+
+
+def best_addition(
+    problem: DesignProblem, M: Array, candidates: IntArray, below: float = np.inf
+) -> int | None:
+    """The candidate with the smallest Φ(M_s + B_siᵀB_si), if that is less than `below`.
+
+    M (S, p, p) may be singular; then no bound is known and all candidates are evaluated.
+    """
+    upper = _upper(problem, M, candidates)
+    order = np.argsort(-upper, kind="stable")
+    candidates, upper = candidates[order], upper[order]
+    values = np.empty(0)
+    best, size = below * (1 - IMPROVEMENT), FIRST
+    while len(values) < len(candidates) and upper[len(values)] * best > 1 - TIE:
+        part = candidates[len(values) : len(values) + size]
+        added = problem.criterion.after_adding(M, problem.blocks[:, part])
+        values = np.concatenate([values, added])
+        best, size = min(best, float(added.min())), size * GROWTH
+    found = candidates[: len(values)][values <= best * (1 + TIE)]
+    return int(found.min()) if len(found) and np.isfinite(best) else None
+
+
+def _upper(problem: DesignProblem, M: Array, candidates: IntArray) -> Array:
+    """Bounds (k,) on 1/Φ(M_s + B_siᵀB_si); inf where none is known or none is worth its cost."""
+    unknown = np.full(len(candidates), np.inf)
+    if not problem.criterion.certifiable or len(candidates) <= FIRST:
+        return unknown
+    try:
+        gradient = problem.criterion.gradient(M)
+    except InsufficientDataError:
+        return unknown
+    B = problem.blocks[:, candidates]
+    S, k, r, p = B.shape
+    weighted = B.reshape(S, k * r, p) @ gradient.G
+    d = np.einsum("skj,skj->k", weighted.reshape(S, k, r * p), B.reshape(S, k, r * p))
+    return np.asarray((1 + d / gradient.value) / gradient.value)
+
+
+def iterated_search(
+    problem: DesignProblem, chosen: IntArray, rng: np.random.Generator
+) -> Exchanged:
+    """Iterated local search (Lourenço, Martin & Stützle 2003) from a regular plan `chosen`.
+
+    The best plan so far is changed in two to MOVED poses and exchanged anew, until PATIENCE
+    changes in a row led to nothing better.  An exchange optimum is left where the better plan
+    differs by two poses or more, which no single exchange can see.
+    """
+    best = _descended(problem, chosen)
+    passes, failed = best.passes, 0
+    while failed < PATIENCE:
+        changed = _changed(problem, best.chosen, rng)
+        failed += 1
+        if not is_regular(problem.prior + problem.sum_of(changed)):
+            continue
+        found = _descended(problem, changed)
+        passes += found.passes
+        if found.value < best.value * (1 - IMPROVEMENT):
+            best, failed = found, 0
+    return Exchanged(best.chosen, best.value, passes)
+
+
+def _descended(problem: DesignProblem, chosen: IntArray) -> Exchanged:
+    """Exchanges on the softened criterion first, where Φ has kinks.
+
+    What lowers a maximum is shut out wherever two of its arguments are equal and each exchange
+    raises one of them; the softened criterion weighs them against each other.
+    """
+    passes, smooth = 0, problem.criterion.softened(SOFT)
+    if smooth is not problem.criterion:
+        first = exchange(replace(problem, criterion=smooth), chosen)
+        chosen, passes = first.chosen, first.passes
+    found = exchange(problem, chosen)
+    return replace(found, passes=found.passes + passes)
+
+
+def _changed(problem: DesignProblem, chosen: IntArray, rng: np.random.Generator) -> IntArray:
+    """The plan with some of its poses replaced by random ones of their groups."""
+    n = len(chosen)
+    moved = rng.choice(chosen, min(int(rng.integers(2, MOVED + 1)), n), replace=False)
+    for out in moved:
+        rest = without(chosen, out)
+        into = rng.choice(admissible(problem, rest, int(problem.group[out])))
+        chosen = np.sort(np.append(rest, into))
+    return chosen
+
+
+def greedy_plan(problem: DesignProblem, begun: IntArray | None = None) -> IntArray:
+    """A plan (n_poses,), sorted: `begun` extended, each time by the pose that lowers Φ most.
+
+    While the information is singular and Φ infinite, the pose that raises the determinant most
+    above a vanishing ridge.  The plan may still be singular: see `regular_plan`.
+    """
+    chosen = np.empty(0, dtype=np.int64) if begun is None else begun
+    extra = RIDGES[-1] * ridge(problem)
+    while len(chosen) < problem.n_poses:
+        taken = np.bincount(problem.group[chosen], minlength=len(problem.shares))
+        open_groups = np.flatnonzero(problem.shares > taken)
+        into = np.sort(np.concatenate([admissible(problem, chosen, int(g)) for g in open_groups]))
+        M = problem.prior + problem.sum_of(chosen)
+        best = best_addition(problem, M, into) if is_regular(M) else None
+        if best is None:
+            best = into[np.argmax(log_det_gain(M + extra, problem.blocks[:, into]))]
+        chosen = np.sort(np.append(chosen, best))
+    return chosen
+
+
+def fitted(problem: DesignProblem, chosen: IntArray) -> IntArray:
+    """A plan (n_poses,), sorted, of these shares from one of others.
+
+    Where a group holds more than its share, the poses that Φ misses least go; then `greedy_plan`
+    fills up.  Where no share is smaller than before the result is therefore never worse.
+    """
+    chosen = np.sort(chosen)
+    while True:
+        taken = np.bincount(problem.group[chosen], minlength=len(problem.shares))
+        surplus = np.flatnonzero((taken > problem.shares)[problem.group[chosen]])
+        if not len(surplus):
+            return greedy_plan(problem, chosen)
+        least = surplus[np.argmin(values_without(problem, chosen)[surplus])]
+        chosen = np.delete(chosen, least)
+
+
+def is_regular(M: Array) -> bool:
+    """Are all of M (S, p, p) regular, by a margin that no order of summation or columns uses up?"""
+    return bool((factorise(M).condition < SINGULAR / 10).all())
+
+
+def check_enough(problem: DesignProblem) -> None:
+    """Raise InsufficientDataError where no plan of these shares can determine all parameters."""
+    _, _, r, p = problem.blocks.shape
+    n, known = problem.n_poses, _known(problem)
+    needed = -(-(p - known) // r)
+    if n < needed:
+        prior = f" and the prior {known}" if known else ""
+        raise InsufficientDataError(
+            f"fewer equations than parameters: {n} poses of {r} readings give {n * r}{prior}, for "
+            f"{p} parameters; plan at least {needed} poses, switch effects off or state a prior"
+        )
+    usable = np.flatnonzero(problem.shares[problem.group] > 0)
+    if not is_regular(problem.prior + problem.sum_of(usable)):
+        raise InsufficientDataError(
+            f"all {len(usable)} candidates of the groups with a share together do not determine "
+            f"the {p} parameters; allow other joint levels or more load, or switch effects off"
+        )
+
+
+def _known(problem: DesignProblem) -> int:
+    """How many combinations of parameters the prior determines."""
+    return min(int(np.linalg.matrix_rank(prior, hermitian=True)) for prior in problem.prior)
+
+
+def log_det_gain(M: Array, blocks: Array) -> Array:
+    """Σ_s log det(1 + B_si M_s⁻¹ B_siᵀ) (k,) for blocks (S, k, r, p): what adding i brings."""
+    inverse = np.linalg.inv(M)[:, None]
+    inner = blocks @ inverse @ blocks.swapaxes(-1, -2)
+    return np.asarray(np.linalg.slogdet(np.eye(blocks.shape[2]) + inner)[1].sum(axis=0))
+
+
+def ridge(problem: DesignProblem) -> Array:
+    """Diagonal matrices (S, p, p): the mean information of the candidates, parameter by parameter.
+
+    Parameters that differ in scale by orders of magnitude are so treated alike; 1 where no
+    candidate shows a parameter.
+    """
+    mean = np.einsum("snrp,snrp->sp", problem.blocks, problem.blocks) / problem.n_candidates
+    mean = np.where(mean > 0, mean, 1.0)
+    return np.asarray(mean[:, :, None] * np.eye(mean.shape[1]))
+
+
+def regular_plan(problem: DesignProblem, chosen: IntArray, rng: np.random.Generator) -> IntArray:
+    """A plan of regular M near `chosen`: exchanges that raise Σ_s log det(M_s + δ), δ → 0.
+
+    For small δ a determinant counts the rank first.  Each candidate stands with an orthonormal
+    basis of what it shows, which leaves ranks as they are and lets no large candidate outweigh
+    one that shows what the others do not.  Random plans are tried where `chosen` leads to none;
+    raises InsufficientDataError where they do not either.
+    """
+    if is_regular(problem.prior + problem.sum_of(chosen)):
+        return chosen
+    even = _evened(problem)
+    unit = np.eye(problem.blocks.shape[-1])
+    for _ in range(ATTEMPTS):
+        for delta in RIDGES:
+            chosen = _raise_determinant(even, chosen, delta * unit)
+            if is_regular(problem.prior + problem.sum_of(chosen)):
+                return chosen
+        chosen = random_plan(problem, rng)
+    raise InsufficientDataError(
+        f"no plan of {problem.n_poses} poses that determines all {len(unit)} parameters was found; "
+        "plan more poses, other shares, or state a prior"
+    )
+
+
+def _evened(problem: DesignProblem) -> DesignProblem:
+    """The problem with an orthonormal basis of its rows in place of each block, parameters in
+    units of their mean information beforehand."""
+    scale = 1 / np.sqrt(np.einsum("spp->sp", ridge(problem) + problem.prior))
+    _, size, basis = np.linalg.svd(problem.blocks * scale[:, None, None, :], full_matrices=False)
+    shown = size > SHOWN * size[..., :1]
+    prior = problem.prior * scale[:, :, None] * scale[:, None, :]
+    return replace(problem, blocks=basis * shown[..., None], prior=prior)
+
+
+def _raise_determinant(problem: DesignProblem, chosen: IntArray, extra: Array) -> IntArray:
+    """Exchanges, each the best for its pose, until none raises the determinant."""
+    improved = True
+    while improved:
+        improved = False
+        for out in np.unique(chosen):
+            rest = without(chosen, out)
+            into = admissible(problem, rest, int(problem.group[out]))
+            M = problem.prior + extra + problem.sum_of(rest)
+            gain = log_det_gain(M, problem.blocks[:, into])
+            best = int(np.argmax(gain))
+            if gain[best] > gain[np.searchsorted(into, out)] + 1e-6:
+                chosen, improved = np.sort(np.append(rest, into[best])), True
+    return chosen
+
+
+def information_without(problem: DesignProblem, chosen: IntArray) -> Array:
+    """M (n, S, p, p) of the plan `chosen` (n,) without its k-th pose, for every k.
+
+    Sums of what comes before and after k: no subtraction, so that a pose that alone determines a
+    parameter leaves an exactly singular M.
+    """
+    B = problem.blocks[:, chosen]
+    each = np.einsum("snri,snrj->nsij", B, B, optimize=True)
+    before, after = np.zeros_like(each), np.zeros_like(each)
+    before[1:] = np.cumsum(each[:-1], axis=0)
+    after[:-1] = np.cumsum(each[:0:-1], axis=0)[::-1]
+    return np.asarray(problem.prior + before + after)
+
+
+def values_without(problem: DesignProblem, chosen: IntArray) -> Array:
+    """Φ (n,) of the plan `chosen` (n,) without its k-th pose; inf where nothing replaces it."""
+    return problem.criterion.value(information_without(problem, chosen))
+
+
+def admissible(problem: DesignProblem, rest: IntArray, label: int) -> IntArray:
+    """Candidates (k,) of the group that the plan `rest` does not yet use `most` times."""
+    free = problem.group == label
+    used, times = np.unique(rest, return_counts=True)
+    free[used[times >= problem.most]] = False
+    return np.flatnonzero(free)
+
+
+def without(chosen: IntArray, candidate: int) -> IntArray:
+    """The sorted plan `chosen` with one pose at `candidate` less."""
+    return np.delete(chosen, np.searchsorted(chosen, candidate))
+
+
+def random_plan(problem: DesignProblem, rng: np.random.Generator) -> IntArray:
+    """A plan (n_poses,), sorted, drawn uniformly from the places that shares and cap leave."""
+    plan = [np.empty(0, dtype=np.int64)]
+    for label, share in enumerate(problem.shares):
+        places = np.repeat(np.flatnonzero(problem.group == label), problem.most)
+        plan.append(rng.choice(places, int(share), replace=False))
+    return np.sort(np.concatenate(plan))

@@ -1,0 +1,440 @@
+"""Polish: the poses of an exact plan moved off the pool by local search, one after the other.
+
+IPOPT moves one pose at a time: joint limits are its bounds, the cell's margins its constraints, and
+the slope of its goal comes through the symbolic B.  What it finds counts only where the exact
+criterion improves and the cell's own rules hold.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.design.candidates import Checker, feasible
+from elastocal.design.feasibility.pairs import Pair
+from elastocal.design.information import PoseInformation
+from elastocal.design.joint_space import JointSpace
+from elastocal.design.problem import DesignProblem
+from elastocal.errors import require
+from elastocal.manipulator.symbolic import SymbolicArm
+from elastocal.manipulator.symbolic_rows import configuration_rows
+from elastocal.planning.criterion import Criterion
+from elastocal.planning.information_matrices import Array, IntArray
+from elastocal.planning.pose_margins import margins
+
+Progress = Callable[[str], None]
+
+
+ORDER = 20.0  # of the power means that stand for a criterion's kinks while IPOPT searches
+SHORTLIST = 200  # candidates by sensitivity among which a pose's further starts are sought
+LEAST_GAIN = 1e-8  # relative improvement of Φ that counts as one
+# Shares of the way from a start to where its search ended that are tried: IPOPT sees B at
+# simplified deflections and the rules in part, so that its end need not be the best, or feasible.
+STEPS = (1.0, 0.9, 0.7, 0.4, 0.15)
+APART = 0.2  # rad or m between starts in at least one joint
+IPOPT_OPTIONS: dict[str, Any] = {
+    "print_time": False,
+    "error_on_fail": False,
+    "show_eval_warnings": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.max_iter": 80,
+    "ipopt.tol": 1e-7,
+    # Six variables: second derivatives cost more than the steps they save.
+    "ipopt.hessian_approximation": "limited-memory",
+    "ipopt.bound_relax_factor": 0.0,
+}
+
+
+@dataclass(frozen=True)
+class PolishStep:
+    """In sweep `sweep` pose `pose` of the plan moved, and Φ fell from `before` to `after`."""
+
+    sweep: int
+    pose: int
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Polished:
+    """The plan's poses q (k, n) in the order given, Φ before and after, and every step taken.
+
+    `moved` (k,) marks the poses that are no longer the candidates they were.
+    """
+
+    q: Array
+    before: float
+    after: float
+    moved: NDArray[np.bool_]
+    steps: tuple[PolishStep, ...]
+
+
+def polish(
+    problem: DesignProblem,
+    searches: Searches,
+    q: Array,
+    load: IntArray,
+    chosen: IntArray,
+    *,
+    starts: int = 3,
+    sweeps: int = 5,
+    tolerance: float = 1e-4,
+    jobs: int = 1,
+    progress: Progress = lambda message: None,
+) -> Polished:
+    """The plan `chosen` (k,) of a pool q (N, n), load (N,), improved continuously.
+
+    Block coordinate descent: pose after pose is moved to
+
+        min Φ(M − B_jᵀB_j + B(q)ᵀB(q))   over its level, joint limits and the cell's margins
+
+    by IPOPT, from where it is and from the `starts` best candidates for its place.  Every end,
+    and points on the way to it, are evaluated exactly and checked by the cell's own rules; the
+    best that passes is taken, so Φ never rises and no rule is broken.  Sweeps end when one gains
+    less than `tolerance`.  The result does not depend on `jobs`, the number of processes.
+
+    Raises InputError where starts < 0 or sweeps < 1.
+    """
+    require(starts >= 0, f"polish needs a number of starts, got {starts}")
+    require(sweeps >= 1, f"polish needs at least one sweep, got {sweeps}")
+    plan = _Plan(problem, searches, q, load, np.asarray(chosen), starts, jobs)
+    before, steps = plan.value, []
+    for sweep in range(sweeps):
+        progress(f"polishing poses, sweep {sweep + 1}: {problem.criterion.name} {plan.value:.6g}")
+        at_start, shortlist = plan.value, plan.shortlist()
+        for j in range(len(plan.q)):
+            old = plan.value
+            if plan.improve(j, shortlist):
+                steps.append(PolishStep(sweep, j, old, plan.value))
+        if plan.value > at_start * (1 - tolerance):
+            break
+    moved = (plan.q != q[plan.chosen]).any(axis=1)
+    return Polished(plan.q, before, plan.value, moved, tuple(steps))
+
+
+class _Plan:
+    """The plan as it stands: poses `q` (k, n), their blocks, Φ `value`."""
+
+    def __init__(
+        self,
+        problem: DesignProblem,
+        searches: Searches,
+        pool: Array,
+        load: IntArray,
+        chosen: IntArray,
+        starts: int,
+        jobs: int,
+    ) -> None:
+        self.problem, self.searches, self.pool, self.load = problem, searches, pool, load
+        self.chosen, self.starts, self.jobs = chosen, starts, jobs
+        self.smooth = problem.criterion.softened(ORDER)
+        self.q = pool[chosen].copy()
+        self.blocks = problem.blocks[:, chosen].copy()
+        self.value = float(problem.criterion.value(self.information()))
+
+    def information(self, without: int | None = None) -> Array:
+        """M (S, p, p) of the plan, or of all its poses but one."""
+        kept = [i for i in range(len(self.q)) if i != without]
+        B = self.blocks[:, kept]
+        return self.problem.prior + np.einsum("snri,snrj->sij", B, B, optimize=True)
+
+    def shortlist(self) -> dict[tuple[int, int], IntArray]:
+        """The candidates of largest sensitivity, per group and load state of the plan."""
+        G = self.problem.criterion.gradient(self.information()).G
+        d = self.problem.sensitivity(G)
+        best = {}
+        for group, load in {self._kind(j) for j in range(len(self.q))}:
+            own = np.flatnonzero((self.problem.group == group) & (self.load == load))
+            best[group, load] = own[np.argsort(-d[own], kind="stable")[:SHORTLIST]]
+        return best
+
+    def improve(self, j: int, shortlist: dict[tuple[int, int], IntArray]) -> bool:
+        """Move pose j if that lowers Φ; says whether it did."""
+        group, load = self._kind(j)
+        M = self.information(without=j)
+        starts = np.vstack([self.q[j], self._others(M, shortlist[group, load])])
+        unit = float(self.smooth.value(self.information()))
+        search = self.searches.at(self.q[j], load, group)
+        goal = PlanValue(self.smooth, M, unit)
+        ends = search_all([(search, goal, starts)], self.jobs)
+        poses = trials(starts, ends)
+        blocks = self.searches.blocks(poses, load)
+        values = self.problem.criterion.after_adding(M, blocks)
+        better = np.flatnonzero(values < self.value * (1 - LEAST_GAIN))
+        better = better[self.searches.feasible(poses[better], load)] if len(better) else better
+        if not len(better):
+            return False
+        best = better[values[better].argmin()]
+        self.q[j], self.blocks[:, j], self.value = poses[best], blocks[:, best], float(values[best])
+        return True
+
+    def _others(self, M: Array, shortlist: IntArray) -> Array:
+        """The best candidates for a place in a plan whose rest has information M."""
+        values = self.problem.criterion.after_adding(M, self.problem.blocks[:, shortlist])
+        ranked = self.pool[shortlist[np.argsort(values, kind="stable")]]
+        return ranked[distinct(ranked, self.starts)]
+
+    def _kind(self, j: int) -> tuple[int, int]:
+        candidate = self.chosen[j]
+        return int(self.problem.group[candidate]), int(self.load[candidate])
+
+
+@dataclass
+class Searches:
+    """What local searches need to know of the cell; `pairs` as of `cell_pairs`."""
+
+    information: PoseInformation
+    space: JointSpace
+    checker: Checker
+    pairs: Sequence[Pair]
+    _built: dict[tuple[int, int], SymbolicBlocks] = field(default_factory=dict)
+    _margins: dict[int, ca.Function | None] = field(default_factory=dict)
+
+    def at(self, q: Array, load: int, group: int) -> LocalSearch:
+        """The search among poses of a group in a load state, with the noise of readings at q."""
+        if (load, group) not in self._built:
+            self._built[load, group] = symbolic_blocks(self.information, q, load)
+        if load not in self._margins:
+            model = self.information.model
+            self._margins[load] = margins(model.cell, model.chain, self.pairs, self.forces(load))
+        blocks = whitened_at(self._built[load, group], self.information, q, load)
+        return LocalSearch(blocks, self._margins[load], *self.space.bounds(group))
+
+    def forces(self, load: int) -> Array:
+        """The forces (k, 3) N under which a pose in load state `load` is measured."""
+        states = self.information.states
+        return np.asarray(states.forces[states.of(load)])
+
+    def feasible(self, q: Array, load: int) -> NDArray[np.bool_]:
+        """The full check of poses q (N, n) in one load state."""
+        return feasible(self.checker, q, self.forces(load))
+
+    def blocks(self, q: Array, load: int) -> Array:
+        """Exact blocks (S, N, r, p) of poses q (N, n) in one load state."""
+        return self.information.blocks(q, np.full(len(q), load))
+
+
+def trials(starts: Array, ends: Array) -> Array:
+    """Poses (K·steps, n) on the way from each start (K, n) to its end, the ends first."""
+    way = ends - starts
+    return np.concatenate([starts + step * way for step in STEPS])
+
+
+def distinct(q: Array, count: int) -> NDArray[np.int64]:
+    """Indices of the first `count` poses of q (N, n) that lie `APART` from those before."""
+    chosen: list[int] = []
+    for i, pose in enumerate(q):
+        if len(chosen) == count:
+            break
+        if all(np.abs(pose - q[k]).max() > APART for k in chosen):
+            chosen.append(i)
+    return np.array(chosen, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class SymbolicBlocks:
+    """Whitened, scaled B (S, r, p) of one pose as a smooth function of its joints q (n,).
+
+    `B` and `adjoint` are CasADi functions as in `ConfigurationRows`; `scenarios` (S, parameters),
+    `sizes` (p,), `whitener` (S, r, r), held while q moves.  It pickles.
+    """
+
+    B: ca.Function
+    adjoint: ca.Function
+    scenarios: Array
+    sizes: Array
+    whitener: Array
+
+    def at(self, q: Array) -> Array:
+        """Blocks (S, r, p) at q."""
+        raw = np.stack([self.B(q, x).full() for x in self.scenarios])
+        return np.asarray(self.whitener @ raw * self.sizes)
+
+    def slope(self, q: Array, W: Array) -> Array:
+        """∂/∂q (n,) of Σ_s ⟨W_s, blocks_s(q)⟩ for W (S, r, p)."""
+        raw = self.whitener.transpose(0, 2, 1) @ W * self.sizes
+        return np.asarray(
+            sum(
+                self.adjoint(q, x, w).full()[:, 0] for x, w in zip(self.scenarios, raw, strict=True)
+            )
+        )
+
+
+def symbolic_blocks(information: PoseInformation, q: Array, load: int) -> SymbolicBlocks:
+    """`information.blocks` of a pose near q (n,) in load state `load`, as an expression.
+
+    The load state, and the level of a split joint, are those of q; so is the whitener.
+    """
+    model = information.model
+    template = information.rows(q[None], np.array([load]), information.scenarios[0])
+    symbolic = SymbolicArm(model.chain, model.cell)
+    rows = configuration_rows(symbolic, template, information.columns)
+    return SymbolicBlocks(
+        rows.function,
+        rows.adjoint,
+        information.scenarios,
+        information.sizes,
+        information.whitener(q, load),
+    )
+
+
+def whitened_at(
+    blocks: SymbolicBlocks, information: PoseInformation, q: Array, load: int
+) -> SymbolicBlocks:
+    """The same expression with the noise of a reading at q (n,)."""
+    return replace(blocks, whitener=information.whitener(q, load))
+
+
+class Goal(Protocol):
+    """A figure of merit f of one pose's blocks B (S, r, p), to be minimised."""
+
+    def value(self, B: Array) -> float:
+        """f(B)."""
+
+    def slope(self, B: Array) -> Array:
+        """∂f/∂B (S, r, p)."""
+
+
+@dataclass(frozen=True)
+class PlanValue:
+    """f = Φ(M + Σ BᵀB)/`unit`: the plan's value, M (S, p, p) the information of all else."""
+
+    criterion: Criterion
+    M: Array
+    unit: float
+
+    def value(self, B: Array) -> float:
+        return float(self.criterion.value(self.M + B.transpose(0, 2, 1) @ B)) / self.unit
+
+    def slope(self, B: Array) -> Array:
+        G = self.criterion.gradient(self.M + B.transpose(0, 2, 1) @ B).G
+        return np.asarray(-2 / self.unit * B @ G)
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """f = −d/`unit` with d = Σ_s tr(B_s G_s B_sᵀ), G (S, p, p): what a pose adds at the margin."""
+
+    G: Array
+    unit: float
+
+    def value(self, B: Array) -> float:
+        return -float(np.sum(B @ self.G * B)) / self.unit
+
+    def slope(self, B: Array) -> Array:
+        return np.asarray(-2 / self.unit * B @ self.G)
+
+
+@dataclass(frozen=True)
+class LocalSearch:
+    """min f(B(q)) with lower ≤ q ≤ upper (n,) and margins(q) ≥ 0; it pickles.
+
+    `margins` q → (m,), or None, is how far each rule of the cell is from being broken.  It is
+    conservative, so a start that the exact rules allow may fall short of it: there each margin
+    need only stay what it is.
+    """
+
+    blocks: SymbolicBlocks
+    margins: ca.Function | None
+    lower: Array
+    upper: Array
+
+    def ends(self, goal: Goal, starts: Array) -> Array:
+        """Where IPOPT stops from each start (K, n); the start itself where it fails.
+
+        IPOPT: Wächter & Biegler, Math. Program. 106 (2006) 25.
+        """
+        n = len(self.lower)
+        f = _GoalFunction(goal, self.blocks, n)
+        q = ca.MX.sym("q", n)
+        problem: dict[str, Any] = {"x": q, "f": f(q)}
+        if self.margins is not None:
+            problem["g"] = self.margins(q)
+        solver = ca.nlpsol("polish", "ipopt", problem, IPOPT_OPTIONS)
+        return np.stack([self._end(solver, start) for start in starts])
+
+    def _end(self, solver: ca.Function, start: Array) -> Array:
+        bounds: dict[str, Any] = {"lbx": self.lower, "ubx": self.upper}
+        if self.margins is not None:
+            bounds |= {"lbg": np.minimum(self.margins(start).full(), 0.0), "ubg": np.inf}
+        # A goal that cannot be evaluated (no equilibrium, singular information) ends a search.
+        with contextlib.suppress(RuntimeError):
+            end = solver(x0=start, **bounds)["x"].full().ravel()
+            if np.isfinite(end).all():
+                return np.asarray(np.clip(end, self.lower, self.upper))
+        return start
+
+
+Task = tuple[LocalSearch, Goal, Array]
+
+
+def search_all(tasks: Sequence[Task], jobs: int) -> Array:
+    """Where every start of every task (search, goal, starts) ended, stacked, on `jobs` processes.
+
+    Every start is searched by itself, so the result does not depend on `jobs`.
+    """
+    if jobs == 1:
+        return np.vstack([search.ends(goal, starts) for search, goal, starts in tasks])
+    from joblib import Parallel, delayed
+
+    single = [(search, goal, start[None]) for search, goal, starts in tasks for start in starts]
+    return np.vstack(Parallel(n_jobs=jobs)(delayed(s.ends)(goal, q) for s, goal, q in single))
+
+
+class _GoalFunction(ca.Callback):
+    """f(B(q)) for CasADi: evaluated by numpy, so that any criterion serves, with exact slopes."""
+
+    def __init__(self, goal: Goal, blocks: SymbolicBlocks, n: int) -> None:
+        ca.Callback.__init__(self)
+        self.goal, self.blocks, self.n = goal, blocks, n
+        self.at: tuple[bytes, Array] = (b"", np.empty(0))
+        self.construct("f", {})
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(self.n, 1)
+
+    def B(self, q: Array) -> Array:
+        # IPOPT asks for the value and the slope at the same point.
+        if self.at[0] != q.tobytes():
+            self.at = (q.tobytes(), self.blocks.at(q))
+        return self.at[1]
+
+    def eval(self, arguments: Sequence[ca.DM]) -> list:
+        return [self.goal.value(self.B(arguments[0].full().ravel()))]
+
+    def has_jacobian(self) -> bool:
+        return True
+
+    def get_jacobian(self, name: str, inputs: Any, outputs: Any, options: Any) -> ca.Function:
+        self.jacobian_function = _GoalSlope(self, name)
+        return self.jacobian_function
+
+
+class _GoalSlope(ca.Callback):
+    """∂f/∂q (1, n) of a `_GoalFunction`, as CasADi calls it: with q and f."""
+
+    def __init__(self, f: _GoalFunction, name: str) -> None:
+        ca.Callback.__init__(self)
+        self.f = f
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        return 2
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(self.f.n if i == 0 else 1, 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(1, self.f.n)
+
+    def eval(self, arguments: Sequence[ca.DM]) -> list:
+        q = arguments[0].full().ravel()
+        slope = self.f.goal.slope(self.f.B(q))
+        return [ca.DM(self.f.blocks.slope(q, slope)).T]

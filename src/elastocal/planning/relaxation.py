@@ -1,0 +1,475 @@
+"""The relaxation: weights instead of whole poses, solved to a certified gap.
+
+A small support of candidates is solved exactly by one of two masters, and all other candidates are
+priced against it by their first derivatives until none of them gains (column generation).  The
+masters, Newton's method of `interior_point` and a conic program for clarabel, are written
+independently of each other, so that each checks the other.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+
+from elastocal.design.certificate import tangent_bound
+from elastocal.design.problem import DesignProblem
+from elastocal.errors import InsufficientDataError, require
+from elastocal.planning.criterion import Cone, Criterion, Gradient, ScenarioCriterion, Worst
+from elastocal.planning.information_matrices import BATCH_NUMBERS, Array, IntArray
+from elastocal.planning.interior_point import NewtonMaster, Restricted, pieces_of
+
+Method = Literal["auto", "first-order", "conic"]
+
+# Pools up to this size go to the conic solver whole.
+DIRECT = 2000
+# Candidates of the first master per parameter, shared among the levels.
+PER_PARAMETER = 4
+# Multiplicative steps before that.
+PASSES = 10
+# Part of even weights in the first ones, so that none is singular.
+EVEN = 0.05
+# Parts of the largest weight below which weights are tried to be left out.
+LEFT_OUT = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+MOST_ROUNDS = 200
+# The master's gap as a part of the pool's: more would be lost on candidates that will change.
+MASTER_PART = 0.1
+# Of each level up to 1/ENTERING of its first candidates join per round.
+ENTERING = 4
+# How far each master starts from its bounds, as a part of the way to even weights.
+LEAST_DEPTH, MOST_DEPTH = 1e-3, 0.1
+# Weights below this part of the largest leave the support, unless their d is near the margin.
+NEGLIGIBLE = 1e-4
+# Information in a direction, as a part of that of the whole pool, which counts as none.
+UNSEEN = 1e-6
+# Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.
+PACKED_BYTES = 1_500_000_000
+# Smallest eigenvalue of the pool's information, scaled to unit diagonal, that counts as regular.
+LEAST_EIGENVALUE = 1e-13
+# Of clarabel on the scaled program, whose optimum is near 1; the second where the first fails.
+TOLERANCES = (1e-10, 1e-8)
+
+
+@dataclass(frozen=True)
+class Relaxed:
+    """Optimal weights (N,) of the relaxation, Φ = `value` there, and what is proved.
+
+    `bound`: no plan with these candidates, shares and repetitions has a smaller Φ.  `gap` is
+    1 − bound/Φ.  `tangent`: the (Φ, G) behind the bound, for sensitivities off the pool; its
+    value is below Φ where the criterion has a kink.  `method`: what solved the masters.
+    """
+
+    weights: Array
+    value: float
+    bound: float
+    gap: float
+    iterations: int
+    method: Literal["first-order", "conic"]
+    history: tuple[RelaxationStep, ...]
+    tangent: Gradient
+
+
+def relax(
+    problem: DesignProblem,
+    *,
+    method: Method = "auto",
+    tolerance: float = 1e-6,
+    start: Array | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Relaxed:
+    """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ most with Σ_{i∈l} w_i = shares[l].
+
+    "first-order": a few candidates by Newton's method, all others priced by the first derivatives
+    d_i, those that gain most added, until the gap is below `tolerance` (relative).  "conic": the
+    same program by clarabel, at once for small pools.  "auto" is the first, with conic masters
+    where the criterion has no smooth pieces: E, O3 and the mean over scenarios of a maximum.
+    `start` (N,) ≥ 0: weights near the optimum, as those of a smaller pool.  The result's gap may
+    exceed `tolerance` where rounding forbids more; its bound holds all the same.
+    Raises InputError for a criterion without a bound (as O2 and O4, whose 1/Φ is not concave) and
+    InsufficientDataError where all candidates together leave M singular.
+    """
+    criterion = problem.criterion
+    require(
+        criterion.certifiable,
+        f"criterion {criterion.name} has no relaxation, since it {criterion.without_bound}; design "
+        "with it by exchange alone, or take D, E or test_pose",
+    )
+    require(
+        method in get_args(Method),
+        f"method of the relaxation is {method!r}; there are {', '.join(get_args(Method))}",
+    )
+    require(0.0 < tolerance < 1.0, f"tolerance is {tolerance}; it must lie between 0 and 1")
+    pool = CandidatePool(problem)
+    _ = pool.root  # a pool that cannot see all parameters is refused here
+    if len(pool.levels) == 0:
+        return _only_plan(pool)
+    first = _first_weights(pool, start)
+    pieces = None if method == "conic" else pieces_of(criterion, len(problem.prior))
+    master: Master = ConicMaster(criterion) if pieces is None else NewtonMaster(pieces)
+    whole = method == "conic" and problem.n_candidates <= DIRECT
+
+    def report(step: RelaxationStep) -> None:
+        if progress is not None:
+            progress(f"relaxation: within {step.gap:.1e} of the bound, {step.support} candidates")
+
+    weights, tangent, history = optimise(
+        pool, master, first, _sizes(pool, whole), tolerance, report
+    )
+    last = history[-1]
+    weights, value = _cleaned(pool, weights, last, tolerance)
+    return Relaxed(
+        weights=weights,
+        value=value,
+        bound=last.bound,
+        gap=RelaxationStep(value, last.bound, last.support).gap,
+        iterations=len(history),
+        method="conic" if pieces is None else "first-order",
+        history=history,
+        tangent=tangent,
+    )
+
+
+def _first_weights(pool: CandidatePool, start: Array | None) -> Array:
+    """Multiplicative steps w_i ∝ w_i √d_i from even weights or `start`: where the support lies.
+
+    Silvey, Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379.
+    """
+    problem, even = pool.problem, pool.even()
+    weights = even
+    if start is not None:
+        require(
+            start.shape == even.shape and bool(np.all(start >= 0.0)),
+            f"start of the relaxation has shape {start.shape} or negative weights; give "
+            f"{even.shape} weights of 0 or more",
+        )
+        weights = EVEN * even + (1.0 - EVEN) * pool.scaled(start)
+    # Of a maximum its mean: on a kink these steps would swing from one side to the other.
+    criterion = problem.criterion.softened(1.0)
+    for _ in range(PASSES):
+        d = pool.sensitivity(criterion.gradient(pool.information(weights)).G)
+        step = np.minimum(pool.scaled(weights * np.sqrt(d)), problem.most)
+        weights = EVEN * even + (1.0 - EVEN) * step
+    return weights
+
+
+def _sizes(pool: CandidatePool, whole: bool) -> IntArray:
+    """Candidates of each level in the first master; more than its share takes at once."""
+    if whole:
+        return np.full(len(pool.levels), pool.problem.n_candidates)
+    p = pool.problem.prior.shape[-1]
+    for_share = 2 * pool.problem.shares[pool.levels] // pool.problem.most
+    return np.asarray(-(-PER_PARAMETER * p // len(pool.levels)) + for_share)
+
+
+def _only_plan(pool: CandidatePool) -> Relaxed:
+    """Where the shares take every candidate, that plan is the optimum and the bound."""
+    problem = pool.problem
+    tangent = problem.criterion.gradient(pool.information(pool.fixed))
+    bound = tangent_bound(problem, tangent)
+    step = RelaxationStep(tangent.value, bound, 0)
+    return Relaxed(pool.fixed, tangent.value, bound, step.gap, 0, "first-order", (), tangent)
+
+
+def _cleaned(
+    pool: CandidatePool, weights: Array, last: RelaxationStep, tolerance: float
+) -> tuple[Array, float]:
+    """Without the smallest weights of each level, as many as the gap allows."""
+    support = np.flatnonzero(weights * ~(pool.fixed > 0.0))
+    task = pool.restricted(support)
+    for part in LEFT_OUT:
+        found = weights[support]
+        found = np.where(task.relative(found) > part, found, 0.0)
+        fewer = pool.fixed.copy()
+        fewer[support] = task.inside(found, 0.0)
+        value = float(pool.problem.criterion.value(pool.information(fewer)))
+        if 1.0 - last.bound / value <= max(tolerance, last.gap):
+            return fewer, value
+    return weights, last.value
+
+
+class CandidatePool:
+    """The candidates of a problem.
+
+    A_si = B_siᵀB_si is stored as its upper triangle with √2 off the diagonal, so that ⟨G, A_si⟩ is
+    a dot product of p(p+1)/2 numbers, where the blocks would need r·p² operations.
+    `fixed` (N,): the weights of groups whose share takes every candidate, 0 for others; `levels`:
+    the groups that leave a choice.
+    """
+
+    def __init__(self, problem: DesignProblem) -> None:
+        self.problem = problem
+        S, N, _, p = problem.blocks.shape
+        self.rows, self.columns = np.triu_indices(p)
+        self._factor = np.where(self.rows == self.columns, 1.0, np.sqrt(2.0))
+        fits = 8 * S * N * len(self.rows) <= PACKED_BYTES
+        self._packed = self._pack() if fits else None
+        size = np.bincount(problem.group, minlength=len(problem.shares))
+        whole = size * problem.most == problem.shares
+        self.fixed = np.where(whole[problem.group], float(problem.most), 0.0)
+        self.levels = np.flatnonzero(~whole & (problem.shares > 0))
+
+    def even(self) -> Array:
+        """w (N,): each group's share spread evenly."""
+        size = np.bincount(self.problem.group, minlength=len(self.problem.shares))
+        return np.asarray((self.problem.shares / np.maximum(size, 1))[self.problem.group])
+
+    @cached_property
+    def root(self) -> Array:
+        """R (S, p, p) with R M Rᵀ = 1 for the information M of even weights.
+
+        Raises InsufficientDataError where that is singular, as then it is for any weights.
+        """
+        M = self.information(self.even())
+        for s, M_s in enumerate(M):
+            diagonal = np.diag(M_s)
+            scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+            smallest = float(np.linalg.eigvalsh(M_s / np.outer(scale, scale))[0])
+            if not smallest > LEAST_EIGENVALUE * len(M_s):
+                raise InsufficientDataError(
+                    f"all {self.problem.n_candidates} candidate poses together leave some "
+                    f"parameters undetermined (scenario {s + 1} of {len(M)}: smallest eigenvalue "
+                    f"of the scaled information {smallest:.1e}): add prior knowledge, other poses "
+                    "or loads, or fix parameters"
+                )
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(M)))
+
+    def scaled(self, weights: Array) -> Array:
+        """w ≥ 0 (N,) with each group's sum brought to its share, 0 where a group has none."""
+        problem = self.problem
+        total = np.bincount(problem.group, weights, minlength=len(problem.shares))
+        return weights * (problem.shares / np.where(total > 0.0, total, np.inf))[problem.group]
+
+    def information(self, weights: Array) -> Array:
+        """M (S, p, p) at weights (N,)."""
+        used = np.flatnonzero(weights)
+        if self._packed is None or len(used) * 4 < len(weights):
+            return self.problem.information(weights)
+        return self.problem.prior + self._unpack(weights @ self._packed)
+
+    def sensitivity(self, G: Array) -> Array:
+        """d (N,) = Σ_s ⟨G_s, A_si⟩, as `DesignProblem.sensitivity`."""
+        if self._packed is None:
+            return self.problem.sensitivity(G)
+        triangles = G[:, self.rows, self.columns] * self._factor
+        return np.asarray((self._packed @ triangles[:, :, None])[..., 0].sum(axis=0))
+
+    def matrices(self, chosen: IntArray) -> Array:
+        """A (S, k, p, p) of the candidates `chosen` (k,)."""
+        B = self.problem.blocks[:, chosen]
+        return np.asarray(B.transpose(0, 1, 3, 2) @ B)
+
+    def restricted(self, chosen: IntArray) -> Restricted:
+        """The problem with no other candidates than `chosen`, all of them free."""
+        problem = self.problem
+        level = np.searchsorted(self.levels, problem.group[chosen])
+        base = problem.information(self.fixed)
+        shares = problem.shares[self.levels]
+        return Restricted(self.matrices(chosen), base, level, shares, problem.most)
+
+    def margins(self, chosen: IntArray, d: Array) -> tuple[Array, Array]:
+        """(N,) each: the least d that a level's share takes of `chosen`, largest first, and the
+        next d, which must stay for a choice to be left; inf where weights are fixed."""
+        problem = self.problem
+        taken, following = np.full((2, len(problem.shares)), np.inf)
+        for level in self.levels:
+            of_level = np.sort(d[chosen[problem.group[chosen] == level]])[::-1]
+            count = -(-int(problem.shares[level]) // problem.most)
+            taken[level] = of_level[count - 1]
+            following[level] = of_level[min(count, len(of_level) - 1)]
+        return taken[problem.group], following[problem.group]
+
+    def best(self, score: Array, counts: IntArray) -> IntArray:
+        """Of each free level as many candidates as `counts` says, those of largest score (N,);
+        none of score −inf."""
+        found = []
+        for level, count in zip(self.levels, counts, strict=True):
+            of_level = np.flatnonzero(self.problem.group == level)
+            rest = max(len(of_level) - count, 0)
+            found.append(of_level[np.argpartition(score[of_level], rest)[rest:]])
+        best = np.concatenate(found)
+        return best[score[best] > -np.inf]
+
+    def _pack(self) -> Array:
+        S, N, _, p = self.problem.blocks.shape
+        packed = np.empty((S, N, len(self.rows)))
+        step = max(BATCH_NUMBERS // (S * p * p), 1)
+        for start in range(0, N, step):
+            A = self.matrices(np.arange(start, min(start + step, N)))
+            packed[:, start : start + step] = A[..., self.rows, self.columns] * self._factor
+        return packed
+
+    def _unpack(self, packed: Array) -> Array:
+        p = self.problem.blocks.shape[-1]
+        M = np.empty((len(packed), p, p))
+        M[:, self.rows, self.columns] = packed / self._factor
+        M[:, self.columns, self.rows] = packed / self._factor
+        return M
+
+
+@dataclass(frozen=True)
+class RelaxationStep:
+    """One round: Φ of the weights at hand, the best bound so far, candidates in the master."""
+
+    value: float
+    bound: float
+    support: int
+
+    @property
+    def gap(self) -> float:
+        """1 − bound/Φ."""
+        return max(1.0 - self.bound / self.value, 0.0)
+
+
+class Master(Protocol):
+    """Solves the problem on a few candidates."""
+
+    def __call__(self, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Gradient]:
+        """w (k,) with a relative gap of `accuracy`, and a tangent that shows it.
+
+        `start` (k,) is strictly inside the bounds.
+        """
+
+
+def optimise(
+    pool: CandidatePool,
+    master: Master,
+    start: Array,
+    sizes: IntArray,
+    tolerance: float,
+    progress: Callable[[RelaxationStep], None] | None,
+) -> tuple[Array, Gradient, tuple[RelaxationStep, ...]]:
+    """Weights (N,) with 1 − bound/Φ ≤ tolerance, the tangent of the bound, and all rounds.
+
+    `start` (N,) names the first candidates, by weight, `sizes` of each free level.  Ends with a
+    wider gap where rounding hides which candidate could still improve the plan.
+    """
+    problem = pool.problem
+    support = pool.best(start, sizes)
+    weights = best = start
+    value, bound, gap, accuracy = np.inf, 0.0, 1.0, MASTER_PART
+    history: list[RelaxationStep] = []
+    for _ in range(MOST_ROUNDS):
+        support, task = _regular(pool, support)
+        inside = task.inside(weights[support], min(max(gap, LEAST_DEPTH), MOST_DEPTH))
+        found, tangent = master(task, inside, accuracy)
+        weights = pool.fixed.copy()
+        weights[support] = found
+        reached = float(problem.criterion.value(pool.information(weights)))
+        if reached < value:
+            best, value = weights, reached
+        d = pool.sensitivity(tangent.G)
+        certified = tangent_bound(problem, tangent, d)
+        if not history or certified > bound:
+            bound, steepest = certified, tangent
+        history.append(RelaxationStep(value, bound, len(support)))
+        if progress is not None:
+            progress(history[-1])
+        gap = history[-1].gap
+        margin, least = pool.margins(support, d)
+        outside = np.where(d > (1.0 + 0.1 * tolerance) * margin, d, -np.inf)
+        outside[support] = -np.inf
+        entering = pool.best(outside, np.maximum(sizes // ENTERING, 1))
+        finest = accuracy <= 0.1 * tolerance
+        if gap <= tolerance or (len(entering) == 0 and finest):
+            break
+        accuracy = MASTER_PART * (gap if len(entering) else min(gap, accuracy))
+        accuracy = max(accuracy, (0.5 if len(entering) else 0.1) * tolerance)
+        kept = (task.relative(found) > NEGLIGIBLE) | (d[support] >= (1.0 - gap) * least[support])
+        support = np.concatenate([support[kept], entering])
+    return best, steepest, tuple(history)
+
+
+def _regular(pool: CandidatePool, support: IntArray) -> tuple[IntArray, Restricted]:
+    """The support with candidates added until it sees every direction that the pool sees.
+
+    Directions that Φ does not count, such as nuisance parameters beside c, draw no weight.
+    """
+    while True:
+        task = pool.restricted(support)
+        even = task.inside(np.zeros(len(support)), 1.0)
+        M = pool.root @ task.information(even) @ pool.root.transpose(0, 2, 1)
+        eigenvalues, U = np.linalg.eigh(M)
+        unseen = eigenvalues < UNSEEN
+        if not unseen.any():
+            return support, task
+        rows = (U * unseen[:, None, :]).transpose(0, 2, 1) @ pool.root
+        d = pool.sensitivity(rows.transpose(0, 2, 1) @ rows)
+        d[support] = -np.inf
+        support = np.concatenate([support, pool.best(d, np.ones_like(pool.levels))])
+
+
+class ConicMaster:
+    """Σ_s Φ_s/S or max_s Φ_s over the weights, solved by clarabel to its own accuracy."""
+
+    def __init__(self, criterion: Criterion) -> None:
+        self._worst = isinstance(criterion, Worst)
+        base = criterion.base if isinstance(criterion, Worst) else criterion
+        assert isinstance(base, ScenarioCriterion)
+        self._base = base
+        import cvxpy as cp
+
+        self._cp = cp
+
+    def __call__(self, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Gradient]:
+        """w (k,) and a tangent; `start` sets the units of the program and nothing else.
+
+        Raises InsufficientDataError where clarabel finds no solution.
+        """
+        cp = self._cp
+        M = task.information(start)
+        values = self._base.each(M)
+        w = cp.Variable(len(start), nonneg=True)
+        members = (task.level == np.arange(len(task.shares))[:, None]).astype(float)
+        constraints = [members @ w == task.shares, w <= task.most]
+        cones: list[Cone] = []
+        for s, root in enumerate(np.linalg.inv(np.linalg.cholesky(M))):
+            A = root @ task.A[s] @ root.T
+            information = cp.reshape(A.reshape(len(A), -1).T @ w, root.shape, order="C")
+            information = information + root @ task.base[s] @ root.T
+            cones.append(self._base.cone(cp, s, information, root, float(values[s])))
+            constraints += cones[-1].constraints
+        relative = [
+            float(v / values.max()) * cone.value for v, cone in zip(values, cones, strict=True)
+        ]
+        total = cp.Variable()
+        if self._worst:
+            limit = [value <= total for value in relative]
+        else:
+            limit = [sum(relative) / len(relative) <= total]
+        self._solve(cp.Problem(cp.Minimize(total), [*constraints, *limit]))
+        if self._worst:
+            share = np.maximum([float(c.dual_value) for c in limit], 0.0)
+        else:
+            share = np.ones(len(cones))
+        found = task.inside(np.maximum(w.value, 0.0), 0.0)
+        return found, self._tangent(task.information(found), cones, share / share.sum())
+
+    def _tangent(self, M: Array, cones: list[Cone], share: Array) -> Gradient:
+        """v = Σ c_s v_s and G = (c_s G_s), c = `share` (S,): Φ ≥ Σ c_s v_s²/⟨G_s, M'_s⟩ is at least
+        v²/⟨G, M'⟩ by Cauchy and Schwarz."""
+        values, G = self._base.each_gradient(M)
+        for s, cone in enumerate(cones):
+            if cone.tangent is not None:
+                values[s], G[s] = cone.tangent(M[s])
+        return Gradient(float(share @ values), share[:, None, None] * G)
+
+    def _solve(self, program: Any) -> None:
+        """Solved in place; an inexact answer is used, since its bound shows what it is worth."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for tolerance in TOLERANCES:
+                options = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), tolerance)
+                try:
+                    program.solve(solver=self._cp.CLARABEL, **options)
+                except self._cp.SolverError:
+                    continue
+                if program.status in ("optimal", "optimal_inaccurate"):
+                    return
+        raise InsufficientDataError(
+            f"the conic solver stopped with status {program.status!r} on the relaxation; the "
+            "information may be nearly singular: add prior knowledge or poses"
+        )

@@ -1,0 +1,88 @@
+"""Low-rank updates against forming every information matrix anew."""
+
+import numpy as np
+import pytest
+from planning.criteria.cases import ROBUST, P, blocks, criterion, information, random_information
+
+from elastocal.planning.criteria import CRITERIA, make_criterion
+from elastocal.planning.information_matrices import candidate_sums
+
+every_criterion = pytest.mark.parametrize("name", CRITERIA)
+LOW_RANK = ("test_pose", "A", "I", "c", "G", "D", "O1")
+
+
+def anew(phi, M, B):
+    return np.concatenate([np.atleast_1d(phi.value(sums)) for _, sums in candidate_sums(M, B)])
+
+
+@every_criterion
+@pytest.mark.parametrize(("scenarios", "robust"), ROBUST)
+@pytest.mark.parametrize("r", [1, 3, 9])
+def test_agrees_with_the_sum(name, scenarios, robust, r):
+    rng = np.random.default_rng(1)
+    phi = criterion(name, scenarios, robust)
+    M = random_information(rng, scenarios)
+    B = blocks(rng, scenarios, 40, r)
+    expected = [phi.value(M + information(B[:, [i]])) for i in range(40)]
+    assert phi.after_adding(M, B) == pytest.approx(np.array(expected), rel=1e-10)
+
+
+@pytest.mark.parametrize("name", LOW_RANK)
+@pytest.mark.parametrize("p", [9, 30])
+@pytest.mark.parametrize("share", [1e-1, 1e-3, 1e-5, 1e-7])
+def test_agrees_where_little_is_known_of_one_direction(name, p, share):
+    """The pose to be replaced carried nearly all that is known of a direction."""
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=p) / np.sqrt(p)
+    weak = np.eye(p) - (1 - share) * np.outer(u, u) / (u @ u)
+    M = information(blocks(rng, 1, 40, 3, p) @ weak)
+    B = blocks(rng, 1, 60, 9, p)
+    B[:, :20] = B[:, :20] @ weak  # some poses mend it, some do not
+    phi = make_criterion(
+        name,
+        parameters=p,
+        interest=np.arange(p // 2),
+        A=rng.normal(size=(1, 4, 3, p)),
+        combination=u,
+        n_poses=40,
+    )
+    assert phi.after_adding(M, B) == pytest.approx(anew(phi, M, B), rel=1e-9 / share**0.25)
+
+
+@every_criterion
+@pytest.mark.parametrize(("scenarios", "robust"), ROBUST)
+def test_a_pose_that_restores_the_rank_is_found(name, scenarios, robust):
+    rng = np.random.default_rng(3)
+    phi = criterion(name, scenarios, robust)
+    plan = blocks(rng, scenarios, 2)
+    # The plan less a pose, as exchange forms it: singular to rounding only.
+    M = information(plan) - information(plan[:, :1])
+    B = blocks(rng, scenarios, 6)
+    B[:, 3:, 2] = B[:, 3:, 0] + B[:, 3:, 1]  # rank 2: one direction stays unseen
+    values = phi.after_adding(M, B)
+    expected = [phi.value(information(plan[:, 1:]) + information(B[:, [i]])) for i in range(3)]
+    assert np.isfinite(values[:3]).all()
+    assert values[:3] == pytest.approx(np.array(expected), rel=1e-9)
+    assert (values[3:] == np.inf).all()
+
+
+@pytest.mark.parametrize("name", LOW_RANK)
+def test_a_pose_that_shows_nothing_changes_nothing(name):
+    rng = np.random.default_rng(4)
+    phi = criterion(name)
+    M = random_information(rng, 1)
+    nothing = np.zeros((1, 3, 3, P))
+    assert phi.after_adding(M, nothing) == pytest.approx(np.full(3, phi.value(M)), rel=1e-13)
+    assert phi.after_adding(M, nothing[:, :0]).shape == (0,)
+
+
+@pytest.mark.parametrize("name", LOW_RANK)
+def test_many_candidates_are_evaluated_in_parts(name, monkeypatch):
+    rng = np.random.default_rng(5)
+    phi = criterion(name)
+    M, B = random_information(rng, 1), blocks(rng, 1, 31)
+    whole = phi.after_adding(M, B)
+    monkeypatch.setattr("elastocal.planning.information_matrices.CHUNK_NUMBERS", 7 * 3 * P)
+    monkeypatch.setattr("elastocal.planning.information_matrices.BATCH_NUMBERS", 4 * P * P)
+    assert phi.after_adding(M, B) == pytest.approx(whole, rel=1e-12)
+    assert anew(phi, M, B) == pytest.approx(whole, rel=1e-12)

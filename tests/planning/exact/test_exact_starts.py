@@ -1,0 +1,212 @@
+"""Starts: the same plan for the same seed, whatever the order, the processes, the interruption."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_pools import random_problem
+
+from elastocal.design.problem import DesignProblem
+from elastocal.errors import InputError, InsufficientDataError
+from elastocal.planning.criteria import make_criterion
+from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.exchange import regular_plan
+
+
+class Memory:
+    """A checkpoint that may be told to interrupt the work after so many savings."""
+
+    def __init__(self, interrupt_after=None):
+        self.state, self.saved, self.interrupt_after = None, 0, interrupt_after
+
+    def load(self):
+        return self.state
+
+    def save(self, state):
+        self.state, self.saved = dict(state), self.saved + 1
+        if self.saved == self.interrupt_after:
+            raise KeyboardInterrupt
+
+
+def rough(seed: int = 0) -> DesignProblem:
+    """A pool in whose local optima starts end that differ."""
+    rng = np.random.default_rng(seed)
+    criterion = make_criterion("E", parameters=7, interest=np.arange(7))
+    blocks = rng.normal(size=(1, 45, 2, 7))
+    group = np.arange(45) % 3
+    return DesignProblem(blocks, np.zeros((1, 7, 7)), group, np.array([3, 3, 3]), criterion)
+
+
+def same(a, b) -> bool:
+    return (
+        np.array_equal(a.chosen, b.chosen)
+        and a.value == b.value
+        and a.passes == b.passes
+        and np.array_equal(a.values, b.values)
+    )
+
+
+def test_the_plan_does_not_depend_on_the_number_of_processes():
+    problem = rough()
+    alone = exact_plan(problem, starts=4, seed=3)
+    assert len(set(alone.values.round(12))) > 1, "starts that all end alike would prove nothing"
+    assert same(alone, exact_plan(problem, starts=4, seed=3, jobs=2))
+
+
+@pytest.mark.parametrize("after", [1, 3])
+def test_an_interrupted_search_resumes_to_the_same_plan(after):
+    problem = rough(1)
+    whole = exact_plan(problem, starts=5, seed=7)
+    memory = Memory(after)
+    with pytest.raises(KeyboardInterrupt):
+        exact_plan(problem, starts=5, seed=7, checkpoint=memory)
+    said = []
+    resumed = exact_plan(problem, starts=5, seed=7, checkpoint=memory, progress=said.append)
+    assert same(whole, resumed)
+    assert len(said) == 5 - after, "finished starts are not made again"
+    assert same(whole, exact_plan(problem, starts=5, seed=7, checkpoint=memory))
+
+
+@pytest.mark.parametrize("change", ["seed", "problem", "size"])
+def test_a_checkpoint_of_other_work_is_not_used(change):
+    problem, seed = rough(1), 7
+    memory = Memory()
+    exact_plan(problem, starts=2, seed=seed, checkpoint=memory)
+    if change == "seed":
+        seed = 8
+    elif change == "problem":
+        problem = replace(problem, blocks=1.5 * problem.blocks)
+    else:
+        problem = replace(problem, shares=np.array([4, 3, 3]))
+    expected = exact_plan(problem, starts=2, seed=seed)
+    assert same(expected, exact_plan(problem, starts=2, seed=seed, checkpoint=memory))
+
+
+def test_more_starts_contain_the_fewer():
+    problem = rough(2)
+    few, many = exact_plan(problem, starts=2, seed=5), exact_plan(problem, starts=4, seed=5)
+    np.testing.assert_array_equal(many.values[:2], few.values)
+    assert many.value <= few.value
+
+
+def test_equal_candidates_are_taken_in_the_order_of_the_pool():
+    """Every candidate twice over: of each pair the plan has the first."""
+    one = random_problem("test_pose", 5)
+    N = one.n_candidates
+    both = replace(
+        one,
+        blocks=np.concatenate([one.blocks, one.blocks], axis=1),
+        group=np.concatenate([one.group, one.group]),
+    )
+    chosen = exact_plan(both, starts=3).chosen
+    second = chosen[chosen >= N]
+    assert np.isin(second - N, chosen).all()
+
+
+def test_fewer_equations_than_parameters_says_how_many():
+    problem = random_problem("D", 0)
+    p = 20
+    rng = np.random.default_rng(0)
+    blocks = rng.normal(size=(1, problem.n_candidates, 3, p))
+    criterion = make_criterion("D", parameters=p, interest=np.arange(p))
+    problem = replace(
+        problem, blocks=blocks, prior=np.zeros((1, p, p)), criterion=criterion,
+        group=np.zeros(problem.n_candidates, dtype=int), shares=np.array([5]),
+    )  # fmt: skip
+    with pytest.raises(InsufficientDataError, match=r"5 poses of 3 readings give 15, for 20 .* 7"):
+        exact_plan(problem)
+    rest = rng.normal(size=(5, p))
+    known = replace(problem, prior=(rest.T @ rest)[None])
+    assert np.isfinite(exact_plan(known, starts=2).value)
+
+
+def test_a_group_without_share_cannot_help():
+    """Parameter 3 shows in group 1 alone, of which no pose is asked."""
+    rng = np.random.default_rng(0)
+    blocks = rng.normal(size=(1, 20, 3, 4))
+    group = np.arange(20) % 2
+    blocks[:, group == 0, :, 3] = 0.0
+    criterion = make_criterion("D", parameters=4, interest=np.arange(4))
+    problem = DesignProblem(blocks, np.zeros((1, 4, 4)), group, np.array([5, 0]), criterion)
+    with pytest.raises(InsufficientDataError, match="10 candidates of the groups with a share"):
+        exact_plan(problem)
+    assert np.isfinite(exact_plan(replace(problem, shares=np.array([4, 1])), starts=1).value)
+
+
+@pytest.mark.parametrize("name", ["D", "E"])
+def test_the_only_plan_that_determines_all_is_found(name):
+    """Each of four candidates shows parameters that no other does; 60 show the same two."""
+    rng = np.random.default_rng(1)
+    blocks = np.zeros((1, 64, 2, 8))
+    blocks[0, :60, :, :2] = rng.normal(size=(60, 2, 2)) * 100
+    for k in range(4):
+        blocks[0, 60 + k, :, 2 * k : 2 * k + 2] = rng.normal(size=(2, 2)) * 1e-2
+    blocks[0, 60] = blocks[0, 60] * 1e-3
+    criterion = make_criterion(name, parameters=8, interest=np.arange(8))
+    problem = DesignProblem(
+        blocks, np.zeros((1, 8, 8)), np.zeros(64, dtype=int), np.array([4]), criterion
+    )
+    found = exact_plan(problem, starts=3)
+    assert {61, 62, 63} < set(found.chosen.tolist())
+    assert np.isfinite(found.value)
+
+
+@pytest.mark.parametrize("large", [1.0, 1e3])
+def test_a_regular_plan_is_found_where_no_exchange_leads_to_it(large):
+    """Ten candidates span e1 and a direction of (e3, e4) each; only the last two make rank 4
+    together.  Neither adds rank to any of the ten, nor as much volume as one of the ten."""
+    blocks = np.zeros((1, 12, 2, 4))
+    for k in range(10):
+        blocks[0, k, 0, 0] = large
+        angle = np.pi * (k + 0.5) / 10
+        blocks[0, k, 1, 2:] = large * np.cos(angle), large * np.sin(angle)
+    blocks[0, 10] = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.1, 0.8, 0.6]]
+    blocks[0, 11] = [[0.0, 0.0, 1.0, 0.0], [0.3, 0.0, 0.0, 1.0]]
+    criterion = make_criterion("D", parameters=4, interest=np.arange(4))
+    problem = DesignProblem(
+        blocks, np.zeros((1, 4, 4)), np.zeros(12, dtype=int), np.array([2]), criterion
+    )
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        np.testing.assert_array_equal(regular_plan(problem, np.array([2, 7]), rng), [10, 11])
+        np.testing.assert_array_equal(exact_plan(problem, starts=2, seed=seed).chosen, [10, 11])
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_a_nuisance_parameter_that_no_near_candidate_shows_is_determined(given, monkeypatch):
+    """Candidates 0 and 1 show the last parameter and nothing else: worthless but indispensable."""
+    monkeypatch.setattr("elastocal.planning.exact_plan.NEAR_PER_POSE", 2)
+    blocks = np.random.default_rng(0).normal(size=(1, 40, 2, 5))
+    blocks[..., 4] = 0.0
+    blocks[:, :2] = 0.0
+    blocks[:, :2, 0, 4] = 1.0
+    criterion = make_criterion("D", parameters=5, interest=np.arange(4))
+    problem = DesignProblem(
+        blocks, np.zeros((1, 5, 5)), np.zeros(40, dtype=int), np.array([4]), criterion
+    )
+    weights = np.full(40, 0.1) if given else None
+    found = exact_plan(problem, relaxed_weights=weights, starts=4)
+    assert (found.chosen < 2).sum() == 1
+    assert np.isfinite(found.values).all()
+
+
+def test_too_few_poses_for_any_regular_plan_say_so():
+    """Enough equations in number, but two poses of a kind see only two of four parameters each."""
+    blocks = np.zeros((1, 12, 3, 6))
+    for i in range(12):
+        blocks[0, i, :2, 2 * (i % 3) : 2 * (i % 3) + 2] = np.eye(2)
+    criterion = make_criterion("D", parameters=6, interest=np.arange(6))
+    problem = DesignProblem(
+        blocks, np.zeros((1, 6, 6)), np.zeros(12, dtype=int), np.array([2]), criterion
+    )
+    with pytest.raises(InsufficientDataError, match="no plan of 2 poses that determines all 6"):
+        exact_plan(problem)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [({"starts": 0}, "start"), ({"jobs": 0}, "jobs"), ({"relaxed_weights": np.ones(3)}, r"\(3,\)")],
+)
+def test_wrong_options_are_named(options, named):
+    with pytest.raises(InputError, match=named):
+        exact_plan(rough(), **options)

@@ -1,0 +1,117 @@
+"""A planar arm that lifts a load: 4 joints, of which the first only turns the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.calibration import cell_of, planar_chain
+
+from elastocal.cell import Array, CartesianNoise, Nominal, Tracker
+from elastocal.cell_design import DesignSpec
+from elastocal.cell_workspace import Workspace
+from elastocal.design.candidates import Candidates, draw
+from elastocal.design.feasibility.feasibility import Feasibility
+from elastocal.design.information import PoseInformation
+from elastocal.design.joint_space import JointSpace, joint_space
+from elastocal.design.problem import DesignProblem
+from elastocal.design.readings import LoadStates, load_states
+from elastocal.manipulator.model import Model
+from elastocal.planning.criteria import make_criterion
+from elastocal.planning.criterion import Criterion
+from elastocal.planning.polish import Searches
+
+EFFECTS = tuple(f"joint_compliance:joint{i}" for i in (2, 3, 4))
+LOAD = np.array([[0.0, 0.0, -200.0]])
+SIGMA = 1e-5
+TYPICAL = 1e-6  # rad/(N m)
+
+
+@dataclass(frozen=True)
+class Case:
+    """An arm in a cell, and everything a search over its poses needs."""
+
+    model: Model
+
+    @cached_property
+    def states(self) -> LoadStates:
+        return load_states(self.model.cell)
+
+    @cached_property
+    def rules(self) -> Feasibility:
+        return Feasibility(self.model.cell, self.model.chain)
+
+    @cached_property
+    def space(self) -> JointSpace:
+        return joint_space(self.model.cell, self.model.chain)
+
+    @cached_property
+    def information(self) -> PoseInformation:
+        columns = np.arange(len(self.model.names))
+        x = self.model.nominal[None]
+        return PoseInformation(self.model, self.states, x, columns, np.full(len(columns), TYPICAL))
+
+    @cached_property
+    def searches(self) -> Searches:
+        return Searches(self.information, self.space, self.rules, self.rules.pairs)
+
+    def draw(self, n: int, seed: int = 0, jobs: int = 1) -> Candidates:
+        model = self.model
+        return draw(model.cell, model.chain, self.states, self.rules, n, seed, jobs)
+
+    def criterion(self, name: str) -> Criterion:
+        """`name` on three test poses."""
+        p = len(self.information.columns)
+        q = np.array([[0.0, 0.3, -0.5, 0.4], [0.5, -0.4, 1.0, 0.2], [0.0, -1.2, 1.5, -1.0]])
+        A = self.information.blocks(q, np.full(3, -1))[:, :, -3:] * SIGMA
+        return make_criterion(
+            name, parameters=p, interest=np.arange(p), A=A, weights=np.ones(3), n_poses=3
+        )
+
+    def problem(
+        self, pool: Candidates, shares: Sequence[int], criterion: Criterion, prior: float = 1e-2
+    ) -> DesignProblem:
+        p = len(self.information.columns)
+        blocks = self.information.blocks(pool.q, pool.load)
+        known = prior * np.eye(p)[None]
+        return DesignProblem(blocks, known, pool.group, np.array(shares), criterion)
+
+    def value(self, problem: DesignProblem, q: Array, load: NDArray[np.int64]) -> float:
+        """Φ of any plan, from the exact B."""
+        B = self.information.blocks(q, load)
+        return float(problem.criterion.value(problem.prior + np.einsum("snri,snrj->sij", B, B)))
+
+
+@pytest.fixture(scope="session")
+def case() -> Callable[..., Case]:
+    """Builds the arm; `design` and `workspace` as of the cell, other keywords for the model."""
+
+    def build(
+        workspace: Workspace | None = None,
+        design: dict[str, Any] | None = None,
+        tracker: Tracker | None = None,
+        effects: Sequence[str] = EFFECTS,
+        **model: Any,
+    ) -> Case:
+        chain = planar_chain(4)
+        spec: dict[str, Any] = {"observe": "deflection", "deflection_model": "linear"} | model
+        cell = cell_of(
+            effects,
+            tracker=tracker or Tracker(noise=CartesianNoise(np.full(3, SIGMA))),
+            nominal=Nominal(joint_compliance=(1e-5,) * chain.n_joints),
+            **spec,
+        )
+        cell = replace(
+            cell,
+            limits={"joint1": (-1.0, 1.0), "joint3": (-2.0, 1.2)},
+            workspace=workspace or Workspace(),
+            design=DesignSpec(**{"loads": LOAD} | (design or {})),
+        )
+        return Case(Model(chain, cell))
+
+    return build

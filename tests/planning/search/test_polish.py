@@ -1,0 +1,135 @@
+"""Polished plans: better, within limits, levels and rules, and as good as brute force finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from elastocal.cell import Array, PolarNoise, Tracker
+from elastocal.cell_workspace import HalfSpace, Solid, Workspace
+from elastocal.design.candidates import sobol
+from elastocal.errors import InputError
+from elastocal.planning.polish import polish
+
+Build = Callable[..., Any]
+POST = np.eye(4)
+POST[:3, 3] = [0.8, 0.0, 0.5]
+CLUTTER = Workspace(
+    obstacles=(Solid("post", "cylinder", np.array([0.1, 1.0]), POST),),
+    keep_out=(HalfSpace("floor", np.zeros(3), np.array([0.0, 0.0, 1.0])),),
+    link_radius=(0.05,) * 4,
+    clearance=0.01,
+)
+LEVELS = (-1.2, -0.4)
+POLAR = Tracker(position=np.array([3.0, -1.0, 0.5]), noise=PolarNoise(1e-5, 3e-7, 1.5e-5, 6e-6))
+
+
+def grid(arm: Any, count: int) -> Array:
+    """Every pose of a grid over joints 2 to 4; joint 1 only turns the picture."""
+    lower, upper = arm.space.bounds(0)
+    axes = [np.linspace(lower[i], upper[i], count) for i in (1, 2, 3)]
+    q = np.array(list(product(*axes)))
+    return np.hstack([np.zeros((len(q), 1)), q])
+
+
+@pytest.mark.parametrize("name", ["test_pose", "D"])
+def test_a_single_pose_reaches_the_best_of_a_dense_grid(case: Build, name: str) -> None:
+    arm = case()
+    pool = arm.draw(64)
+    problem = arm.problem(pool, [1], arm.criterion(name))
+    worst = int(problem.criterion.after_adding(problem.prior, problem.blocks).argmax())
+    found = polish(problem, arm.searches, pool.q, pool.load, np.array([worst]), starts=6)
+    q = grid(arm, 41)
+    blocks = arm.information.blocks(q, np.full(len(q), -1))
+    best = problem.criterion.after_adding(problem.prior, blocks).min()
+    assert found.before > found.after
+    assert best * 0.98 < found.after <= best
+
+
+@pytest.mark.parametrize("name", ["test_pose", "D", "A", "E", "G", "O5"])
+def test_no_criterion_gets_worse_and_no_rule_is_broken(case: Build, name: str) -> None:
+    arm = case(CLUTTER, {"levels": {"joint2": LEVELS}}, deflection_model="equilibrium")
+    pool = arm.draw(200, seed=1)
+    problem = arm.problem(pool, [2, 1], arm.criterion(name))
+    chosen = np.array([3, 40, 150])
+    found = polish(problem, arm.searches, pool.q, pool.load, chosen, starts=1, sweeps=2)
+    assert found.after < found.before
+    assert found.before == pytest.approx(arm.value(problem, pool.q[chosen], pool.load[chosen]))
+    assert found.after == pytest.approx(arm.value(problem, found.q, pool.load[chosen]), rel=1e-9)
+    values = [found.before, *(step.after for step in found.steps)]
+    assert all(step.before > step.after for step in found.steps)
+    assert values == sorted(values, reverse=True) and values[-1] == found.after
+    assert set(np.flatnonzero(found.moved)) == {step.pose for step in found.steps}
+    assert arm.rules.check(found.q, arm.states.forces[-1]).ok.all()
+    np.testing.assert_array_equal(found.q[:, 1], [LEVELS[0], LEVELS[0], LEVELS[1]])
+    lower, upper = arm.space.lower, arm.space.upper
+    assert ((lower <= found.q) & (found.q <= upper)).all()
+
+
+def test_floor_and_ceiling_at_the_best_poses_cost_something(case: Build) -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    planes = (HalfSpace("ceiling", 0.7 * up, -up), HalfSpace("floor", 0.33 * up, up))
+    free, blocked = case(), case(Workspace(keep_out=planes, link_radius=(0.05,) * 4))
+    results = []
+    for arm in (free, blocked):
+        pool = arm.draw(128)
+        problem = arm.problem(pool, [1], arm.criterion("test_pose"))
+        found = polish(problem, arm.searches, pool.q, pool.load, np.array([0]), starts=4)
+        results.append((found, problem))
+    (loose, _), (tight, problem) = results
+    assert 1.001 * loose.after < tight.after < tight.before
+    assert blocked.rules.check(tight.q, blocked.states.forces[-1]).ok.all()
+    q = next(sobol(blocked.space, 0, np.random.SeedSequence(2)))
+    q = q[blocked.rules.check(q, blocked.states.forces[-1]).ok]
+    blocks = blocked.information.blocks(q, np.full(len(q), -1))
+    values = problem.criterion.after_adding(problem.prior, blocks)
+    assert tight.after <= values.min()
+
+
+def test_each_pose_keeps_its_load_and_its_noise(case: Build) -> None:
+    loads = np.array([[0.0, 0.0, -20.0], [0.0, 0.0, -200.0]])
+    arm = case(
+        design={"loads": loads, "load_choice": True}, tracker=POLAR, observe="position",
+        deflection_model="equilibrium", effects=("joint_compliance:joint2", "marker_position"),
+    )  # fmt: skip
+    pool = arm.draw(100)
+    problem = arm.problem(pool, [3], arm.criterion("D"))
+    chosen = np.array([0, 1, 2])
+    assert set(pool.load[chosen]) == {0, 1}
+    found = polish(problem, arm.searches, pool.q, pool.load, chosen, starts=1, sweeps=2)
+    assert found.after < found.before
+    assert found.after == pytest.approx(arm.value(problem, found.q, pool.load[chosen]), rel=1e-9)
+
+
+def test_the_same_plan_on_one_and_two_processes(case: Build) -> None:
+    arm = case()
+    pool = arm.draw(64)
+    problem = arm.problem(pool, [2], arm.criterion("test_pose"))
+    plans = [
+        polish(
+            problem,
+            arm.searches,
+            pool.q,
+            pool.load,
+            np.array([1, 2]),
+            sweeps=1,
+            starts=2,
+            jobs=jobs,
+        )
+        for jobs in (1, 2)
+    ]
+    np.testing.assert_array_equal(plans[0].q, plans[1].q)
+    assert plans[0].steps == plans[1].steps
+
+
+def test_numbers_that_make_no_sense_are_refused(case: Build) -> None:
+    arm = case()
+    pool = arm.draw(64)
+    problem = arm.problem(pool, [1], arm.criterion("D"))
+    for bad in ({"starts": -1}, {"sweeps": 0}):
+        with pytest.raises(InputError, match="polish needs"):
+            polish(problem, arm.searches, pool.q, pool.load, np.array([0]), **bad)
