@@ -172,7 +172,7 @@ def _read(path: Path, asked: dict[str, Any]) -> Cell:
     from elastocal.cell_design import CriterionName
     from elastocal.cell_reader import read_cell
     from elastocal.manipulator.effects import CATALOGUE
-    from elastocal.nearest import did_you_mean, listed, quoted
+    from elastocal.text import did_you_mean, listed, quoted
 
     cell = read_cell(path, known_effects=tuple(CATALOGUE))
     names = get_args(CriterionName)
@@ -195,7 +195,7 @@ def _options(
 ) -> DesignOptions:  # fmt: skip
     from elastocal.design.options import DesignOptions
     from elastocal.manipulator.choice import load_chain
-    from elastocal.measurement_reader import read_measurements
+    from elastocal.measurements import read_measurements
 
     done = None
     if augment is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from elastocal.files import atomic_write_text
 from elastocal.identification.result import IdentificationResult
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from elastocal.report.html import Published

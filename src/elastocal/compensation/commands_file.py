@@ -11,7 +11,8 @@ import numpy as np
 
 from elastocal.compensation.compensate import REACHED, Compensation
 from elastocal.manipulator.chain import Array
-from elastocal.measurement_columns import column, families
+from elastocal.measurements import families
+from elastocal.tables import column
 
 SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.

@@ -30,7 +30,7 @@ from elastocal.design.shares import check_available, most_poses, shares_of
 from elastocal.design.target_poses import test_poses
 from elastocal.errors import InsufficientDataError, require
 from elastocal.manipulator.model import Model
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

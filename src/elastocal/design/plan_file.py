@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from elastocal.design.order.execution import Execution, Stop
 from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text, atomic_writer
-from elastocal.json_text import json_text
-from elastocal.labels import is_label
-from elastocal.measurement_columns import column, families
-from elastocal.nearest import quoted
+from elastocal.measurements import families
+from elastocal.tables import column
+from elastocal.text import is_label, json_text, quoted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -84,7 +83,7 @@ def plan_rows(
 def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> None:
     """Write plan.csv, whole or not at all; angles in degrees, travel in mm.
 
-    `measurement_reader.read_plan` reads it back to 1e-11 rad.  Raises InputError for values that
+    `measurements.read_plan` reads it back to 1e-11 rad.  Raises InputError for values that
     are not finite, names that cannot stand in a table or repeat, and an unwritable place.
     """
     columns = _columns(rows, joint_kinds)

@@ -32,8 +32,8 @@ from elastocal.errors import InsufficientDataError
 from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.manipulator.model import Model
-from elastocal.nearest import listed
 from elastocal.simulation.simulate import draw_errors, values_from
+from elastocal.text import listed
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

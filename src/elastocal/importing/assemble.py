@@ -16,8 +16,9 @@ from elastocal.importing.pool import DEFAULT, Array, Pool
 from elastocal.importing.schema import JoinTable, MappingTable
 from elastocal.importing.standstill import groups_alike
 from elastocal.importing.units import convert, quantities
-from elastocal.measurement_columns import Family, column, families
-from elastocal.nearest import listed, quoted
+from elastocal.measurements import families
+from elastocal.tables import Family, column
+from elastocal.text import listed, quoted
 
 SAME_DEG, SAME_MM = 0.05, 0.05
 OWN_DEFAULT = {"sigma_cartesian": "um", "sigma_polar": "um"}

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from elastocal.errors import InputError
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 
 ISO = "ISO 8601"
 

@@ -10,7 +10,7 @@ from elastocal.errors import InputError
 from elastocal.importing.schema import UnitsTable
 from elastocal.importing.targets import AUTO, Target, target_of
 from elastocal.importing.units import known_unit, quantities, split_unit
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 Where = int | str | list[str | int]
 MOST_JOINTS = 64

@@ -22,14 +22,14 @@ from elastocal.importing.spherical import is_spherical, with_positions
 from elastocal.importing.table_file import table_text, validated
 from elastocal.importing.with_cell import Fit, against_cell
 from elastocal.measurements import Measurements
-from elastocal.nearest import listed, quoted
+from elastocal.text import listed, quoted
 
 
 @dataclass(frozen=True)
 class Imported:
     """What was read and made of it.
 
-    `table` is the measurement table as `measurement_reader.read_measurements` reads `text`;
+    `table` is the measurement table as `measurements.read_measurements` reads `text`;
     `refused` says why the robot of the cell cannot have measured it, "" where it can.
     """
 

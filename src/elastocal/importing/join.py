@@ -12,7 +12,7 @@ from elastocal.errors import InputError
 from elastocal.importing.pool import Array, IntArray, Pool
 from elastocal.importing.schema import JoinTable
 from elastocal.importing.standstill import standstills
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 TOLERANCE_S, STILL_DEG, STILL_MM, STILL_S = 0.5, 0.01, 0.01, 1.0
 SHOWN = 8

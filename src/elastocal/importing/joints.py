@@ -18,7 +18,7 @@ from elastocal.errors import InputError, require
 from elastocal.importing.records import Records
 from elastocal.importing.schema import JointsTable
 from elastocal.importing.units import convert, quantities
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 
 def with_joints(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from elastocal.errors import InputError
 from elastocal.importing.pool import Pool
 from elastocal.importing.schema import LoadTable
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 GRAVITY = 9.80665  # m/s², standard
 UNLOADED = ("none", "unloaded", "0")

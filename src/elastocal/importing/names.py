@@ -10,8 +10,7 @@ from elastocal.errors import InputError
 from elastocal.importing.patterns import compiled
 from elastocal.importing.records import Records
 from elastocal.importing.schema import NamesTable
-from elastocal.labels import is_label
-from elastocal.nearest import listed, quoted
+from elastocal.text import is_label, listed, quoted
 
 GROUPS = ("configuration", "marker", "repeat", "load")
 ADVICE = "write pattern in [source.names]"

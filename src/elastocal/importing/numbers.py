@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from elastocal.csv_cells import NUMBER, first_bad_cell
+from elastocal.csv_lines import NUMBER, first_bad_cell
 from elastocal.errors import InputError
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from elastocal.errors import InputError
 from elastocal.importing.units import known_unit
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 
 
 def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -> str | None:

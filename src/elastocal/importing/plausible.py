@@ -6,7 +6,7 @@ import numpy as np
 
 from elastocal.importing.assemble import Assembled
 from elastocal.measurements import Measurements
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 # Industrial arms measured by trackers: radians of a campaign span more than this, degrees too.
 SMALLEST_SPREAD_DEG = 7.0  # 2 pi: a column of radians read as degrees spans less

@@ -12,7 +12,7 @@ from elastocal.errors import InputError
 from elastocal.importing.joints import joint_stems
 from elastocal.importing.records import Records
 from elastocal.importing.units import convert, quantities
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

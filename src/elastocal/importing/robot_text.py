@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from elastocal.errors import InputError
 from elastocal.importing.text_file import Text
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 
 KRL_AXES = tuple(f"{letter}{i}" for letter in "AE" for i in range(1, 7))
 RAPID_AXES = (*(f"rax_{i}" for i in range(1, 7)), *(f"eax_{letter}" for letter in "abcdef"))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from elastocal.errors import InputError
 from elastocal.importing.records import Records
 from elastocal.importing.units import convert
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,7 @@ import numpy as np
 from elastocal.cell import Cell
 from elastocal.errors import InputError
 from elastocal.importing.assemble import Assembled
-from elastocal.measurement_reader import read_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_measurements
 
 
 def table_text(made: Assembled) -> str:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from elastocal.csv_cells import NUMBER
+from elastocal.csv_lines import NUMBER
 from elastocal.errors import InputError
 from elastocal.importing.patterns import compiled
 from elastocal.importing.robot_text import Rows
 from elastocal.importing.schema import TextTable
 from elastocal.importing.text_file import Text
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 
 DELIMITERS = {"tab": "\t", ";": ";", ",": ",", "space": " "}
 SAMPLE = 200  # lines that decide on the delimiter, and in which a header is looked for

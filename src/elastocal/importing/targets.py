@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from elastocal.errors import InputError
 from elastocal.importing.units import FACTORS
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 TEXTS = ("name", "configuration", "marker", "repeat", "load", "time_text", "joint#")
 AUTO = "auto"

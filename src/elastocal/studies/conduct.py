@@ -13,7 +13,6 @@ from typing import Protocol
 import elastocal
 from elastocal import __version__
 from elastocal.errors import InputError
-from elastocal.nearest import quoted
 from elastocal.studies.dataset import Dataset, read_results
 from elastocal.studies.definition import Definition, read_definition
 from elastocal.studies.execution import Outcome
@@ -22,6 +21,7 @@ from elastocal.studies.package import Package, calling, load, pack
 from elastocal.studies.recorder import SOONEST, Recorder
 from elastocal.studies.stopping import Stop
 from elastocal.studies.table import Table
+from elastocal.text import quoted
 
 Runner = Callable[[Sequence[Job]], Generator[Outcome, None, None]]
 

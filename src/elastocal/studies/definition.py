@@ -10,7 +10,7 @@ from typing import Any
 
 from elastocal.errors import InputError, require
 from elastocal.files import read_text
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 KEYS = ("title", "seed", "files", "options", "columns")
 MOST_BYTES = 1_000_000

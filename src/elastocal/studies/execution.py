@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from elastocal import __version__
-from elastocal.nearest import did_you_mean, listed
 from elastocal.studies.job import Job
 from elastocal.studies.package import Package, load
+from elastocal.text import did_you_mean, listed
 
 Row = dict[str, Any]
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.nearest import quoted
 from elastocal.studies.definition import Definition
 from elastocal.studies.package import calling
+from elastocal.text import quoted
 
 RESERVED = ("task", "task_hash", "task_row", "task_seconds", "elastocal", "task_error")
 

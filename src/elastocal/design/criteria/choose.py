@@ -25,7 +25,7 @@ from elastocal.design.criteria.remaining_error import remaining_error
 from elastocal.design.criteria.scenarios import ScenarioCriterion
 from elastocal.design.criteria.worst import Worst
 from elastocal.errors import InputError, require
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 Robust = Literal["none", "average", "worst"]
 
