@@ -8,9 +8,12 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import Any, BinaryIO, TextIO
 
 from elastocal.errors import InputError
+
+# What is being written ends so; a process that was killed leaves it.
+UNFINISHED = ".tmp"
 
 
 @contextmanager
@@ -89,6 +92,19 @@ def atomic_writer(path: str | Path) -> Iterator[TextIO]:
     Raises InputError where the folder is missing or not writable; whatever fails within the
     `with` block leaves no temporary file and the old content of `path` untouched.
     """
+    with _atomic(path, "", encoding="utf-8", newline="\n") as handle:
+        yield handle
+
+
+@contextmanager
+def atomic_binary_writer(path: str | Path) -> Iterator[BinaryIO]:
+    """The same for bytes."""
+    with _atomic(path, "b") as handle:
+        yield handle
+
+
+@contextmanager
+def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
     _check_path(path)
     target = Path(path)
     with _write_errors(target):
@@ -96,13 +112,13 @@ def atomic_writer(path: str | Path) -> Iterator[TextIO]:
             raise InputError(f"{target}: is a directory; name a file to write")
         if target.exists() and not target.is_file():
             # Renaming over /dev/stdout or /dev/null would replace the device itself.
-            with open(target, "w", encoding="utf-8", newline="\n") as device:
+            with open(target, f"w{binary}", **options) as device:
                 yield device
             return
         target = Path(os.path.realpath(target))  # a link keeps pointing to what it points to
-        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}.tmp")
+        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}")
         try:
-            with open(temporary, "x", encoding="utf-8", newline="\n") as handle:
+            with open(temporary, f"x{binary}", **options) as handle:
                 yield handle
                 handle.flush()
                 os.fsync(handle.fileno())
@@ -134,3 +150,9 @@ def atomic_write_text(path: str | Path, text: str) -> None:
     """
     with atomic_writer(path) as handle:
         handle.write(text)
+
+
+def atomic_write_bytes(path: str | Path, data: bytes) -> None:
+    """The same for bytes."""
+    with atomic_binary_writer(path) as handle:
+        handle.write(data)

@@ -56,7 +56,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return float(value) if math.isfinite(value) else None
     # numpy's arrays and numbers, without loading numpy for it: --help comes by here.
     return plain(value.tolist()) if hasattr(value, "tolist") else value
 

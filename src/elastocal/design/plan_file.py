@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,9 @@ from numpy.typing import NDArray
 
 from elastocal.design.order.execution import Execution, Stop
 from elastocal.errors import InputError, require
-from elastocal.files import atomic_write_text, atomic_writer
+from elastocal.files import atomic_write_text
 from elastocal.measurements import families
-from elastocal.tables import column
+from elastocal.tables import column, csv_text
 from elastocal.text import is_label, json_text, quoted
 
 Array = NDArray[np.float64]
@@ -98,10 +97,7 @@ def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> 
     for values in (rows.q, rows.force):
         if values is not None and not np.isfinite(values).all():
             raise InputError(f"{path}: the plan's joint values and forces must be finite")
-    with atomic_writer(path) as handle:
-        writer = csv.writer(handle, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(zip(*columns.values(), strict=True))
+    atomic_write_text(path, csv_text(columns, zip(*columns.values(), strict=True)))
 
 
 def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[str]]:
