@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 from elastocal.errors import InputError
+from elastocal.files import decoded
 from elastocal.text import quoted
 
 MAX_LINE = 64 * 1024
@@ -166,13 +167,8 @@ class CsvLines:
         return line
 
     def _decoded(self, line: bytes, number: int) -> str:
-        try:
-            text = line.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise InputError(
-                f"{self.source}, line {number}: not UTF-8 text (byte 0x{line[error.start]:02x}); "
-                "save the table as CSV in UTF-8"
-            ) from None
+        remedy = "save the table as CSV in UTF-8"
+        text = decoded(self.source, line, remedy, codec="utf-8", line=number)
         if number > 1 and "\ufeff" in text:
             raise InputError(
                 f"{self.source}, line {number}: a byte order mark inside the file; if files were "

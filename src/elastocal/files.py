@@ -50,13 +50,24 @@ def read_text(path: str | Path, what: str, max_bytes: int) -> str:
         raise InputError(
             f"{path}: larger than {max_bytes / 1e6:.0f} MB, which no {what} is; check the path"
         )
+    return decoded(str(path), data, f"save the {what} as UTF-8")
+
+
+def decoded(
+    source: str, data: bytes, remedy: str, codec: str = "utf-8-sig", name: str = "UTF-8",
+    line: int = 1,
+) -> str:  # fmt: skip
+    """The text of `data`, which begins in `line` of a file, in the encoding `codec`.
+
+    Raises InputError that names line and byte where `data` is no such text; `name` is what people
+    call the encoding, `remedy` what they can do.
+    """
     try:
-        return data.decode("utf-8-sig")
+        return data.decode(codec)
     except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
+        line += data.count(b"\n", 0, error.start)
         raise InputError(
-            f"{path}, line {line}: not UTF-8 text (byte 0x{data[error.start]:02x}); "
-            f"save the {what} as UTF-8"
+            f"{source}, line {line}: not {name} text (byte 0x{data[error.start]:02x}); {remedy}"
         ) from None
 
 

@@ -8,26 +8,29 @@ from dataclasses import dataclass
 
 from elastocal.errors import InputError
 from elastocal.importing.schema import UnitsTable
+from elastocal.measurements import families
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
 TEXTS = ("name", "configuration", "marker", "repeat", "load", "time_text", "joint#")
 AUTO = "auto"
-_QUANTITIES: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("x", "y", "z", "distance", "range"), ("length",)),
-    **dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",)),
-    **dict.fromkeys(("sigma_x", "sigma_y", "sigma_z"), ("length",)),
-    **dict.fromkeys(("sigma_range", "sigma_azimuth", "sigma_elevation"), ("length",)),
-    **dict.fromkeys(("rx", "ry", "rz"), ("angle",)),
-    **dict.fromkeys(("qw", "qx", "qy", "qz"), ("number",)),
-    **dict.fromkeys(("force_x", "force_y", "force_z"), ("force",)),
-    "time": ("time",),
-    "temperature": ("temperature",),
-    "q#": ("angle", "length"),
-    "torque_#": ("torque", "force"),
-    "approach_#": ("number",),
-}
 _NUMBERED = re.compile(r"(q|torque_|approach_|joint)([1-9]\d?|#)((?:_[A-Za-z]+)?)")
+
+
+def _quantities() -> dict[str, tuple[str, ...]]:
+    """What each column of the measurement table, and each that becomes some of them, measures."""
+    found = {"range": ("length",)} | dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",))
+    for kind in ("revolute", "prismatic"):
+        for family in families((kind,)).values():
+            for stem, units in family.units.items():
+                name = re.sub(r"^(q|torque_|approach_)1$", r"\1#", stem)
+                if name not in TEXTS:
+                    known = found.get(name, ())
+                    found[name] = tuple(dict.fromkeys((*known, *quantities(units[0]))))
+    return found
+
+
+_QUANTITIES = _quantities()
 
 
 @dataclass(frozen=True)

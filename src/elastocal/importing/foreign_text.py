@@ -15,12 +15,13 @@ from pathlib import Path
 
 from elastocal.csv_lines import MAX_LINE, NUMBER, first_bad_cell
 from elastocal.errors import InputError
-from elastocal.files import open_input
+from elastocal.files import decoded, open_input
 from elastocal.importing.schema import TextTable
 from elastocal.text import quoted
 from elastocal.units import known_unit
 
 MAX_BYTES = 300_000_000
+SAVE_AS = "set encoding in [source.text], or export as UTF-8"
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig", "UTF-8"),
     (codecs.BOM_UTF16_LE, "utf-16", "UTF-16"),
@@ -87,10 +88,10 @@ def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
     if encoding == "auto":
         for mark, codec, name in _MARKS:
             if data.startswith(mark):
-                return _strictly(source, data, codec, name), name
+                return decoded(source, data, SAVE_AS, codec, name), name
         wide = _wide(data)
         if wide:
-            return _strictly(source, data, wide, "UTF-16"), "UTF-16"
+            return decoded(source, data, SAVE_AS, wide, "UTF-16"), "UTF-16"
         try:
             return data.decode("utf-8"), "ASCII" if data.isascii() else "UTF-8"
         except UnicodeDecodeError:
@@ -102,7 +103,7 @@ def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
     codec = {"utf-8": "utf-8-sig"}.get(encoding, encoding)
     if encoding == "utf-16" and not data.startswith(codecs.BOM_UTF16):
         codec = _wide(data) or "utf-16-le"
-    return _strictly(source, data, codec, encoding), encoding
+    return decoded(source, data, SAVE_AS, codec, encoding), encoding
 
 
 def _wide(data: bytes) -> str | None:
@@ -114,17 +115,6 @@ def _wide(data: bytes) -> str | None:
     if even > 0.4 * len(start) / 2 and odd < even / 4:
         return "utf-16-be"
     return None
-
-
-def _strictly(source: str, data: bytes, codec: str, name: str) -> str:
-    try:
-        return data.decode(codec)
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise InputError(
-            f"{source}, line {line}: not {name} text (byte 0x{data[error.start]:02x}); set "
-            "encoding in [source.text], or export as UTF-8"
-        ) from None
 
 
 def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -> str | None:
