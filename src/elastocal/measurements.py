@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +25,7 @@ from elastocal.tables import (
     layout_of_columns,
     match_columns,
     read_table,
+    write_csv,
 )
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import ANGLE, LENGTH, TIME
@@ -50,6 +51,7 @@ BESIDE_COMMANDS = ("correction_", "error_", "std_", "status")
 DEFAULT_MARKER = "M1"
 QUATERNION_NORM_TOLERANCE = 1e-3
 LARGEST_EXACT_INTEGER = 2.0**53
+AT_A_TIME = 50_000  # rows
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,10 @@ class Measurements:
         """
         import pandas as pd
 
+        return pd.DataFrame(self.columns(joint_kinds), copy=False)
+
+    def columns(self, joint_kinds: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """The same as header → (n,) numbers or labels."""
         known = families(joint_kinds or ("revolute",) * self.q.shape[1])
         blocks: dict[str, np.ndarray | None] = {
             "repeat": self.repeat,
@@ -109,7 +115,7 @@ class Measurements:
             "approach": None if self.approach is None else self.approach.astype(np.int64),
             "temperature": self.temperature,
         }
-        columns: dict[str, object] = {
+        columns: dict[str, np.ndarray] = {
             "configuration": np.array(self.configuration_labels, dtype=object)[self.configuration],
             "marker": np.array(self.marker_names, dtype=object)[self.marker],
         }
@@ -120,7 +126,7 @@ class Measurements:
             for stem, numbers in zip(stems, values.reshape(len(self), len(stems)).T, strict=True):
                 unit = next(unit for unit in SI_UNITS if unit in stems[stem])
                 columns[column(stem, unit)] = numbers
-        return pd.DataFrame(columns, copy=False)
+        return columns
 
     def _repr_html_(self) -> str:
         """The first and last rows, as notebooks show a data frame."""
@@ -414,19 +420,26 @@ def write_measurements(
     for names in (measurements.configuration_labels, measurements.marker_names):
         _check_labels(names)
     kinds = joint_kinds or ("revolute",) * measurements.q.shape[1]
-    frame = measurements.to_dataframe(kinds)
+    columns = measurements.columns(kinds)
     meaning = {
         header: family.meaning
         for family in families(kinds).values()
         for stem in family.units
         for header in family.columns(stem)
     }
-    for header in frame.select_dtypes("number"):
-        if not np.isfinite(frame[header].to_numpy()).all():
+    for header, values in columns.items():
+        if values.dtype != object and not np.isfinite(values).all():
             raise InputError(f"{path}: the {meaning[header]} to write are not all finite")
-    # Without a float format pandas writes the shortest digits (17 at most) that read back exactly.
     with atomic_writer(path) as handle:
-        frame.to_csv(handle, index=False, lineterminator="\n")
+        write_csv(handle, columns, _rows(columns, len(measurements)))
+
+
+def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
+    """The rows, a few at a time as numbers of Python, which are written with the shortest digits
+    that read back exactly."""
+    for start in range(0, n, AT_A_TIME):
+        some = slice(start, start + AT_A_TIME)
+        yield from zip(*(values[some].tolist() for values in columns.values()), strict=True)
 
 
 def _check_labels(names: Sequence[str]) -> None:

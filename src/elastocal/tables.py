@@ -17,7 +17,7 @@ from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO, StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -563,13 +563,23 @@ def _number(cell: str) -> float:
 # Writing
 
 
+def write_csv(
+    handle: TextIO,
+    header: Iterable[str],
+    rows: Iterable[Iterable[object]],
+    comments: Iterable[str] = (),
+) -> None:
+    """Write a table as CSV, each of `comments` on a line of its own above it, after #."""
+    handle.writelines(f"# {comment}\n" for comment in comments)
+    writer = csv.writer(handle, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+
+
 def csv_text(
     header: Iterable[str], rows: Iterable[Iterable[object]], comments: Iterable[str] = ()
 ) -> str:
-    """A table as CSV, each of `comments` on a line of its own above it, after #."""
+    """The text that `write_csv` writes."""
     text = StringIO()
-    text.writelines(f"# {comment}\n" for comment in comments)
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    write_csv(text, header, rows, comments)
     return text.getvalue()

@@ -19,7 +19,8 @@ _NUMBERED = re.compile(r"(q|torque_|approach_|joint)([1-9]\d?|#)((?:_[A-Za-z]+)?
 
 def _quantities() -> dict[str, tuple[str, ...]]:
     """What each column of the measurement table, and each that becomes some of them, measures."""
-    found = {"range": ("length",)} | dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",))
+    found: dict[str, tuple[str, ...]] = {"range": ("length",)}
+    found |= dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",))
     for kind in ("revolute", "prismatic"):
         for family in families((kind,)).values():
             for stem, units in family.units.items():
