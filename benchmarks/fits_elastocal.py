@@ -25,7 +25,7 @@ with clock.step("import"):
     import elastocal.cell_reader
     import elastocal.manipulator.effects
     import elastocal.manipulator.urdf
-    import elastocal.measurement_reader  # noqa: F401
+    import elastocal.measurements  # noqa: F401
     from elastocal.cli.identify import load_inputs
     from elastocal.identification.identify import identify
     from elastocal.identification.noise import Weights

@@ -29,9 +29,7 @@ from elastocal.identification.result import IdentificationResult
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
-from elastocal.measurement_reader import read_measurements
-from elastocal.measurement_writer import write_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_measurements, write_measurements
 from elastocal.simulation.simulate import simulate
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")

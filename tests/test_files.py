@@ -7,7 +7,12 @@ import os
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.files import atomic_write_text, atomic_writer
+from elastocal.files import (
+    atomic_binary_writer,
+    atomic_write_bytes,
+    atomic_write_text,
+    atomic_writer,
+)
 
 
 def test_text_is_written_as_utf8_and_nothing_else_is_left(tmp_path):
@@ -24,6 +29,16 @@ def test_a_failure_leaves_the_old_file_and_no_temporary_one(tmp_path, failure):
         raise failure
     assert (tmp_path / "a.txt").read_text() == "old"
     assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_bytes_are_written_whole_or_not_at_all(tmp_path):
+    atomic_write_bytes(tmp_path / "a.bin", b"\r\n\0")
+    assert (tmp_path / "a.bin").read_bytes() == b"\r\n\0"
+    with pytest.raises(RuntimeError), atomic_binary_writer(tmp_path / "a.bin") as handle:
+        handle.write(b"half")
+        raise RuntimeError
+    assert (tmp_path / "a.bin").read_bytes() == b"\r\n\0"
+    assert os.listdir(tmp_path) == ["a.bin"]
 
 
 def test_missing_folder_is_an_input_error_that_names_it(tmp_path):

@@ -11,7 +11,7 @@ from style import ROOT, Colours, draw, plt
 
 from elastocal.cell_reader import read_cell
 from elastocal.manipulator.model import Model
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
 TUTORIAL = ROOT / "docs" / "tutorial"

@@ -21,8 +21,7 @@ from elastocal.diagnosis.noise import NoiseValues, NoisyData
 from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.manipulator.model import Model
-from elastocal.measurement_reader import read_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_measurements
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from worker import Worker
 from world import Visits
 from world_files import write_table
 
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 
 Array = NDArray[np.float64]
 ANSWER = "diagnosis.json"

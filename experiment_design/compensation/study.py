@@ -31,8 +31,7 @@ from elastocal.manipulator.calibrated import read_calibrated
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.choice import load_chain
 from elastocal.manipulator.limits import joint_limits
-from elastocal.measurement_writer import write_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, write_measurements
 from elastocal.simulation.mujoco_arm import MujocoArm
 
 HERE = Path(__file__).resolve().parent

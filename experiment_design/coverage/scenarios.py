@@ -17,7 +17,7 @@ from elastocal.cell_reader import read_cell
 from elastocal.demo import LOAD_N, published_compliances
 from elastocal.identification.variance.readings import Readings
 from elastocal.manipulator.model import Model
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 from elastocal.simulation.simulate import expand_plan, values_from
 from elastocal.tracker_noise import polar_axes
 

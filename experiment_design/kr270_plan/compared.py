@@ -21,7 +21,7 @@ from elastocal.design.setup import Known, Pool, Setup, set_up
 from elastocal.design.shares import shares_of
 from elastocal.design.target_poses import TargetPoses, test_poses
 from elastocal.manipulator.model import Model
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 
 HERE = Path(__file__).parent
 DEMO = Path(str(files("elastocal.demo")))

@@ -12,7 +12,7 @@ from elastocal.cell_reader import read_cell
 from elastocal.demo import LOAD_N, REPEATS, published_compliances, reading_sigma
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
 DEMO = Path(str(files("elastocal.demo")))

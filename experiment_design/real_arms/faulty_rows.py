@@ -14,8 +14,7 @@ from elastocal.identification.outliers import blocks
 from elastocal.identification.result import IdentificationResult
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
-from elastocal.measurement_reader import read_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_measurements
 
 SPLITS, TEST_SHARE = 5, 0.2
 

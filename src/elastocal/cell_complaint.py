@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from elastocal.cell_keys import dotted, header, place
 from elastocal.cell_schema import CellTable
 from elastocal.errors import InputError
-from elastocal.nearest import did_you_mean, listed, nearest, quoted
+from elastocal.text import did_you_mean, listed, nearest, quoted
 
 UNIT_SUFFIX = re.compile(
     r"_(um|mm|cm|m|deg|rad|urad|mrad|ppm|N|kN|Nm|N_per_m|N_per_mm|s|min|si"

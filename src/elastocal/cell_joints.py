@@ -8,7 +8,7 @@ from pathlib import Path
 
 from elastocal.cell_keys import dotted
 from elastocal.errors import InputError
-from elastocal.nearest import did_you_mean
+from elastocal.text import did_you_mean
 from elastocal.units import to_si
 
 JOINT_UNITS = ("deg", "rad", "m", "mm")

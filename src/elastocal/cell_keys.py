@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 
 
 def dotted(keys: Sequence[str]) -> str:

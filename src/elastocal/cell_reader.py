@@ -38,8 +38,7 @@ from elastocal.cell_workspace_reader import read_workspace
 from elastocal.cell_workspace_schema import WorkspaceTable
 from elastocal.errors import InputError
 from elastocal.files import check_exists, read_text
-from elastocal.labels import is_label
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import to_si
 
 MAX_BYTES = 5_000_000

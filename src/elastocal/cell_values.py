@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from elastocal.cell_keys import header, place
 from elastocal.errors import InputError, require
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import to_si
 
 Array = NDArray[np.float64]

@@ -28,8 +28,7 @@ from elastocal.cell_workspace_schema import (
 )
 from elastocal.errors import InputError, require
 from elastocal.files import check_exists
-from elastocal.labels import is_label
-from elastocal.nearest import quoted
+from elastocal.text import is_label, quoted
 from elastocal.units import to_si
 
 LENGTH = {"mm": "mm", "m": "m"}

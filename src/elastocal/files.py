@@ -8,9 +8,12 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import Any, BinaryIO, TextIO
 
 from elastocal.errors import InputError
+
+# What is being written ends so; a process that was killed leaves it.
+UNFINISHED = ".tmp"
 
 
 @contextmanager
@@ -47,13 +50,24 @@ def read_text(path: str | Path, what: str, max_bytes: int) -> str:
         raise InputError(
             f"{path}: larger than {max_bytes / 1e6:.0f} MB, which no {what} is; check the path"
         )
+    return decoded(str(path), data, f"save the {what} as UTF-8")
+
+
+def decoded(
+    source: str, data: bytes, remedy: str, codec: str = "utf-8-sig", name: str = "UTF-8",
+    line: int = 1,
+) -> str:  # fmt: skip
+    """The text of `data`, which begins in `line` of a file, in the encoding `codec`.
+
+    Raises InputError that names line and byte where `data` is no such text; `name` is what people
+    call the encoding, `remedy` what they can do.
+    """
     try:
-        return data.decode("utf-8-sig")
+        return data.decode(codec)
     except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
+        line += data.count(b"\n", 0, error.start)
         raise InputError(
-            f"{path}, line {line}: not UTF-8 text (byte 0x{data[error.start]:02x}); "
-            f"save the {what} as UTF-8"
+            f"{source}, line {line}: not {name} text (byte 0x{data[error.start]:02x}); {remedy}"
         ) from None
 
 
@@ -89,6 +103,19 @@ def atomic_writer(path: str | Path) -> Iterator[TextIO]:
     Raises InputError where the folder is missing or not writable; whatever fails within the
     `with` block leaves no temporary file and the old content of `path` untouched.
     """
+    with _atomic(path, "", encoding="utf-8", newline="\n") as handle:
+        yield handle
+
+
+@contextmanager
+def atomic_binary_writer(path: str | Path) -> Iterator[BinaryIO]:
+    """The same for bytes."""
+    with _atomic(path, "b") as handle:
+        yield handle
+
+
+@contextmanager
+def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
     _check_path(path)
     target = Path(path)
     with _write_errors(target):
@@ -96,13 +123,13 @@ def atomic_writer(path: str | Path) -> Iterator[TextIO]:
             raise InputError(f"{target}: is a directory; name a file to write")
         if target.exists() and not target.is_file():
             # Renaming over /dev/stdout or /dev/null would replace the device itself.
-            with open(target, "w", encoding="utf-8", newline="\n") as device:
+            with open(target, f"w{binary}", **options) as device:
                 yield device
             return
         target = Path(os.path.realpath(target))  # a link keeps pointing to what it points to
-        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}.tmp")
+        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}")
         try:
-            with open(temporary, "x", encoding="utf-8", newline="\n") as handle:
+            with open(temporary, f"x{binary}", **options) as handle:
                 yield handle
                 handle.flush()
                 os.fsync(handle.fileno())
@@ -134,3 +161,9 @@ def atomic_write_text(path: str | Path, text: str) -> None:
     """
     with atomic_writer(path) as handle:
         handle.write(text)
+
+
+def atomic_write_bytes(path: str | Path, data: bytes) -> None:
+    """The same for bytes."""
+    with atomic_binary_writer(path) as handle:
+        handle.write(data)

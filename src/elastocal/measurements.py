@@ -1,23 +1,57 @@
-"""What the user measured: one validated, frozen table in SI units."""
+"""What the user measured: a checked, frozen table in SI units, its columns, reader and writer."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.measurement_columns import column, families
+from elastocal.errors import InputError
+from elastocal.files import atomic_writer
+from elastocal.tables import (
+    NO_UNIT,
+    Array,
+    Family,
+    IntArray,
+    Labels,
+    Layout,
+    RawTable,
+    column,
+    layout_of_columns,
+    match_columns,
+    read_table,
+    write_csv,
+)
+from elastocal.text import did_you_mean, is_label, listed, quoted
+from elastocal.units import ANGLE, LENGTH, TIME
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")
+REQUIRED: dict[str, tuple[tuple[str, ...], ...]] = {
+    "position": (("position",),),
+    "deflection": (("position",),),
+    "pose": (("position",), ("rotation", "quaternion")),
+    "distance": (("distance",),),
+    "plan": (),
+    "targets": (),
+}
+EXCLUSIVE = (("sigma_cartesian", "sigma_polar"), ("rotation", "quaternion"))
+NUMBERED = re.compile(r"(q|torque_|approach_)([1-9][0-9]{0,3})(_[a-zA-Z]+)?", re.ASCII)
+PLANS = ("plan", "targets")
+PLAN_ONLY = ("level", "order")
+# What `compensate` writes beside its commands, which are a plan too.
+BESIDE_COMMANDS = ("correction_", "error_", "std_", "status")
+DEFAULT_MARKER = "M1"
+QUATERNION_NORM_TOLERANCE = 1e-3
+LARGEST_EXACT_INTEGER = 2.0**53
+AT_A_TIME = 50_000  # rows
 
 
 @dataclass(frozen=True)
@@ -63,6 +97,10 @@ class Measurements:
         """
         import pandas as pd
 
+        return pd.DataFrame(self.columns(joint_kinds), copy=False)
+
+    def columns(self, joint_kinds: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """The same as header → (n,) numbers or labels."""
         known = families(joint_kinds or ("revolute",) * self.q.shape[1])
         blocks: dict[str, np.ndarray | None] = {
             "repeat": self.repeat,
@@ -77,7 +115,7 @@ class Measurements:
             "approach": None if self.approach is None else self.approach.astype(np.int64),
             "temperature": self.temperature,
         }
-        columns: dict[str, object] = {
+        columns: dict[str, np.ndarray] = {
             "configuration": np.array(self.configuration_labels, dtype=object)[self.configuration],
             "marker": np.array(self.marker_names, dtype=object)[self.marker],
         }
@@ -88,7 +126,7 @@ class Measurements:
             for stem, numbers in zip(stems, values.reshape(len(self), len(stems)).T, strict=True):
                 unit = next(unit for unit in SI_UNITS if unit in stems[stem])
                 columns[column(stem, unit)] = numbers
-        return pd.DataFrame(columns, copy=False)
+        return columns
 
     def _repr_html_(self) -> str:
         """The first and last rows, as notebooks show a data frame."""
@@ -102,3 +140,312 @@ class Measurements:
             if isinstance(getattr(self, f.name), np.ndarray)
         }
         return replace(self, **changes)
+
+
+# Its columns
+
+
+def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
+    """Every family of columns for a robot with these joints ("revolute" or "prismatic")."""
+    numbered = list(enumerate(joint_kinds, start=1))
+
+    def per_joint(stem: str, revolute: tuple[str, ...], prismatic: tuple[str, ...]) -> dict:
+        return {
+            stem.format(i): prismatic if kind == "prismatic" else revolute for i, kind in numbered
+        }
+
+    def same(units: tuple[str, ...], *stems: str) -> dict[str, tuple[str, ...]]:
+        return dict.fromkeys(stems, units)
+
+    known = (
+        Family("configuration", "configuration", same(NO_UNIT, "configuration"), is_label=True),
+        Family("repeat", "repeat", same(NO_UNIT, "repeat")),
+        Family("marker", "marker", same(NO_UNIT, "marker"), is_label=True),
+        Family("q", "joint positions", per_joint("q{}", ANGLE, LENGTH[:2])),
+        Family("force", "forces", same(("N",), "force_x", "force_y", "force_z")),
+        Family("position", "positions", same(LENGTH, "x", "y", "z")),
+        Family("rotation", "rotation vector", same(ANGLE, "rx", "ry", "rz")),
+        Family("quaternion", "quaternion", same(NO_UNIT, "qw", "qx", "qy", "qz")),
+        Family("distance", "distances", same(LENGTH[:2], "distance")),
+        Family("torque", "joint torques", per_joint("torque_{}", ("Nm",), ("N",))),
+        Family(
+            "sigma_cartesian",
+            "Cartesian sigmas",
+            same(("um", "mm", "m"), "sigma_x", "sigma_y", "sigma_z"),
+        ),
+        Family(
+            "sigma_polar",
+            "polar sigmas",
+            same(("um", "mm", "m"), "sigma_range", "sigma_azimuth", "sigma_elevation"),
+        ),
+        Family("time", "time", same(TIME, "time")),
+        Family("approach", "approach directions", per_joint("approach_{}", NO_UNIT, NO_UNIT)),
+        Family("temperature", "temperature", same(("C",), "temperature")),
+    )
+    return {family.name: family for family in known}
+
+
+def layout_of(
+    source: str,
+    header: Sequence[str],
+    joint_kinds: Sequence[str],
+    observe: str,
+    extra: Sequence[Family] = (),
+) -> Layout:
+    """What the columns of a table mean.
+
+    `joint_kinds`: "revolute" or "prismatic" per joint; `observe` decides what must be there;
+    `extra`: families that this table may have besides.
+    Raises InputError for unnamed, repeated, unknown, unitless, missing columns, mixed units,
+    incomplete families and a joint count that is not the robot's.
+    """
+    known = families(joint_kinds) | {family.name: family for family in extra}
+    present = match_columns(
+        source,
+        header,
+        known,
+        lambda text: observe in PLANS and (text in PLAN_ONLY or text.startswith(BESIDE_COMMANDS)),
+        lambda text: _wrong_joint(text, header, known),
+    )
+    stated = observe != "targets" or "q" in present  # targets need no joints, perhaps no positions
+    if joint_kinds and stated and len(present.get("q", {})) != len(joint_kinds):
+        raise InputError(f"{source}: {_wrong_count(header, known['q'])}")
+    needed_by = f'observe = "{observe}" in the cell file needs'
+    return layout_of_columns(source, present, known, REQUIRED[observe], needed_by, EXCLUSIVE)
+
+
+def _wrong_joint(text: str, header: Sequence[str], known: Mapping[str, Family]) -> str | None:
+    """What to say of a column of a joint that the robot does not have."""
+    numbered = NUMBERED.fullmatch(text)
+    if not numbered or any(numbered[1] + numbered[2] in f.units for f in known.values()):
+        return None
+    if numbered[1] == "q":
+        return _wrong_count(header, known["q"])
+    n = len(known["q"].units)
+    return f"column {quoted(text)} is of joint {numbered[2]}, but the robot has {n} joints"
+
+
+def _wrong_count(header: Sequence[str], family: Family) -> str:
+    n = len(family.units)
+    found = [t for t in header if (m := NUMBERED.fullmatch(t)) and m[1] == "q"]
+    stems = {"q" + NUMBERED.fullmatch(t)[2] for t in found}  # type: ignore[index]
+    missing = [family.columns(stem)[0] for stem in family.units if stem not in stems]
+    names = f" ({listed(found, 8)})" if found else ""
+    remedy = f"; add {listed(missing, 8)}" if missing else ""
+    return (
+        f"{len(stems)} joint columns{names}, but the robot has {n} joints{remedy or '; drop the'}"
+        f"{'' if remedy else ' columns too many, or use the cell of the right robot'}"
+    )
+
+
+# Reading
+
+
+def read_measurements(
+    path: str | Path,
+    *,
+    joint_kinds: tuple[str, ...],
+    marker_names: tuple[str, ...] = (),
+    observe: str = "position",
+    text: str | None = None,
+) -> Measurements:
+    """The measurements of a CSV or Parquet (.parquet, .pq) file, in SI units.
+
+    `joint_kinds`: "revolute" or "prismatic" per joint of the robot; `marker_names`: the cell's
+    markers, () if it names none; `observe`: "position", "deflection", "pose" or "distance",
+    which decides the columns that must be there, or "plan" or "targets", which ask for none.
+    Quaternions become rotation vectors.  With `text` the table is that CSV text, and `path` only
+    its name.
+
+    Raises InputError that names file, line, column and the offending text.
+    """
+
+    def choose(header: Sequence[str]) -> Layout:
+        return layout_of(str(path), header, joint_kinds, observe)
+
+    raw = read_table(path, choose, text=text)
+    n = len(raw.row)
+    marker = _marker(raw, marker_names)
+    configuration = raw.labels.get("configuration")
+    if configuration is None:
+        configuration = Labels(np.arange(n), tuple(str(i) for i in range(1, n + 1)))
+    force, torque, sigma = raw.si("force"), raw.si("torque"), _sigma(raw)
+    q, time, temperature = raw.si("q"), raw.si("time"), raw.si("temperature")
+    distance = raw.si("distance")
+    if distance is not None:
+        raw.check("distance", distance > 0, "a distance must be positive")
+    approach = raw.si("approach")
+    if approach is not None:
+        good = np.isin(approach, (-1.0, 0.0, 1.0))
+        raw.check("approach", good, "an approach direction is -1, 0 or 1")
+    table = Measurements(
+        source=str(path),
+        row=raw.row,
+        q=np.zeros((n, 0)) if q is None else q,
+        configuration=configuration.codes,
+        configuration_labels=configuration.names,
+        repeat=_repeat(raw),
+        marker=marker.codes,
+        marker_names=marker.names,
+        force=np.zeros((n, 3)) if force is None else force,
+        position=raw.si("position"),
+        rotation=rotation_column(raw),
+        distance=None if distance is None else distance[:, 0],
+        torque=torque,
+        sigma=sigma,
+        sigma_frame="polar" if "sigma_polar" in raw.layout.columns else "cartesian",
+        time=None if time is None else time[:, 0],
+        approach=approach,
+        temperature=None if temperature is None else temperature[:, 0],
+    )
+    if observe != "targets":  # a path may pass a place twice
+        _check_duplicates(raw, table)
+    return table
+
+
+def read_plan(path: str | Path, *, joint_kinds: tuple[str, ...]) -> Measurements:
+    """The poses of a plan: configuration, q1_deg …, and forces where the plan states them.
+
+    `level` and `order`, which a designed plan has, are passed over.  Errors as for measurements.
+    """
+    return read_measurements(path, joint_kinds=joint_kinds, observe="plan")
+
+
+def _sigma(raw: RawTable) -> Array | None:
+    for family in ("sigma_cartesian", "sigma_polar"):
+        sigma = raw.si(family)
+        if sigma is not None:
+            raw.check(family, sigma > 0, "a standard deviation must be positive")
+            return sigma
+    return None
+
+
+def _repeat(raw: RawTable) -> IntArray:
+    repeat = raw.si("repeat")
+    if repeat is None:
+        return np.zeros(len(raw.row), dtype=np.int64)
+    whole = (repeat == np.round(repeat)) & (np.abs(repeat) <= LARGEST_EXACT_INTEGER)
+    raw.check("repeat", whole, "a repeat is a whole number")
+    return repeat[:, 0].astype(np.int64)
+
+
+def rotation_column(raw: RawTable) -> Array | None:
+    """Rotation vectors (n, 3) in rad from rx … or the quaternion, None where there is neither."""
+    quaternion = raw.si("quaternion")
+    if quaternion is None:
+        return raw.si("rotation")
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
+    off = ~(np.abs(norm - 1.0) <= QUATERNION_NORM_TOLERANCE)
+    if off.any():
+        i = int(np.argmax(off))
+        raise InputError(
+            f"{raw.where(i, 'qw')}: the quaternion's norm is {norm[i]:.6g}, not 1; check the "
+            "order qw, qx, qy, qz and the digits"
+        )
+    return rotation_vector(quaternion)
+
+
+def rotation_vector(quaternion: Array) -> Array:
+    """Axis times angle in [0, π], (n, 3) rad, of quaternions (n, 4) as w, x, y, z, not zero.
+
+    Scale and sign of a quaternion do not matter.
+    """
+    # q and -q are the same rotation; w >= 0 is the one of at most half a turn.
+    q = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+    sine = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2.0 * np.arctan2(sine, q[:, 0])
+    # angle / sine tends to 2 / w as the angle vanishes.
+    small = sine < 1e-150
+    factor = np.where(small, 2.0 / np.where(small, q[:, 0], 1.0), 0.0)
+    np.divide(angle, sine, out=factor, where=~small)
+    return q[:, 1:] * factor[:, None]
+
+
+def _marker(raw: RawTable, known: tuple[str, ...]) -> Labels:
+    labels = raw.labels.get("marker")
+    if labels is None:
+        if len(known) > 1:
+            raise InputError(
+                f"{raw.source}: no marker column, but the cell has the markers {listed(known)}; "
+                "add a column marker that says which one each row measures"
+            )
+        return Labels(np.zeros(len(raw.row), dtype=np.int64), known or (DEFAULT_MARKER,))
+    if not known:
+        return labels
+    for code, name in enumerate(labels.names):
+        if name not in known:
+            i = int(np.argmax(labels.codes == code))
+            raise InputError(
+                f"{raw.where(i, 'marker')}: {quoted(name)} is no marker of the cell"
+                f"{did_you_mean(name, known)}; its markers: {listed(known)}"
+            )
+    return Labels(np.array([known.index(name) for name in labels.names])[labels.codes], known)
+
+
+def _check_duplicates(raw: RawTable, table: Measurements) -> None:
+    import pandas as pd
+
+    if "configuration" in raw.labels:
+        key = [table.configuration, table.repeat, table.marker, *table.force.T]
+        what = "the same configuration, repeat, marker and force"
+    else:
+        key = [*raw.numbers.values(), *(labels.codes for labels in raw.labels.values())]
+        what = "the same values in all columns"
+    # Adding zero makes -0.0 and 0.0 the same key.
+    frame = pd.DataFrame({k: values + 0 for k, values in enumerate(key)}, copy=False)
+    repeated = frame.duplicated().to_numpy()
+    if repeated.any():
+        i = int(np.argmax(repeated))
+        same = np.logical_and.reduce([values == values[i] for values in key])
+        first = int(np.argmax(same))
+        raise InputError(
+            f"{raw.source}: {raw.noun}s {raw.row[first]} and {raw.row[i]} have {what}; drop one, "
+            "or number true repetitions in a `repeat` column"
+        )
+
+
+# Writing
+
+
+def write_measurements(
+    measurements: Measurements, path: str | Path, joint_kinds: Sequence[str] | None = None
+) -> None:
+    """Write the table to a CSV that reads back bit for bit; whole or not at all.
+
+    `joint_kinds`: "revolute" (default for all joints) or "prismatic", which decides q1_rad or
+    q1_m.  Raises InputError where the folder is missing or not writable, and for values or
+    labels that no table can hold (NaN, infinite, control characters).
+    """
+    for names in (measurements.configuration_labels, measurements.marker_names):
+        _check_labels(names)
+    kinds = joint_kinds or ("revolute",) * measurements.q.shape[1]
+    columns = measurements.columns(kinds)
+    meaning = {
+        header: family.meaning
+        for family in families(kinds).values()
+        for stem in family.units
+        for header in family.columns(stem)
+    }
+    for header, values in columns.items():
+        if values.dtype != object and not np.isfinite(values).all():
+            raise InputError(f"{path}: the {meaning[header]} to write are not all finite")
+    with atomic_writer(path) as handle:
+        write_csv(handle, columns, _rows(columns, len(measurements)))
+
+
+def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
+    """The rows, a few at a time as numbers of Python, which are written with the shortest digits
+    that read back exactly."""
+    for start in range(0, n, AT_A_TIME):
+        some = slice(start, start + AT_A_TIME)
+        yield from zip(*(values[some].tolist() for values in columns.values()), strict=True)
+
+
+def _check_labels(names: Sequence[str]) -> None:
+    for name in names:
+        if not is_label(name):
+            raise InputError(
+                f"label {quoted(name)} cannot stand in a table; use one line without blanks at "
+                "its ends"
+            )

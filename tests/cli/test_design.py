@@ -19,7 +19,7 @@ from support.design_commands import (
     write_cell,
 )
 
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 
 TWO_LEVELS = "\n[design.levels]\njoint2_deg = [-25.24, -56.9]\n"
 LEVELS = altered(DEFLECTION, poses="6") + TWO_LEVELS

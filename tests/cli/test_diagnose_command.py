@@ -19,7 +19,7 @@ from elastocal.cell_reader import read_cell
 from elastocal.cli import app
 from elastocal.cli.diagnosis_files import write_extra_poses
 from elastocal.errors import InsufficientDataError
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 
 KINDS = ("revolute",) * 6
 

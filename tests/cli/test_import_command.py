@@ -9,7 +9,7 @@ from support.tracker_exports import kr270_readings, krl, spatialanalyzer
 from typer.testing import CliRunner
 
 from elastocal.cli import app
-from elastocal.measurement_reader import read_measurements
+from elastocal.measurements import read_measurements
 
 
 @pytest.fixture

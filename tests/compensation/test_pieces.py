@@ -19,7 +19,7 @@ from elastocal.compensation.levels import share_of_levels
 from elastocal.compensation.point import tool_point
 from elastocal.compensation.targets import one_target, read_targets, targets_at
 from elastocal.errors import ElastocalError, InputError
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 
 KINDS = ("revolute",) * 6
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"

@@ -16,7 +16,7 @@ from elastocal.cli import app
 from elastocal.design.order.schedule import schedule
 from elastocal.design.plan_file import PlanRows, plan_rows, write_plan, write_plan_json
 from elastocal.errors import InputError
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 
 FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
 KINDS = kr270_chain().kinds

@@ -179,7 +179,7 @@ GOOD = "0,-90,90,0,30,0"
         (f"{JOINTS}\n", ["no rows"]),
         (f"{JOINTS},weight\n{GOOD},abc", ["line 2, column weight", "'abc' is not a number"]),
         (f"{JOINTS},weight\n{GOOD},1\n{GOOD},0", ["line 3, column weight", "must be positive"]),
-        (f"{JOINTS},weight,weight\n{GOOD},1,1", ["'weight' appears twice"]),
+        (f"{JOINTS},weight,weight\n{GOOD},1,1", ["'weight' appears 2 times"]),
         (f"{JOINTS}\n0,-90,90,0,30", ["line 2 has 5 fields"]),
         (f"{JOINTS}\n{GOOD}\n0,1,90,0,30,0", ["line 3, column q2_deg: joint2", "at 1° is beyond"]),
         ("q1_deg,q2_deg\n0,0", ["2 joint columns", "6 joints"]),

@@ -19,11 +19,10 @@ from elastocal.diagnosis.separate.result import RivalPair
 from elastocal.identification.knowledge_schema import TABLES, KnowledgeTable
 from elastocal.identification.outlier import Outlier
 from elastocal.identification.robust.report import Finding
-from elastocal.manipulator.dh import DH_COLUMNS
+from elastocal.manipulator.dh import DH_FAMILIES
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
-from elastocal.measurement_columns import families
-from elastocal.measurement_reader import read_measurements
+from elastocal.measurements import families, read_measurements
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "file-formats.md").read_text(encoding="utf-8")
@@ -78,8 +77,9 @@ def test_every_column_of_the_measurement_table_is_on_the_page():
 
 def test_every_column_of_the_dh_table_is_on_the_page():
     text = PAGE.split("### DH table", 1)[1].split("\n## ", 1)[0]
-    for quantity in DH_COLUMNS:
-        assert quantity.name.removesuffix(" travel") + "_" in text, quantity.name
+    for family in DH_FAMILIES:
+        for stem in family.units:
+            assert stem + ("" if family.is_label else "_") in text, stem
 
 
 def test_every_key_of_an_identification_is_on_the_page(course):

@@ -10,8 +10,8 @@ from support.cells import kr270_chain, random_poses
 
 from elastocal.cell import Nominal
 from elastocal.identification.identify import identify
-from elastocal.json_text import json_text
 from elastocal.manipulator.model import Model
+from elastocal.text import json_text
 
 HELD = 2e-6  # rad/(N m), what the cell states for every joint
 

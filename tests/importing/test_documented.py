@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from elastocal.cli import app
 from elastocal.cli.import_ import PRESET_NAMES
-from elastocal.importing.columns import wanted
+from elastocal.importing.export_columns import wanted
 from elastocal.importing.mapping import PRESETS, read_mapping
 
 PAGE = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")

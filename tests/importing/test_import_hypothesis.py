@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 from support.tracker_exports import imported, krl, rapid
 
 from elastocal.errors import InputError
-from elastocal.importing.clock import Clock
+from elastocal.importing.foreign_text import Clock, Text, krl_rows, rapid_rows
 from elastocal.importing.mapping import read_mapping
-from elastocal.importing.robot_text import krl_rows, rapid_rows
-from elastocal.importing.text_file import Text
 
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 MAPPING = """

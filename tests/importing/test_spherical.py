@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.tracker_exports import MARKERS, imported, kr270_readings, krl
 
 from elastocal.errors import InputError
-from elastocal.importing.units import FACTORS
+from elastocal.units import FACTORS
 
 TURN = {"deg": 360.0, "gon": 400.0, "rad": 2 * np.pi}
 MAPPING = """
@@ -86,8 +86,7 @@ def test_readings_in_the_second_face_come_out_right(tmp_path, readings):
     st.sampled_from(["deg", "gon", "rad"]),
 )  # fmt: skip
 def test_the_length_is_the_range_whatever_the_angles(d, az, zen, clockwise, unit):
-    from elastocal.importing.records import Records, Understood
-    from elastocal.importing.spherical import with_positions
+    from elastocal.importing.records import Records, Understood, with_positions
 
     scale = TURN[unit] / 400
     seen = Understood("p", None, "points", "utf-8", "", ".", (), (), 1, ())

@@ -160,38 +160,50 @@ def test_byte_order_mark_and_blank_lines_are_harmless(tmp_path: Path) -> None:
     assert read_dh(path).n_joints == 6
 
 
+def test_semicolons_and_decimal_commas_are_read(tmp_path: Path) -> None:
+    rows = "\n".join(f"{theta};{d};{a};{alpha}".replace(".", ",") for theta, d, a, alpha in UR5)
+    path = tmp_path / "dh.csv"
+    path.write_text(HEADER.replace(",", ";") + "\n" + rows + "\n")
+    q = np.full(6, 0.3)
+    expected = evaluate(read_dh(write(tmp_path / "commas.csv", HEADER, UR5)), q)
+    np.testing.assert_array_equal(evaluate(read_dh(path), q), expected)
+
+
 ROW = "0,0.1,0.2,0"
 WRONG_DH = {
-    "empty": ("", "empty; the first row names the columns, e.g. theta0_rad,d_m,a_m,alpha_rad"),
-    "no unit": ("theta0,d_m,a_m,alpha_rad\n", "'theta0' has no unit; call it theta0_rad or"),
-    "no unit on limit": (HEADER + ",lower\n", "call it lower_rad or lower_deg or lower_m"),
+    "empty": ("", "empty file; the first line names the columns"),
+    "no unit": ("theta0,d_m,a_m,alpha_rad\n", "'theta0' has no unit; write theta0_rad or"),
+    "no unit on limit": (HEADER + ",lower\n", "write lower_rad or lower_deg or lower_m"),
     "misspelt": ("theta_rad,d_m,a_m,alpha_rad\n", r"'theta_rad' \(did you mean 'theta0_rad'"),
     "mixed angles": ("theta0_rad,d_m,a_m,alpha_deg\n", "theta0_rad and alpha_deg mix units"),
     "mixed lengths": ("theta0_rad,d_m,a_mm,alpha_rad\n", "d_m and a_mm mix units"),
     "same twice": (HEADER + ",d_mm\n", "columns d_m and d_mm say the same"),
-    "repeated": (HEADER + ",d_m\n", "column 'd_m' appears twice"),
-    "missing": ("theta0_rad,d_m,alpha_rad\n", "no column a_m or a_mm; columns found: theta0_rad"),
-    "semicolons": ("theta0_rad;d_m;a_m;alpha_rad\n", "separated by ';'; use commas"),
-    "text": (f"{HEADER}\n{ROW}\n0,x,0,0\n", "row 3, column d_m: 'x' is not a finite number"),
-    "nan": (f"{HEADER}\nnan,0,0,0\n", "row 2, column theta0_rad: 'nan' is not a finite"),
-    "infinite": (f"{HEADER}\n0,0,inf,0\n", "row 2, column a_m: 'inf' is not a finite"),
-    "blank": (f"{HEADER}\n" + f"{ROW}\n" * 4 + "0,,0,0\n", "row 6, column d_m: blank"),
-    "decimal comma": (f"{HEADER}\n0,0,5,0,0\n", "row 2: 5 cells, the header has 4"),
+    "repeated": (HEADER + ",d_m\n", "column 'd_m' appears 2 times"),
+    "missing": (
+        "theta0_rad,d_m,alpha_rad\n",
+        "d_m without a_m; the table needs all columns of the lengths$",
+    ),
+    "no angles": ("d_m,a_m\n", "theta0_rad,alpha_rad are missing, which a DH table needs"),
+    "text": (f"{HEADER}\n{ROW}\n0,x,0,0\n", "line 3, column d_m: 'x' is not a number"),
+    "nan": (f"{HEADER}\nnan,0,0,0\n", "line 2, column theta0_rad: 'nan' is not a finite"),
+    "infinite": (f"{HEADER}\n0,0,inf,0\n", "line 2, column a_m: 'inf' is not a finite"),
+    "blank": (f"{HEADER}\n" + f"{ROW}\n" * 4 + "0,,0,0\n", "line 6, column d_m: empty cell"),
+    "decimal comma": (f"{HEADER}\n0,0,5,0,0\n", "line 2 has 5 fields, header has 4"),
     "too few": (f"{HEADER}\n" + f"{ROW}\n" * 3, "3 rows below the header.*4 to 9"),
     "too many": (f"{HEADER}\n" + f"{ROW}\n" * 10, "10 rows below the header.*4 to 9"),
     "degrees": (f"{HEADER}\n" + "0,0,0,90\n" * 4, "90 rad is more than two turns.*alpha_deg"),
     "millimetres": (f"{HEADER}\n" + "0,750,0,0\n" * 4, "750 m is too long for a link.*d_mm"),
     "joint type": (
         f"{HEADER},type\n" + f"{ROW},revolut\n" * 4,
-        r"row 2, column type: unknown joint type 'revolut' \(did you mean 'revolute'",
+        r"line 2, column type: unknown joint type 'revolut' \(did you mean 'revolute'",
     ),
     "limits crossed": (
         f"{HEADER},lower_deg,upper_deg\n" + f"{ROW},10,-10\n" * 4,
-        "row 2, columns lower_deg and upper_deg: lower is not below upper",
+        "line 2, columns lower_deg and upper_deg: lower is not below upper",
     ),
     "limit in metres": (
         f"{HEADER},lower_m\n" + f"{ROW},1\n" * 4,
-        "row 2, column lower_m: the joint is revolute; leave this blank and give.*rad or deg",
+        "line 2, column lower_m: the joint is revolute; leave this blank and give.*rad or deg",
     ),
     "same name": (f"{HEADER},joint\n" + f"{ROW},A\n" * 4, "column joint: 'A' appears twice"),
 }
@@ -209,14 +221,17 @@ def test_wrong_tables_are_explained(tmp_path: Path, text: str, message: str) -> 
 MASSES = "link,mass_kg,com_x_m,com_y_m,com_z_m\n"
 ALL = "".join(f"{i},1,0,0,0\n" for i in range(1, 7))
 WRONG_MASSES = {
-    "unknown link": (MASSES + "link7,1,0,0,0\n", r"row 2, column link: unknown link 'link7'"),
+    "unknown link": (MASSES + "link7,1,0,0,0\n", r"line 2, column link: unknown link 'link7'"),
     "misspelt link": (MASSES + "lnk3,1,0,0,0\n", r"unknown link 'lnk3' \(did you mean 'link3'"),
-    "twice": (MASSES + ALL + "link2,1,0,0,0\n", "row 8, column link: 'link2' appears twice"),
+    "twice": (MASSES + ALL + "link2,1,0,0,0\n", "line 8, column link: 'link2' appears twice"),
     "missing": (MASSES + ALL[: -2 * len("6,1,0,0,0\n")], "no row for link5, link6"),
-    "negative": (MASSES + "1,-2,0,0,0\n", "row 2, column mass_kg: -2 is negative"),
-    "no unit": ("link,mass,com_x_m,com_y_m,com_z_m\n", "'mass' has no unit; call it mass_kg"),
-    "no link column": ("mass_kg,com_x_m,com_y_m,com_z_m\n1,0,0,0\n", "column link: unknown"),
-    "blank": (MASSES + "1,1,,0,0\n", "row 2, column com_x_m: blank"),
+    "negative": (MASSES + "1,-2,0,0,0\n", "line 2, column mass_kg: -2 is negative"),
+    "no unit": ("link,mass,com_x_m,com_y_m,com_z_m\n", "'mass' has no unit; write mass_kg"),
+    "no link column": (
+        "mass_kg,com_x_m,com_y_m,com_z_m\n1,0,0,0\n",
+        "the columns link are missing, which a table of link masses",
+    ),
+    "blank": (MASSES + "1,1,,0,0\n", "line 2, column com_x_m: empty cell"),
 }
 
 
@@ -236,7 +251,7 @@ def test_unreadable_files_and_convention(tmp_path: Path) -> None:
         read_dh(tmp_path)
     binary = tmp_path / "binary.csv"
     binary.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(InputError, match="not a text file"):
+    with pytest.raises(InputError, match="is UTF-16; save the table as CSV"):
         read_dh(binary)
     with pytest.raises(InputError, match=r"did you mean 'modified'\?"):
         read_dh(tmp_path / "dh.csv", convention="modifed")  # type: ignore[arg-type]

@@ -101,7 +101,7 @@ def test_pruning_leaves_files_of_others_alone(
 
 def test_abandoned_parts_are_removed(folder: Path) -> None:
     folder.mkdir()
-    old, new = folder / ".old.part", folder / ".new.part"
+    old, new = folder / f".{KEY}.old.tmp", folder / f".{KEY}.new.tmp"
     for path in (old, new):
         path.write_bytes(b"half")
     os.utime(old, (0, 0))

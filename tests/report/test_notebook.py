@@ -12,8 +12,7 @@ from support.cells import MARKERS, kr270_chain, random_table
 from support.diagnoses import VERDICTS
 
 from elastocal.errors import InputError
-from elastocal.measurement_reader import read_measurements
-from elastocal.measurement_writer import write_measurements
+from elastocal.measurements import read_measurements, write_measurements
 from elastocal.report.notebook import view_of
 
 VOID = {"br", "hr", "img"}

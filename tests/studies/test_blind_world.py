@@ -35,8 +35,7 @@ from world_files import write_table, write_world
 from elastocal.cell import EffectChoice
 from elastocal.cell_reader import read_cell
 from elastocal.manipulator.model import Model
-from elastocal.measurement_reader import read_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_measurements
 
 WORLD_MODULES = {
     "arm_data", "chance", "draw", "inside", "instrument", "mechanics", "mjcf", "outside", "places",

@@ -21,7 +21,7 @@ from elastocal.cell_reader import read_cell
 from elastocal.demo import LOAD_N, published_compliances
 from elastocal.identification.identify import Options, identify
 from elastocal.manipulator.model import Model
-from elastocal.measurement_reader import read_plan
+from elastocal.measurements import read_plan
 from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
 study = study_of(FOLDER)

@@ -21,7 +21,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import require
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from elastocal.cell import Array

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from elastocal.errors import InputError, InsufficientDataError
+from elastocal.tables import csv_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -140,13 +139,11 @@ def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[di
         heads += ["drx_deg", "dry_deg", "drz_deg"]
         columns.append(np.degrees(found.correction[:, 3:]))
     order = np.lexsort(found.points.T[::-1])
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*heads, "status"])
+    rows = []
     values = np.hstack(columns)
     for i in order:
         cells = [f"{v + 0.0:.7f}" if np.isfinite(v) else "" for v in values[i]]
-        writer.writerow([*(f"{v + 0.0:.9g}" for v in points[i]), *cells, found.status[i]])
+        rows.append([*(f"{v + 0.0:.9g}" for v in points[i]), *cells, found.status[i]])
     content: dict[str, Any] = {
         "points": len(found.status),
         "exact": found.status.count(EXACT),
@@ -159,7 +156,7 @@ def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[di
     if found.oriented:
         content["rotation_without_urad"] = spread(found.before[:, 1])
         content["rotation_with_urad"] = spread(found.between[:, 1])
-    return content, text.getvalue()
+    return content, csv_text([*heads, "status"], rows)
 
 
 def print_summaries(screen: Console, content: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from elastocal.cli.app import Json, Seed, app, console, progress_line, reporting_errors
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 
 @app.command(short_help="See a KR 270 simulated and calibrated (Klimchik et al. 2013).")

@@ -192,6 +192,7 @@ def _read(path: Path, asked: dict[str, Any]) -> Cell:
     from elastocal.manipulator.effects import CATALOGUE
     from elastocal.nearest import did_you_mean, listed, quoted
     from elastocal.planning.criteria import CRITERIA
+    from elastocal.text import did_you_mean, listed, quoted
 
     cell = read_cell(path, known_effects=tuple(CATALOGUE))
     name = asked["criterion"]
@@ -213,7 +214,7 @@ def _options(
 ) -> DesignOptions:  # fmt: skip
     from elastocal.design.options import DesignOptions
     from elastocal.manipulator.choice import load_chain
-    from elastocal.measurement_reader import read_measurements
+    from elastocal.measurements import read_measurements
 
     done = None
     if augment is not None:

@@ -22,7 +22,7 @@ from elastocal.cli.diagnosis_files import Outputs, write_diagnosis
 from elastocal.cli.identify import load_inputs
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import require
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from elastocal.files import atomic_write_text
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.result import Diagnosis

@@ -20,7 +20,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from elastocal.identification.knowledge import Knowledge
@@ -161,7 +161,7 @@ def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurem
     from elastocal.manipulator.choice import load_chain
     from elastocal.manipulator.effects import CATALOGUE
     from elastocal.manipulator.model import Model
-    from elastocal.measurement_reader import read_measurements
+    from elastocal.measurements import read_measurements
 
     cell = read_cell(cell_path, known_effects=tuple(CATALOGUE))
     chain = load_chain(cell)

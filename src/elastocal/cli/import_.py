@@ -10,7 +10,7 @@ import typer
 from elastocal.cli.app import Json, app, check_outputs, console, reporting_errors
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError, require
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from elastocal.importing.import_files import Imported

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from elastocal.importing.import_files import Imported
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 
 def left_out(found: Imported) -> list[str]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shlex
 import sys
 from pathlib import Path
@@ -11,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from elastocal.files import atomic_write_text
 from elastocal.identification.result import IdentificationResult
-from elastocal.json_text import json_text
+from elastocal.tables import csv_text
+from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from elastocal.report.html import Published
@@ -36,11 +35,8 @@ def write_results(
         atomic_write_text(output, json_text(result.to_json()) + "\n")
     if residuals is not None:
         rows = result.residual_table()
-        text = io.StringIO()
-        writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        atomic_write_text(residuals, text.getvalue())
+        header = list(rows[0])
+        atomic_write_text(residuals, csv_text(header, ([row[h] for h in header] for row in rows)))
     if report is not None:
         from elastocal.report.html import write_report
 

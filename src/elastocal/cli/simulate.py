@@ -18,7 +18,7 @@ from elastocal.cli.app import (
 )
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import InputError, require
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 
 @app.command(short_help="What would I measure, if …?")
@@ -63,8 +63,7 @@ def simulate(
     from elastocal.identification.checks import check_limits
     from elastocal.manipulator.effects import CATALOGUE
     from elastocal.manipulator.model import Model
-    from elastocal.measurement_reader import read_plan
-    from elastocal.measurement_writer import write_measurements
+    from elastocal.measurements import read_plan, write_measurements
     from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
     from elastocal.simulation.simulate import simulate as run
 

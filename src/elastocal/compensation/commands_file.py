@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +9,9 @@ import numpy as np
 
 from elastocal.compensation.compensate import REACHED, Compensation
 from elastocal.manipulator.chain import Array
-from elastocal.measurement_columns import column, families
+from elastocal.measurements import families
+from elastocal.tables import column, csv_text
+from elastocal.text import plain
 
 SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.
@@ -62,14 +62,13 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
         heads = ["error_rotation_before_urad", "error_rotation_after_urad"]
         blocks.append((heads, result.turn * 1e6, ".4g"))
     blocks.append((["std_um"], result.uncertainty.std[:, None] * 1e6, ".4g"))
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["configuration", *(h for heads, _, _ in blocks for h in heads), "status"])
+    header = ["configuration", *(h for heads, _, _ in blocks for h in heads), "status"]
+    rows = []
     for i in range(len(table)):
         cells = [_cell(v, form) for _, values, form in blocks for v in values[i]]
         label = table.configuration_labels[table.configuration[i]]
-        writer.writerow([label, *cells, result.status[i]])
-    return text.getvalue()
+        rows.append([label, *cells, result.status[i]])
+    return csv_text(header, rows)
 
 
 def _cell(value: float, form: str) -> str:
@@ -95,7 +94,7 @@ def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[
         ),
         "not_reached": [
             {"line": int(result.targets.table.row[i]), "status": result.status[i],
-             "nearest_um": _number(result.after[i] * 1e6)}
+             "nearest_um": plain(result.after[i] * 1e6)}
             for i in np.flatnonzero(~good)
         ],
         "undetermined": list(result.uncertainty.blamed),
@@ -127,7 +126,3 @@ def spread(values: Array) -> dict[str, float | None]:
         "p95": float(np.quantile(known, 0.95)),
         "max": float(known.max()),
     }
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

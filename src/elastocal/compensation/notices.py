@@ -9,7 +9,7 @@ from elastocal.cell import Cell
 from elastocal.compensation.targets import Targets
 from elastocal.compensation.uncertainty import Uncertainty
 from elastocal.manipulator.chain import Array, Chain
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 AT_LIMIT = 1e-9  # rad or m
 FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool

@@ -8,7 +8,7 @@ import numpy as np
 
 from elastocal.cell import Array, Cell
 from elastocal.errors import InputError
-from elastocal.nearest import did_you_mean, listed
+from elastocal.text import did_you_mean, listed
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from elastocal.compensation.point import numbers
 from elastocal.errors import InputError, require
 from elastocal.manipulator.chain import Array
-from elastocal.measurement_reader import read_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_measurements
 
 Frame = Literal["base", "tracker"]
 FRAMES: tuple[Frame, ...] = ("base", "tracker")

@@ -47,8 +47,7 @@ def run_demo(
     from elastocal.cell_reader import read_cell
     from elastocal.identification.identify import identify
     from elastocal.manipulator.model import Model
-    from elastocal.measurement_reader import read_plan
-    from elastocal.measurement_writer import write_measurements
+    from elastocal.measurements import read_plan, write_measurements
     from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
     progress("copying the example")

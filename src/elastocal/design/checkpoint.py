@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
-import secrets
 import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
@@ -18,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal import __version__
+from elastocal.files import atomic_write_bytes
 
 State = Mapping[str, NDArray]
 
@@ -59,9 +58,7 @@ class Stage:
         text = io.BytesIO()
         np.savez(text, allow_pickle=False, **{k: np.asarray(v) for k, v in state.items()})
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}")
-        temporary.write_bytes(text.getvalue())
-        os.replace(temporary, self.path)
+        atomic_write_bytes(self.path, text.getvalue())
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.exact_plan import size_curve
 from elastocal.planning.exchange import values_without
 from elastocal.planning.polish import Searches
+from elastocal.text import did_you_mean, listed, quoted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

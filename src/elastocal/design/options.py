@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from elastocal.errors import require
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.measurements import Measurements
-from elastocal.nearest import did_you_mean, listed
+from elastocal.text import did_you_mean, listed
 
 Effort = Literal["quick", "normal", "thorough"]
 

@@ -15,7 +15,7 @@ from elastocal.identification.selection import WORTH_A_COLUMN
 from elastocal.manipulator.limits import joint_index
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,10 @@ from numpy.typing import NDArray
 
 from elastocal.design.order.execution import Execution, Stop
 from elastocal.errors import InputError, require
-from elastocal.files import atomic_write_text, atomic_writer
-from elastocal.json_text import json_text
-from elastocal.labels import is_label
-from elastocal.measurement_columns import column, families
-from elastocal.nearest import quoted
+from elastocal.files import atomic_write_text
+from elastocal.measurements import families
+from elastocal.tables import column, csv_text
+from elastocal.text import is_label, json_text, quoted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -84,7 +82,7 @@ def plan_rows(
 def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> None:
     """Write plan.csv, whole or not at all; angles in degrees, travel in mm.
 
-    `measurement_reader.read_plan` reads it back to 1e-11 rad.  Raises InputError for values that
+    `measurements.read_plan` reads it back to 1e-11 rad.  Raises InputError for values that
     are not finite, names that cannot stand in a table or repeat, and an unwritable place.
     """
     columns = _columns(rows, joint_kinds)
@@ -99,10 +97,7 @@ def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> 
     for values in (rows.q, rows.force):
         if values is not None and not np.isfinite(values).all():
             raise InputError(f"{path}: the plan's joint values and forces must be finite")
-    with atomic_writer(path) as handle:
-        writer = csv.writer(handle, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(zip(*columns.values(), strict=True))
+    atomic_write_text(path, csv_text(columns, zip(*columns.values(), strict=True)))
 
 
 def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[str]]:

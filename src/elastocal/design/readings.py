@@ -13,7 +13,7 @@ from elastocal.identification.noise import stated_covariance
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import Observations
 from elastocal.measurements import Measurements
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 from elastocal.tracker_noise import available_noise
 
 Array = NDArray[np.float64]

@@ -34,6 +34,7 @@ from elastocal.nearest import listed
 from elastocal.planning.criteria import criterion_named, make_criterion
 from elastocal.planning.criterion import Criterion
 from elastocal.simulation.simulate import draw_errors, values_from
+from elastocal.text import listed
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

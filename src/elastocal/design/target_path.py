@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from elastocal.csv_source import read_csv
 from elastocal.errors import InputError, require
-from elastocal.measurement_columns import families
-from elastocal.measurement_header import NUMBERED, Column, Layout, layout_of
-from elastocal.measurement_reader import rotation_column, si_columns
-from elastocal.nearest import listed, quoted
-from elastocal.parquet_source import read_parquet
-from elastocal.raw_table import RawTable
+from elastocal.measurements import NUMBERED, families, layout_of, rotation_column
+from elastocal.tables import NO_UNIT, Array, Family, Layout, RawTable, read_table
+from elastocal.text import listed, quoted
 
-Array = NDArray[np.float64]
-
-WEIGHT = "weight"
 TAKEN = ("q", "position", "rotation", "quaternion", "force")
+WEIGHT = Family("weight", "weights", {"weight": NO_UNIT})
 MOST_POSES = 10_000
 
 
@@ -54,34 +47,41 @@ def read_path(path: Path, joint_kinds: Sequence[str]) -> PathTable:
     def choose(header: Sequence[str]) -> Layout:
         return _layout(str(path), header, joint_kinds)
 
-    raw = (read_parquet if path.suffix.lower() in (".parquet", ".pq") else read_csv)(path, choose)
+    raw = read_table(path, choose)
     require(
         len(raw.row) <= MOST_POSES,
         f"{raw.source}: {len(raw.row)} poses; a path takes at most {MOST_POSES}; thin it out: "
         "neighbouring poses say the same",
     )
-    weight = si_columns(raw, WEIGHT)
-    if weight is not None and not (weight > 0).all():
-        i = int(np.argmin(weight[:, 0] > 0))
-        raise InputError(
-            f"{raw.where(i, WEIGHT)}: a weight must be positive; found {weight[i, 0]:.6g}; correct "
-            f"it or drop the {raw.noun}"
-        )
+    weight = raw.si(WEIGHT.name)
+    if weight is not None:
+        raw.check(WEIGHT.name, weight > 0, "a weight must be positive")
     return PathTable(
         raw=raw,
-        q=si_columns(raw, "q"),
-        position=si_columns(raw, "position"),
+        q=raw.si("q"),
+        position=raw.si("position"),
         rotation=rotation_column(raw),
-        force=si_columns(raw, "force"),
+        force=raw.si("force"),
         weight=np.ones(len(raw.row)) if weight is None else weight[:, 0],
     )
 
 
 def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> Layout:
-    known = [text for text in header if text != WEIGHT]
-    require(len(header) - len(known) < 2, f"{source}: column '{WEIGHT}' appears twice; keep one")
-    in_joints = any((m := NUMBERED.fullmatch(text)) and m[1] == "q" for text in known)
-    columns = _columns(source, known, joint_kinds if in_joints else ())
+    in_joints = any((m := NUMBERED.fullmatch(text)) and m[1] == "q" for text in header)
+    kinds = joint_kinds if in_joints else ()
+    layout = layout_of(source, header, kinds, "plan", extra=(WEIGHT,))
+    columns = {n: cs for n, cs in layout.columns.items() if n in (*TAKEN, WEIGHT.name)}
+    for name, family in layout.columns.items():
+        if name not in columns and name != "configuration":
+            raise InputError(
+                f"{source}: column {quoted(family[0].header)} has no meaning in a path; drop it, "
+                "or start its name with '#', '_' or 'note' to have it ignored"
+            )
+    if in_joints and ("rotation" in columns or "quaternion" in columns):
+        other = columns["rotation" if "rotation" in columns else "quaternion"][0].header
+        raise InputError(
+            f"{source}: {columns['q'][0].header} … says the rotation too; drop {other} …"
+        )
     if in_joints and "position" in columns:
         raise InputError(
             f"{source}: {columns['q'][0].header} … and {columns['position'][0].header} … say the "
@@ -93,27 +93,5 @@ def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> L
             f"{source}: the columns {joints}_deg … or x_mm,y_mm,z_mm are missing; a path needs "
             f"the joints or the positions of its poses; found {listed(header, 12)}"
         )
-    if len(known) < len(header):
-        columns |= {WEIGHT: (Column(WEIGHT, ""),)}
     numbers = tuple(column.header for family in columns.values() for column in family)
     return Layout(columns, (), numbers)
-
-
-def _columns(
-    source: str, header: Sequence[str], joint_kinds: Sequence[str]
-) -> dict[str, tuple[Column, ...]]:
-    """The families of columns in a header, all of which a path takes."""
-    columns: Mapping[str, tuple[Column, ...]]
-    columns = layout_of(source, header, joint_kinds, "plan").columns
-    for name, family in columns.items():
-        if name not in TAKEN and name != "configuration":
-            raise InputError(
-                f"{source}: column {quoted(family[0].header)} has no meaning in a path; drop it, "
-                "or start its name with '#', '_' or 'note' to have it ignored"
-            )
-    if "q" in columns and ("rotation" in columns or "quaternion" in columns):
-        other = columns["rotation" if "rotation" in columns else "quaternion"][0].header
-        raise InputError(
-            f"{source}: {columns['q'][0].header} … says the rotation too; drop {other} …"
-        )
-    return {name: family for name, family in columns.items() if name in TAKEN}

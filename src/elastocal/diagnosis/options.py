@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from elastocal.errors import InputError, require
 from elastocal.manipulator.effects import CATALOGUE
-from elastocal.nearest import did_you_mean, listed
+from elastocal.text import did_you_mean, listed
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from typing import Any
 
 from elastocal.diagnosis.result import (
@@ -19,6 +17,7 @@ from elastocal.diagnosis.result import (
 )
 from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.manipulator.model import Model
+from elastocal.text import plain
 
 SCHEMA = "elastocal/diagnosis/1"
 MICRO = 1e6
@@ -64,7 +63,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "n_readings": d.n_readings,
         "n_configurations": d.n_configurations,
     }
-    return {key: _known(value) for key, value in content.items()}
+    return {key: plain(value) for key, value in content.items()}
 
 
 def _step(step: Step) -> dict[str, Any]:
@@ -167,14 +166,3 @@ def _extra(extra: ExtraPlan) -> dict[str, Any]:
         "probability_random": extra.probability_random,
         "advice": list(extra.advice),
     }
-
-
-def _known(value: Any) -> Any:
-    """The same with null for numbers that are not finite."""
-    if isinstance(value, Mapping):
-        return {key: _known(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_known(v) for v in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value

@@ -23,9 +23,9 @@ from elastocal.cell import Robot
 from elastocal.export.dh_rows import Row, split
 from elastocal.export.pieces import Pieces
 from elastocal.manipulator.chain import Array, Chain, Joint
-from elastocal.manipulator.dh import DH_COLUMNS, FIXED
+from elastocal.manipulator.dh import FIXED, dh_number, read_dh_table
 from elastocal.manipulator.effects.off_axis_compliance import transverse_axes
-from elastocal.manipulator.number_table import read_table
+from elastocal.tables import csv_text
 
 Convention = Literal["standard", "modified"]
 CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}
@@ -85,15 +85,15 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     kinds = {line.joint.kind for line in lines if line.joint is not None and _limits(line.joint)}
     limits = [name for kind, names in LIMITS.items() if kind in kinds for name in names]
     header = [*(HEADER if with_beta else HEADER[:-1]), *limits]
-    text = [*(f"# {comment}" for comment in comments), ",".join(header)]
+    rows = []
     for line in lines:
         numbers = dict(zip(HEADER[2:], astuple(line.row), strict=True))
         if line.joint is not None:
             numbers |= _limits(line.joint)
         kind = FIXED if line.joint is None else line.joint.kind
         cells = [repr(numbers[name] + 0.0) if name in numbers else "" for name in header[2:]]
-        text.append(",".join([_cell(line.name), kind, *cells]))
-    return "\n".join(text) + "\n"
+        rows.append([line.name, kind, *cells])
+    return csv_text(header, rows, comments)
 
 
 def without_beta(lines: Sequence[Line]) -> list[Line]:
@@ -148,11 +148,19 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Ro
     nothing: list[Row | None] = [None] * (chain.n_joints + 1)
     if robot.dh is None or robot.dh_convention != convention:
         return nothing
-    table = read_table(robot.dh, DH_COLUMNS, ("joint", "type"))
-    if any(row.texts["type"] == FIXED for row in table.rows):
+    table = read_dh_table(robot.dh)
+    n = len(table.row)
+    if any(table.text(i, "type") == FIXED for i in range(n)):
         return nothing
-    keys = ("theta0", "d", "a", "alpha", "beta")
-    own = [Row(*(row.numbers.get(key) or 0.0 for key in keys)) for row in table.rows]
+    keys = (
+        ("angle", "theta0"),
+        ("length", "d"),
+        ("length", "a"),
+        ("angle", "alpha"),
+        ("angle", "beta"),
+    )
+    numbers = np.nan_to_num([[dh_number(table, i, *key) for key in keys] for i in range(n)])
+    own = [Row(*row) for row in numbers.tolist()]
     if convention == "standard":
         return [Row(), *own]
     after = [*own[1:], Row()]
@@ -164,7 +172,3 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Ro
 def _limits(joint: Joint) -> dict[str, float]:
     ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
     return {name: value for name, value in ends if math.isfinite(value)}
-
-
-def _cell(text: str) -> str:
-    return f'"{text.replace(chr(34), chr(34) * 2)}"' if set(text) & set(',"\n\r') else text

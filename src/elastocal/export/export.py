@@ -24,9 +24,9 @@ from elastocal.export.pieces import Pieces, evaluate_pieces
 from elastocal.export.urdf import Frames, calibrated_urdf
 from elastocal.export.urdf_new import BASE, FLANGE, new_urdf
 from elastocal.export.yaml_text import to_yaml
-from elastocal.json_text import json_text
 from elastocal.manipulator.calibrated import Calibrated
 from elastocal.manipulator.chain import Array, Chain
+from elastocal.text import json_text
 
 SCHEMA = "elastocal/export/1"
 POSES_AT_REST = 20

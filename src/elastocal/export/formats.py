@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from elastocal.errors import InputError
-from elastocal.nearest import did_you_mean
+from elastocal.text import did_you_mean
 
 ENDINGS = {
     ".urdf": "urdf",

@@ -13,7 +13,7 @@ from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import Observations
 from elastocal.measurements import Measurements
-from elastocal.nearest import did_you_mean
+from elastocal.text import did_you_mean
 
 Array = NDArray[np.float64]
 

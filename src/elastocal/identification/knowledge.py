@@ -21,7 +21,7 @@ from elastocal.identification.constrained.physical import physical_constraints
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.identification.knowledge_schema import KnowledgeTable, complaint
 from elastocal.manipulator.model import Model
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 
 MAX_BYTES = 5_000_000
 

@@ -19,7 +19,7 @@ from elastocal.identification.constrained.constraints import (
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.identification.selection import WORTH_A_COLUMN
 from elastocal.identification.solve import Solution
-from elastocal.nearest import listed, quoted
+from elastocal.text import listed, quoted
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

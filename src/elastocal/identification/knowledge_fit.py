@@ -24,7 +24,7 @@ from elastocal.identification.reduction import Reduction
 from elastocal.identification.robust.scale import median_scale
 from elastocal.identification.solve import Progress, Solution, residual_sigma
 from elastocal.identification.triangle import Triangle
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 Array = NDArray[np.float64]
 

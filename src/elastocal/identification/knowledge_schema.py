@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from elastocal.errors import InputError
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 Name = Annotated[str, Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]

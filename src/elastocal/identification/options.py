@@ -15,7 +15,7 @@ from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.intervals import IntervalKind
 from elastocal.identification.noise import WeightKind
 from elastocal.identification.variance.choose import KINDS as NOISES
-from elastocal.nearest import did_you_mean
+from elastocal.text import did_you_mean
 
 Method = Literal[
     "auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "tukey", "l1", "student-t"

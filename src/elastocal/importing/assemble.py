@@ -1,23 +1,63 @@
-"""Points and their joint values → the rows of the measurement table."""
+"""Points and their joint values → the checked measurement table."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.cell import Cell
 from elastocal.errors import InputError
-from elastocal.importing.join import Joined
-from elastocal.importing.loads import forces_of
-from elastocal.importing.pool import DEFAULT, Array, Pool
-from elastocal.importing.schema import JoinTable, MappingTable
-from elastocal.importing.standstill import groups_alike
-from elastocal.importing.units import convert, quantities
-from elastocal.measurement_columns import Family, column, families
-from elastocal.nearest import listed, quoted
+from elastocal.importing.joining import DEFAULT, Array, Joined, PooledRecords, groups_alike
+from elastocal.importing.schema import JoinTable, LoadTable, MappingTable
+from elastocal.measurements import Measurements, families, read_measurements
+from elastocal.tables import Family, column, csv_text
+from elastocal.text import did_you_mean, listed, quoted
+from elastocal.units import convert, quantities
+
+GRAVITY = 9.80665  # m/s², standard
+UNLOADED = ("none", "unloaded", "0")
+
+
+def forces_of(
+    where: str, points: PooledRecords, loads: Mapping[str, Sequence[float] | LoadTable] | None
+) -> NDArray[np.float64] | None:
+    """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
+
+    A mass m hangs straight down: force (0, 0, -9.80665 m).  The names none, unloaded and 0 mean no
+    force unless [loads] says otherwise.  Raises InputError for a load that [loads] does not have,
+    and where loads are told both by name and in columns.
+    """
+    named = points.labels.get("load")
+    if named is None:
+        if loads and "force_x" not in points.numbers:
+            raise InputError(
+                f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
+                "to; give load in [[source]], or a group (?P<load>…) in a pattern"
+            )
+        return None
+    if "force_x" in points.numbers:
+        raise InputError(
+            f"{points.files[0]}: the load is told by name and in columns force_x …; keep one"
+        )
+    known = {name: np.zeros(3) for name in UNLOADED}
+    for name, stated in (loads or {}).items():
+        down = stated.mass_kg * GRAVITY if isinstance(stated, LoadTable) else 0.0
+        known[name] = np.array(
+            [0.0, 0.0, -down] if isinstance(stated, LoadTable) else list(stated), dtype=float
+        ) + 0.0  # no -0.0  # fmt: skip
+    for i, name in enumerate(named):
+        if name not in known:
+            raise InputError(
+                f"{points.where(i)}: load {quoted(name)} is not in [loads] of {where}"
+                f"{did_you_mean(name, known)}; there are {listed(known)}: add "
+                f"{name} = [0, 0, -1000] in N, or {name} = {{ mass_kg = 100 }}"
+            )
+    return np.array([known[name] for name in named])
+
 
 SAME_DEG, SAME_MM = 0.05, 0.05
 OWN_DEFAULT = {"sigma_cartesian": "um", "sigma_polar": "um"}
@@ -41,7 +81,7 @@ class Assembled:
         return len(self.origin)
 
 
-def assemble(where: str, points: Pool, log: Pool | None, joined: Joined | None,
+def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joined: Joined | None,
              mapping: MappingTable) -> Assembled:  # fmt: skip
     """One row per point that has joint values, in the points' order.
 
@@ -95,14 +135,14 @@ def assemble(where: str, points: Pool, log: Pool | None, joined: Joined | None,
     return Assembled(columns, kinds, origin, tuple(warnings))
 
 
-def _of_log(log: Pool | None, joined: Joined | None) -> Array | None:
+def _of_log(log: PooledRecords | None, joined: Joined | None) -> Array | None:
     if log is None or joined is None or log.time is None:
         return None
     return log.time[joined.row]
 
 
 def _numbers(
-    points: Pool, log: Pool | None, joined: Joined | None, rows: NDArray[np.int64]
+    points: PooledRecords, log: PooledRecords | None, joined: Joined | None, rows: NDArray[np.int64]
 ) -> tuple[dict[str, Array], dict[str, str]]:
     """Columns of the points, and of the joint log those that the points do not have."""
     numbers = {stem: values[rows] for stem, values in points.numbers.items()}
@@ -117,7 +157,7 @@ def _numbers(
 
 
 def _configurations(
-    points: Pool, joined: Joined | None, rows: NDArray[np.int64], q: Array, spread: Array
+    points: PooledRecords, joined: Joined | None, rows: NDArray[np.int64], q: Array, spread: Array
 ) -> tuple[list[str], list[str]]:
     stated = points.labels.get("configuration")
     if stated is None and joined is not None:
@@ -147,7 +187,9 @@ def _configurations(
     ]
 
 
-def _repeats(points: Pool, rows: NDArray[np.int64], keys: list[tuple]) -> NDArray[np.int64]:
+def _repeats(
+    points: PooledRecords, rows: NDArray[np.int64], keys: list[tuple]
+) -> NDArray[np.int64]:
     stated = points.labels.get("repeat")
     count: dict[tuple, int] = {}
     seen: dict[tuple, int] = {}
@@ -197,3 +239,46 @@ def _family(
             f"the {family.meaning}: add them to [source.columns]"
         )
     return columns
+
+
+def table_text(made: Assembled) -> str:
+    """The CSV of docs/file-formats.md; numbers with the digits that read back exactly."""
+    return csv_text(made.columns, zip(*map(_texts, made.columns.values()), strict=True))
+
+
+def _texts(values: Sequence[str] | NDArray) -> Sequence[object]:
+    return [repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
+
+
+def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measurements:
+    """The table as the reader of `identify` reads it.
+
+    With `cell`, joints, markers and columns must be those that it asks for.  Raises InputError
+    as the reader does, about the table `name`.
+    """
+    kinds = made.kinds
+    markers: tuple[str, ...] = ()
+    observe = "position" if any(c.startswith("x_") for c in made.columns) else "distance"
+    if cell is not None:
+        from elastocal.manipulator.choice import load_chain
+
+        kinds = load_chain(cell).kinds
+        markers = tuple(cell.tool.markers)
+        observe = cell.model.observe
+    try:
+        return read_measurements(
+            f"{name} (not written)",
+            joint_kinds=kinds,
+            marker_names=markers,
+            observe=observe,
+            text=text,
+        )
+    except InputError as error:
+        raise InputError(f"{error}{_meant(made, str(error))}") from None
+
+
+def _meant(made: Assembled, message: str) -> str:
+    """Where the line that a message names comes from."""
+    found = re.search(r"line (\d+)", message)
+    row = int(found[1]) - 2 if found else -1
+    return f" (from {made.origin[row]})" if 0 <= row < len(made) else ""

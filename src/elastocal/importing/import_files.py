@@ -9,27 +9,28 @@ from pathlib import Path
 
 from elastocal.cell import Cell
 from elastocal.errors import InputError
-from elastocal.importing.assemble import Assembled, assemble
-from elastocal.importing.join import Joined, join
-from elastocal.importing.joints import with_joints
+from elastocal.importing.assemble import Assembled, assemble, table_text, validated
+from elastocal.importing.joining import Joined, join, pooled, with_joints
 from elastocal.importing.mapping import Mapping
-from elastocal.importing.names import with_labels
-from elastocal.importing.plausible import plausibility
-from elastocal.importing.pool import pooled
-from elastocal.importing.records import Records, Understood, read_records
+from elastocal.importing.plausible import NominalFit, against_cell, plausibility
+from elastocal.importing.records import (
+    Records,
+    Understood,
+    is_spherical,
+    read_records,
+    with_labels,
+    with_positions,
+)
 from elastocal.importing.schema import SourceTable, UnitsTable
-from elastocal.importing.spherical import is_spherical, with_positions
-from elastocal.importing.table_file import table_text, validated
-from elastocal.importing.with_cell import Fit, against_cell
 from elastocal.measurements import Measurements
-from elastocal.nearest import listed, quoted
+from elastocal.text import listed, quoted
 
 
 @dataclass(frozen=True)
 class Imported:
     """What was read and made of it.
 
-    `table` is the measurement table as `measurement_reader.read_measurements` reads `text`;
+    `table` is the measurement table as `measurements.read_measurements` reads `text`;
     `refused` says why the robot of the cell cannot have measured it, "" where it can.
     """
 
@@ -39,7 +40,7 @@ class Imported:
     text: str
     table: Measurements
     warnings: tuple[str, ...]
-    fit: Fit | None
+    fit: NominalFit | None
     refused: str
 
 

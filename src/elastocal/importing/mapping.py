@@ -16,7 +16,7 @@ from elastocal.cell_keys import place
 from elastocal.errors import InputError
 from elastocal.files import read_text
 from elastocal.importing.schema import MappingTable, SourceTable
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 MAX_BYTES = 1_000_000
 PRESETS = ("spatialanalyzer", "polyworks", "leica", "faro", "spherical", "kuka", "abb", "ros")

@@ -1,26 +1,40 @@
-"""One file as the mapping reads it: numbers with units, texts, times, and what was passed over."""
+"""One file as the mapping reads it: numbers with units, texts, times, and what was left out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from elastocal.errors import InputError
-from elastocal.importing.clock import Clock
-from elastocal.importing.columns import Column, Wanted, lacking, no_header, resolve, wanted
-from elastocal.importing.numbers import NumberCells
-from elastocal.importing.patterns import unit_in_comments
-from elastocal.importing.robot_text import krl_rows, rapid_rows
-from elastocal.importing.schema import SourceTable, TextTable, UnitsTable
-from elastocal.importing.table_text import SAMPLE, Table, table_rows
-from elastocal.importing.text_file import Text, read_lines
-from elastocal.importing.units import convert
+from elastocal.importing.export_columns import (
+    FileColumn,
+    Wanted,
+    lacking,
+    no_header,
+    resolve,
+    wanted,
+)
+from elastocal.importing.foreign_text import (
+    SAMPLE,
+    Clock,
+    FoundTable,
+    NumberCells,
+    Text,
+    compiled,
+    krl_rows,
+    rapid_rows,
+    read_lines,
+    table_rows,
+    unit_in_comments,
+)
+from elastocal.importing.schema import NamesTable, SourceTable, TextTable, UnitsTable
+from elastocal.tables import Array, IntArray
+from elastocal.text import is_label, listed, quoted
+from elastocal.units import convert
 
-Array = NDArray[np.float64]
 MAX_ROWS = 2_000_000
 DECIMAL_SAMPLE = 2000
 
@@ -51,7 +65,7 @@ class Records:
     `labels` (configuration, marker, repeat, load) → n texts; `time` (n,) s on the file's clock."""
 
     source: str
-    line: NDArray[np.int64]
+    line: IntArray
     numbers: dict[str, Array]
     units: dict[str, str]
     texts: dict[str, list[str]]
@@ -124,11 +138,11 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     return reader.records(understood, source)
 
 
-def _table(text: Text, settings: TextTable, asked: Wanted) -> Table:
+def _table(text: Text, settings: TextTable, asked: Wanted) -> FoundTable:
     kind = settings.format or "table"
     if kind != "table":
         rows = (krl_rows if kind == "krl" else rapid_rows)(text)
-        return Table(rows, 0, kind, ())
+        return FoundTable(rows, 0, kind, ())
     guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
     places = [at for t, at in asked.required if not t.is_text and isinstance(at, int)]
 
@@ -144,7 +158,7 @@ def _table(text: Text, settings: TextTable, asked: Wanted) -> Table:
     return table
 
 
-def _layout(settings: TextTable, table: Table) -> str:
+def _layout(settings: TextTable, table: FoundTable) -> str:
     if (settings.format or "table") != "table":
         return {"krl": "KRL", "rapid": "RAPID"}[table.delimiter]
     head = f"header in line {table.header_line}" if table.header_line else "no header"
@@ -152,7 +166,7 @@ def _layout(settings: TextTable, table: Table) -> str:
     return f"columns split at {mark}, {head}"
 
 
-def _filled(column: Column) -> str:
+def _filled(column: FileColumn) -> str:
     stem, unit = column.target.stem, column.unit
     return f"{stem}_{unit}" if unit else stem
 
@@ -166,7 +180,7 @@ class _Reader:
     """Gathers the cells of one file row by row."""
 
     def __init__(
-        self, source: str, columns: Sequence[Column], cells: NumberCells, formats: Sequence[str]
+        self, source: str, columns: Sequence[FileColumn], cells: NumberCells, formats: Sequence[str]
     ) -> None:
         self.source, self.cells = source, cells
         self.clock = Clock(formats)
@@ -231,3 +245,185 @@ class _Reader:
             except ValueError:
                 raise self.clock.complaint(f"{self.source}, line {self.line[i]}", text) from None
         return seconds
+
+
+HEIGHT = ("zenith", "elevation")
+SPHERICAL = ("range", "azimuth", *HEIGHT)
+
+
+def is_spherical(records: Records) -> bool:
+    """Does the file give any spherical coordinate?"""
+    return any(stem in records.numbers for stem in SPHERICAL)
+
+
+def with_positions(records: Records, clockwise: bool = False) -> Records:
+    """The records with x, y, z in the unit of the range, where the file has spherical coordinates.
+
+    With range d, azimuth α and zenith angle ζ (π/2 − elevation), in a right-handed frame with z up
+    and x at azimuth zero:
+
+        x = d sin ζ cos α,   y = d sin ζ sin α,   z = d cos ζ
+
+    α counts counterclockwise seen from above; where `clockwise`, as theodolites count, y has the
+    other sign.  Readings in the second face, ζ beyond 180° with α turned by 180°, come out right.
+    Raises InputError where a coordinate is missing, given twice, or beyond what can be read.
+    """
+    if not is_spherical(records):
+        return records
+    height = _height(records)
+    numbers, units = dict(records.numbers), dict(records.units)
+    d = numbers.pop("range")
+    alpha = np.radians(convert(numbers.pop("azimuth"), units["azimuth"], "deg"))
+    angle = convert(numbers.pop(height), units[height], "deg")
+    _check_spherical(records, d, height, angle)
+    zeta = np.radians(angle if height == "zenith" else 90.0 - angle)
+    level = d * np.sin(zeta)
+    y = level * np.sin(alpha)
+    numbers |= {"x": level * np.cos(alpha), "y": -y if clockwise else y, "z": d * np.cos(zeta)}
+    unit = units["range"]
+    kept = {stem: u for stem, u in units.items() if stem not in SPHERICAL}
+    return replace(records, numbers=numbers, units=kept | dict.fromkeys("xyz", unit))
+
+
+def _height(records: Records) -> str:
+    """Which of zenith and elevation the file has, all else being there too."""
+    found = [stem for stem in SPHERICAL if stem in records.numbers]
+    both = [stem for stem in "xyz" if stem in records.numbers]
+    if both:
+        raise InputError(
+            f"{records.source}: positions are mapped twice, as {listed(both)} and as "
+            f"{listed(found)}; keep one of the two in [source.columns]"
+        )
+    heights = [stem for stem in HEIGHT if stem in found]
+    if len(heights) == 2:
+        raise InputError(
+            f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
+            "gives (a level line has zenith 90° and elevation 0°)"
+        )
+    missing = [stem for stem in ("range", "azimuth") if stem not in found]
+    missing += [] if heights else ["zenith or elevation"]
+    if missing:
+        raise InputError(
+            f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
+            "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]"
+        )
+    return heights[0]
+
+
+def _check_spherical(records: Records, d: Array, height: str, angle: Array) -> None:
+    """Refuse distances and angles that no tracker reads; `angle` (n,) in degrees."""
+    if not (d > 0).all():
+        i = int(np.argmin(d > 0))
+        raise InputError(
+            f"{records.where(i)}: a range of {d[i]:g} {records.units['range']}; a distance is "
+            "positive: correct the line, or the column of range in [source.columns]"
+        )
+    low, high, other = (0.0, 360.0, "elevation") if height == "zenith" else (-90.0, 90.0, "zenith")
+    off = (angle < low) | (angle > high)
+    if off.any():
+        i = int(np.argmax(off))
+        raise InputError(
+            f"{records.where(i)}: {height} of {angle[i]:.6g}°, which lies beyond {low:g}° to "
+            f"{high:g}°; is it an angle of another unit, or {other}_{records.units[height]}?"
+        )
+
+
+GROUPS = ("configuration", "marker", "repeat", "load")
+ADVICE = "write pattern in [source.names]"
+
+
+def with_labels(where: str, records: Records, names: NamesTable | None) -> Records:
+    """The records with `labels` from their columns, and from their names where a pattern is given.
+
+    A group that a column gives too is taken from the column.  A name that no pattern matches is
+    an error, or with unmatched = "ignore" passed over and listed.
+    Raises InputError for patterns that are no regular expressions or have none of the groups, and
+    for labels that no table can hold.
+    """
+    names = names or NamesTable()
+    labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
+    named = records.texts.get("name")
+    if names.pattern is not None and named is not None:
+        found, bad = _labels_of_names(where, records, names, named)
+        if bad:
+            keep = np.setdiff1d(np.arange(len(records)), bad)
+            reasons = tuple(
+                (int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad
+            )
+            records = _taken(records, keep, reasons)
+            labels = {stem: [texts[i] for i in keep] for stem, texts in labels.items()}
+            found = {stem: [texts[i] for i in keep] for stem, texts in found.items()}
+        labels = found | labels
+    if names.markers and "marker" in labels:
+        labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
+    if names.in_order and "marker" not in labels:
+        n = len(names.in_order)
+        labels["marker"] = [names.in_order[i % n] for i in range(len(records))]
+        if len(records) % n:
+            raise InputError(
+                f"{records.source}: {len(records)} points, which is no multiple of the {n} markers "
+                f"{listed(names.in_order)} of in_order; a point is missing or one too many: name "
+                "the points"
+            )
+    for stem, texts in labels.items():
+        for i, text in enumerate(texts):
+            if not is_label(text):
+                raise InputError(
+                    f"{records.where(i)}: {stem} {quoted(text)} cannot stand in a table; correct "
+                    f"the name, or {ADVICE}"
+                )
+    return replace(records, labels=labels)
+
+
+def _labels_of_names(
+    where: str, records: Records, names: NamesTable, named: list[str]
+) -> tuple[dict[str, list[str]], list[int]]:
+    patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
+    expressions = [compiled(where, "pattern", text) for text in patterns]
+    for expression in expressions:
+        if not set(expression.groupindex) & set(GROUPS):
+            raise InputError(
+                f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
+                f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so"
+            )
+    found: dict[str, list[str]] = {stem: [] for stem in GROUPS}
+    bad: list[int] = []
+    for i, name in enumerate(named):
+        match = next((m for e in expressions if (m := e.search(name))), None)
+        if match is None:
+            bad.append(i)
+        groups = match.groupdict() if match else {}
+        for stem in GROUPS:
+            found[stem].append((groups.get(stem) or "").strip())
+    if bad and (names.unmatched != "ignore" or len(bad) == len(named)):
+        raise InputError(
+            f"{records.where(bad[0])}: the name {quoted(named[bad[0]])} matches no pattern "
+            f"({listed(map(quoted, patterns), 3)}), as do not {len(bad) - 1} others; {ADVICE}, or "
+            'unmatched = "ignore" to leave such points out'
+        )
+    present = {stem: texts for stem, texts in found.items() if any(texts)}
+    for stem, texts in present.items():
+        empty = [i for i, text in enumerate(texts) if not text and i not in set(bad)]
+        if empty and stem in ("configuration", "marker"):
+            raise InputError(
+                f"{records.where(empty[0])}: the name {quoted(named[empty[0]])} says no {stem}, "
+                f"others do; {ADVICE} that finds it in every name"
+            )
+        if empty:
+            default = "0" if stem == "repeat" else "none"
+            present[stem] = [text or default for text in texts]
+    return present, bad
+
+
+def _taken(records: Records, keep: np.ndarray, reasons: tuple[tuple[int, str], ...]) -> Records:
+    """The rows `keep`; the others are listed as passed over."""
+    seen = records.understood
+    ignored = tuple(sorted([*seen.ignored, *reasons]))
+    return replace(
+        records,
+        line=records.line[keep],
+        numbers={stem: values[keep] for stem, values in records.numbers.items()},
+        texts={stem: [texts[i] for i in keep] for stem, texts in records.texts.items()},
+        time=None if records.time is None else records.time[keep],
+        understood=replace(seen, rows=len(keep), ignored=ignored),
+    )

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from elastocal.errors import InputError
-from elastocal.nearest import did_you_mean
+from elastocal.text import did_you_mean
 
 BACKENDS = ("auto", "numpy", "compiled")
 VARIABLE = "ELASTOCAL_BACKEND"

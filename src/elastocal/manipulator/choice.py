@@ -9,7 +9,7 @@ from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.effects.base import Effect
-from elastocal.nearest import did_you_mean, listed
+from elastocal.text import did_you_mean, listed
 
 
 def load_chain(cell: Cell) -> Chain:

@@ -33,8 +33,16 @@ from elastocal.manipulator.chain import (
     JointKind,
     LinkMass,
 )
-from elastocal.manipulator.number_table import Quantity, Row, Table, read_table
-from elastocal.nearest import did_you_mean, listed
+from elastocal.tables import (
+    NO_UNIT,
+    Family,
+    Layout,
+    RawTable,
+    layout_of_columns,
+    match_columns,
+    read_table,
+)
+from elastocal.text import did_you_mean, listed
 
 Convention = Literal["standard", "modified"]
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
@@ -43,22 +51,24 @@ FIXED = "fixed"
 # Beyond these a unit in the header is wrong: two turns, and longer than any arm's link.
 MAX_ANGLE, MAX_LENGTH = 4 * math.pi, 50.0
 
-DH_COLUMNS = (
-    Quantity("theta0", ANGLE, "angle"),
-    Quantity("d", LENGTH, "length"),
-    Quantity("a", LENGTH, "length"),
-    Quantity("alpha", ANGLE, "angle"),
-    Quantity("beta", ANGLE, "angle", required=False),
-    Quantity("lower", ANGLE, "angular limit", required=False),
-    Quantity("upper", ANGLE, "angular limit", required=False),
-    Quantity("lower travel", LENGTH, "limit of travel", required=False, shared_header="lower"),
-    Quantity("upper travel", LENGTH, "limit of travel", required=False, shared_header="upper"),
+# Multiplied, as these tables always were: 115.7 mm / 1000 is not the same float.
+SI = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3, "kg": 1.0}
+ENDS = ("lower", "upper")
+
+DH_FAMILIES = (
+    Family("joint", "joint names", {"joint": NO_UNIT}, is_label=True, optional=("joint",)),
+    Family("type", "joint types", {"type": NO_UNIT}, is_label=True, optional=("type",)),
+    Family(
+        "angle", "angles", dict.fromkeys(("theta0", "alpha", "beta"), ANGLE), optional=("beta",)
+    ),
+    Family("length", "lengths", dict.fromkeys(("d", "a"), LENGTH)),
+    Family("limit", "angular limits", dict.fromkeys(ENDS, ANGLE), optional=ENDS),
+    Family("travel", "limits of travel", dict.fromkeys(ENDS, LENGTH), optional=ENDS),
 )
-MASS_COLUMNS = (
-    Quantity("mass", ("kg",), "mass"),
-    Quantity("com_x", LENGTH, "centre of mass"),
-    Quantity("com_y", LENGTH, "centre of mass"),
-    Quantity("com_z", LENGTH, "centre of mass"),
+MASS_FAMILIES = (
+    Family("link", "links", {"link": NO_UNIT}, is_label=True),
+    Family("mass", "masses", {"mass": ("kg",)}),
+    Family("com", "centres of mass", dict.fromkeys(("com_x", "com_y", "com_z"), LENGTH)),
 )
 
 
@@ -84,22 +94,22 @@ def read_dh(
             f"dh_convention '{convention}'{did_you_mean(str(convention), ('standard', 'modified'))}"
             " is unknown; valid: standard, modified"
         )
-    table = read_table(path, DH_COLUMNS, ("joint", "type"))
-    moving = [row for row in table.rows if row.texts["type"] != FIXED]
+    table = read_dh_table(path)
+    moving = [i for i in range(len(table.row)) if table.text(i, "type") != FIXED]
     if not MIN_JOINTS <= len(moving) <= MAX_JOINTS:
         raise InputError(
             f"{path}: {len(moving)} rows below the header, one per joint; "
             f"{MIN_JOINTS} to {MAX_JOINTS} joints are supported"
         )
-    waiting = iter(_joint_names(path, moving))
+    waiting = iter(_joint_names(table, moving))
     joints, after, passed = [], [], np.eye(4)
-    for row in table.rows:
-        T_before, T_after = _link(row, table, convention)
-        if row.texts["type"] == FIXED:
+    for i in range(len(table.row)):
+        T_before, T_after = _link(table, i, convention)
+        if i not in moving:
             passed = passed @ T_before @ T_after
             continue
-        kind = _kind(row)
-        lower, upper = _limits(row, kind, table)
+        kind = _kind(table, i)
+        lower, upper = _limits(table, i, kind)
         joints.append(Joint(next(waiting), kind, passed @ T_before, np.array(Z), lower, upper))
         passed = T_after
         after.append(T_after)
@@ -108,16 +118,36 @@ def read_dh(
     return Chain(name or path.stem, tuple(joints), passed, masses)
 
 
-def _link(row: Row, table: Table, convention: str) -> tuple[Array, Array]:
+def read_dh_table(path: Path) -> RawTable:
+    """The cells of a DH table; lines that begin with # are comments."""
+    return _read(path, DH_FAMILIES, ("angle", "length"), "DH table")
+
+
+def dh_number(table: RawTable, i: int, family: str, stem: str) -> float:
+    """A number of row i in rad, m or kg; NaN where its cell is empty or there is no such column."""
+    column = table.column(family, stem)
+    return math.nan if column is None else float(table.numbers[column.header][i] * SI[column.unit])
+
+
+def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str) -> RawTable:
+    named = {family.name: family for family in known}
+
+    def choose(header: Sequence[str]) -> Layout:
+        present = match_columns(str(path), header, named)
+        return layout_of_columns(
+            str(path), present, named, [(n,) for n in needed], f"a {what} needs"
+        )
+
+    return read_table(path, choose, what=what, comments=True)
+
+
+def _link(table: RawTable, i: int, convention: str) -> tuple[Array, Array]:
     """T_{i-1,i}(q_i) = before · motion(q_i) · after: the two constant factors."""
-    theta0, d, a, alpha = (
-        _plausible(row, name, table.column_of[name]) for name in ("theta0", "d", "a", "alpha")
-    )
+    theta0, alpha, beta = (_plausible(table, i, "angle", k) for k in ("theta0", "alpha", "beta"))
+    d, a = (_plausible(table, i, "length", k) for k in ("d", "a"))
     Rz_theta, Tz_d = _rotation(Z, theta0), _translation(Z, d)
     Tx_a, Rx_alpha = _translation(X, a), _rotation(X, alpha)
-    Ry_beta = _rotation(Y, 0.0)
-    if row.numbers.get("beta") is not None:
-        Ry_beta = _rotation(Y, _plausible(row, "beta", table.column_of["beta"]))
+    Ry_beta = _rotation(Y, 0.0 if math.isnan(beta) else beta)
     if convention == "standard":
         return _numbers(Rz_theta), _numbers(Tz_d @ Tx_a @ Rx_alpha @ Ry_beta)
     return _numbers(Rx_alpha @ Tx_a @ Ry_beta @ Rz_theta @ Tz_d), np.eye(4)
@@ -135,70 +165,70 @@ def _numbers(T: ca.SX) -> Array:
     return np.array(ca.DM(T).full())
 
 
-def _plausible(row: Row, name: str, column: str) -> float:
-    value = row.require(name, column)
-    if column.endswith("_rad") and abs(value) > MAX_ANGLE:
+def _plausible(table: RawTable, i: int, family: str, stem: str) -> float:
+    value, column = dh_number(table, i, family, stem), table.column(family, stem)
+    if column is None:
+        return value
+    if column.unit == "rad" and abs(value) > MAX_ANGLE:
         raise InputError(
-            f"{row.where}, column {column}: {value:g} rad is more than two turns; "
-            f"if these are degrees, call the column {name}_deg"
+            f"{table.where(i, column.header)}: {value:g} rad is more than two turns; "
+            f"if these are degrees, call the column {stem}_deg"
         )
-    if column.endswith("_m") and abs(value) > MAX_LENGTH:
+    if column.unit == "m" and abs(value) > MAX_LENGTH:
         raise InputError(
-            f"{row.where}, column {column}: {value:g} m is too long for a link; "
-            f"if these are millimetres, call the column {name}_mm"
+            f"{table.where(i, column.header)}: {value:g} m is too long for a link; "
+            f"if these are millimetres, call the column {stem}_mm"
         )
     return value
 
 
-def _kind(row: Row) -> JointKind:
-    text = row.texts["type"] or "revolute"
+def _kind(table: RawTable, i: int) -> JointKind:
+    text = table.text(i, "type") or "revolute"
     if text == "revolute" or text == "prismatic":
         return "prismatic" if text == "prismatic" else "revolute"
     raise InputError(
-        f"{row.where}, column type: unknown joint type '{text}'"
+        f"{table.where(i, 'type')}: unknown joint type '{text}'"
         f"{did_you_mean(text, ('revolute', 'prismatic', FIXED))}; valid: revolute, prismatic, fixed"
     )
 
 
-def _limits(row: Row, kind: JointKind, table: Table) -> tuple[float, float]:
-    own, other = ("", " travel") if kind == "revolute" else (" travel", "")
-    for side in ("lower", "upper"):
-        if row.numbers.get(side + other) is not None:
+def _limits(table: RawTable, i: int, kind: JointKind) -> tuple[float, float]:
+    own, other = ("limit", "travel") if kind == "revolute" else ("travel", "limit")
+    for side in ENDS:
+        wrong = table.column(other, side)
+        if wrong is not None and not math.isnan(dh_number(table, i, other, side)):
             raise InputError(
-                f"{row.where}, column {table.column_of[side + other]}: the joint is {kind}; leave "
-                f"this blank and give its limits in {'rad or deg' if own == '' else 'm or mm'}"
+                f"{table.where(i, wrong.header)}: the joint is {kind}; leave this blank and give "
+                f"its limits in {'rad or deg' if own == 'limit' else 'm or mm'}"
             )
-    lower, upper = row.numbers.get("lower" + own), row.numbers.get("upper" + own)
-    lower = -np.inf if lower is None else lower
-    upper = np.inf if upper is None else upper
+    lower, upper = (dh_number(table, i, own, side) for side in ENDS)
     if lower >= upper:
-        raise InputError(
-            f"{row.where}, columns {table.column_of['lower' + own]} and "
-            f"{table.column_of['upper' + own]}: lower is not below upper; check the limits"
-        )
-    return lower, upper
+        where = table.where(i, *(column.header for column in table.layout.columns[own]))
+        raise InputError(f"{where}: lower is not below upper; check the limits")
+    return (-np.inf if math.isnan(lower) else lower, np.inf if math.isnan(upper) else upper)
 
 
-def _joint_names(path: Path, rows: Sequence[Row]) -> list[str]:
-    names = [row.texts["joint"] or f"joint{i}" for i, row in enumerate(rows, start=1)]
-    for row, name in zip(rows, names, strict=True):
+def _joint_names(table: RawTable, rows: Sequence[int]) -> list[str]:
+    names = [table.text(i, "joint") or f"joint{k}" for k, i in enumerate(rows, start=1)]
+    for i, name in zip(rows, names, strict=True):
         if names.count(name) > 1:
-            raise InputError(f"{row.where}, column joint: '{name}' appears twice; rename one")
+            raise InputError(f"{table.where(i, 'joint')}: '{name}' appears twice; rename one")
     return names
 
 
 def _masses(path: Path, names: Sequence[str], after: Sequence[Array]) -> tuple[LinkMass, ...]:
     """Masses by link, centres of mass taken from DH frame i to joint frame i."""
-    table = read_table(path, MASS_COLUMNS, ("link",))
+    table = _read(path, MASS_FAMILIES, ("link", "mass", "com"), "table of link masses")
     found: dict[int, LinkMass] = {}
-    for row in table.rows:
-        i = _link_index(row, names)
+    for k in range(len(table.row)):
+        i = _link_index(table, k, names)
         if i in found:
-            raise InputError(f"{row.where}, column link: '{row.texts['link']}' appears twice")
-        mass, x, y, z = (row.require(q.name, table.column_of[q.name]) for q in MASS_COLUMNS)
+            raise InputError(f"{table.where(k, 'link')}: '{table.text(k, 'link')}' appears twice")
+        mass = dh_number(table, k, "mass", "mass")
+        com = [dh_number(table, k, "com", f"com_{axis}") for axis in "xyz"]
         if mass < 0:
-            raise InputError(f"{row.where}, column mass_kg: {mass:g} is negative; give 0 or more")
-        found[i] = LinkMass(mass, (after[i] @ np.array([x, y, z, 1.0]))[:3])
+            raise InputError(f"{table.where(k, 'mass_kg')}: {mass:g} is negative; give 0 or more")
+        found[i] = LinkMass(mass, (after[i] @ np.array([*com, 1.0]))[:3])
     missing = [f"link{i + 1}" for i in range(len(names)) if i not in found]
     if missing:
         raise InputError(
@@ -207,8 +237,8 @@ def _masses(path: Path, names: Sequence[str], after: Sequence[Array]) -> tuple[L
     return tuple(found[i] for i in range(len(names)))
 
 
-def _link_index(row: Row, names: Sequence[str]) -> int:
-    text = row.texts["link"]
+def _link_index(table: RawTable, row: int, names: Sequence[str]) -> int:
+    text = table.text(row, "link")
     if text in names:
         return names.index(text)
     numbered = [f"link{i + 1}" for i in range(len(names))]
@@ -217,6 +247,6 @@ def _link_index(row: Row, names: Sequence[str]) -> int:
             return numbered.index(spelling)
     valid = (*numbered, *names)
     raise InputError(
-        f"{row.where}, column link: unknown link '{text}'{did_you_mean(text, valid)}; "
+        f"{table.where(row, 'link')}: unknown link '{text}'{did_you_mean(text, valid)}; "
         f"valid: {listed(numbered)} or the joints' names"
     )

@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-import secrets
+import re
 import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+
+from elastocal.errors import InputError
+from elastocal.files import UNFINISHED, atomic_write_bytes
 
 # Part of every key: raise it when the meaning of an entry changes.
 FORMAT = "1"
@@ -83,13 +86,9 @@ def store(key: str, suffix: str, data: bytes) -> Path | None:
     if folder is None:
         return None
     path = folder / f"{key}.{_digest(data)}{suffix}"
-    temporary = folder / f".{secrets.token_hex(8)}.part"
     try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except OSError:
-        with suppress(OSError):
-            temporary.unlink()
+        atomic_write_bytes(path, data)
+    except InputError:
         return None
     prune(folder, keep=path)
     return path
@@ -102,7 +101,7 @@ def prune(folder: Path, keep: Path, largest: int | None = None) -> None:
     for path in folder.iterdir():
         with suppress(OSError):
             facts = path.stat()
-            if path.suffix == ".part":
+            if path.suffix == UNFINISHED and _is_key(path.name[1:33]):
                 if time.time() - facts.st_mtime > ABANDONED:
                     path.unlink()
             elif _is_entry(path) and path != keep:
@@ -119,7 +118,11 @@ def prune(folder: Path, keep: Path, largest: int | None = None) -> None:
 def _is_entry(path: Path) -> bool:
     """Only what `store` wrote may be removed: ELASTOCAL_CACHE may name any folder."""
     parts = path.name.split(".")
-    return len(parts) >= 3 and len(parts[0]) == 32 and len(parts[1]) == 64
+    return len(parts) >= 3 and _is_key(parts[0]) and len(parts[1]) == 64
+
+
+def _is_key(text: str) -> bool:
+    return re.fullmatch("[0-9a-f]{32}", text) is not None
 
 
 def _digest(data: bytes) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from elastocal.errors import InputError
 from elastocal.manipulator.urdf_tree import MOVING, Link, Tree, UrdfJoint, Vector
-from elastocal.nearest import did_you_mean
+from elastocal.text import did_you_mean
 
 MAX_BYTES = 50_000_000
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import MAX_JOINTS, MIN_JOINTS
-from elastocal.nearest import did_you_mean, listed
+from elastocal.text import did_you_mean, listed
 
 Vector = tuple[float, float, float]
 MOVING = ("revolute", "continuous", "prismatic")

@@ -16,7 +16,6 @@ from elastocal.design.plan import Plan
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.errors import InputError
 from elastocal.identification.result import IdentificationResult
-from elastocal.nearest import did_you_mean, listed, quoted
 from elastocal.report import notebook_figures as figures
 from elastocal.report.diagnosis_rows import BUDGET, CANDIDATES, budget_rows, candidate_rows
 from elastocal.report.diagnosis_verdict import verdict_lines
@@ -24,6 +23,7 @@ from elastocal.report.plan_tables import plan_lines
 from elastocal.report.rows import combination_rows, parameter_rows
 from elastocal.report.units import length
 from elastocal.report.verdict import summary_lines
+from elastocal.text import did_you_mean, listed, quoted
 
 if TYPE_CHECKING:
     import pandas as pd

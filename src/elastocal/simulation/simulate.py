@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from elastocal.errors import InputError
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
-from elastocal.nearest import did_you_mean, listed
+from elastocal.text import did_you_mean, listed
 from elastocal.tracker_noise import available_noise, position_covariance
 
 Array = NDArray[np.float64]

@@ -21,8 +21,7 @@ from elastocal.diagnosis.separate.rivals import Suspects
 from elastocal.errors import InputError
 from elastocal.manipulator.limits import finite_ranges, joint_limits
 from elastocal.manipulator.model import Model
-from elastocal.measurement_reader import read_plan
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_plan
 from elastocal.simulation.simulate import expand_plan, simulate
 
 NARROW = {"joint3.eccentricity_sin": 1.5e-4, "joint3.eccentricity_cos": -1e-4}

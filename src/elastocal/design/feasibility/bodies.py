@@ -19,7 +19,7 @@ from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.shapes import capsule_between, support
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
-from elastocal.nearest import did_you_mean, listed
+from elastocal.text import did_you_mean, listed
 
 Array = NDArray[np.float64]
 Kind = Literal["arm", "carried", "load", "rope", "obstacle"]

@@ -15,7 +15,7 @@ from elastocal.design.feasibility.carriers import WORLD
 from elastocal.design.feasibility.shapes import hull, touches
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
-from elastocal.nearest import did_you_mean, listed
+from elastocal.text import did_you_mean, listed
 
 Rule = Literal["keep_out", "load_height", "obstacle", "self_collision"]
 RULES: tuple[Rule, ...] = get_args(Rule)

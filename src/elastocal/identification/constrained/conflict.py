@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 from elastocal.errors import InputError
 from elastocal.identification.constrained.conic import extremes, least_excess
 from elastocal.identification.constrained.system import System
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 MATTERS = 1e-6  # of the largest multiplier
 

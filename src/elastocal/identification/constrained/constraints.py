@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from elastocal.errors import require
 from elastocal.identification.constrained.system import Matrix, System
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 Array = NDArray[np.float64]
 # An entry of a matrix: a parameter, a linear combination of parameters, or a number.

@@ -27,7 +27,7 @@ from elastocal.identification.constrained.polyhedral import (
     equality_space,
 )
 from elastocal.identification.constrained.system import ROUND_OFF, Matrix, System
-from elastocal.nearest import listed
+from elastocal.text import listed
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import InputError, require
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from elastocal.identification.variance.reml import LogPrior, Reml, reml, usual_s
 from elastocal.identification.variance.shared import shared_effects
 from elastocal.identification.variance.shrinkage import prior_of_groups
 from elastocal.identification.variance.structure import STRUCTURES, Structure
-from elastocal.nearest import did_you_mean
+from elastocal.text import did_you_mean
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from elastocal.errors import InputError
-from elastocal.labels import is_label
-from elastocal.measurement_columns import families
-from elastocal.measurement_reader import read_measurements
-from elastocal.measurement_writer import write_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, families, read_measurements, write_measurements
+from elastocal.text import is_label
 
 SETTINGS = settings(
     deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]

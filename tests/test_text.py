@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.json_text import json_text
+from elastocal.text import json_text
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -44,5 +44,5 @@ def test_numpy_numbers_and_arrays_are_plain_ones():
 
 
 def test_it_loads_no_numpy_as_the_help_texts_come_by_it():
-    program = "import sys, elastocal.json_text; sys.exit('numpy' in sys.modules)"
+    program = "import sys, elastocal.text; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program]).returncode == 0

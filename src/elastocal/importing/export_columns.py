@@ -1,4 +1,4 @@
-"""Which column of a file is which column of the measurement table, and in which unit."""
+"""Which column of an export fills which column of the measurement table, and in which unit."""
 
 from __future__ import annotations
 
@@ -8,19 +8,112 @@ from dataclasses import dataclass
 
 from elastocal.errors import InputError
 from elastocal.importing.schema import UnitsTable
-from elastocal.importing.targets import AUTO, Target, target_of
-from elastocal.importing.units import known_unit, quantities, split_unit
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.measurements import families
+from elastocal.text import did_you_mean, listed, quoted
+from elastocal.units import FACTORS, known_unit, quantities, split_unit
+
+TEXTS = ("name", "configuration", "marker", "repeat", "load", "time_text", "joint#")
+AUTO = "auto"
+_NUMBERED = re.compile(r"(q|torque_|approach_|joint)([1-9]\d?|#)((?:_[A-Za-z]+)?)")
+
+
+def _quantities() -> dict[str, tuple[str, ...]]:
+    """What each column of the measurement table, and each that becomes some of them, measures."""
+    found: dict[str, tuple[str, ...]] = {"range": ("length",)}
+    found |= dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",))
+    for kind in ("revolute", "prismatic"):
+        for family in families((kind,)).values():
+            for stem, units in family.units.items():
+                name = re.sub(r"^(q|torque_|approach_)1$", r"\1#", stem)
+                if name not in TEXTS:
+                    known = found.get(name, ())
+                    found[name] = tuple(dict.fromkeys((*known, *quantities(units[0]))))
+    return found
+
+
+_QUANTITIES = _quantities()
+
+
+@dataclass(frozen=True)
+class ColumnKey:
+    """A column to fill: `stem` ("x", "q3", "q#"), `unit` ("" where there is none, or "auto")."""
+
+    key: str
+    stem: str
+    unit: str
+    is_text: bool = False
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        return quantities_of(self.stem)
+
+    @property
+    def is_template(self) -> bool:
+        """q#: one column for each joint."""
+        return self.stem.endswith("#")
+
+    def numbered(self, i: int) -> ColumnKey:
+        """The column of joint i (from 1) of a template."""
+        return ColumnKey(
+            self.key.replace("#", str(i)), f"{self.stem[:-1]}{i}", self.unit, self.is_text
+        )
+
+
+def quantities_of(stem: str) -> tuple[str, ...]:
+    """What the numbers of a column measure."""
+    return _QUANTITIES[re.sub(r"^(q|torque_|approach_)\d+$", r"\1#", stem)]
+
+
+def column_key(where: str, key: str) -> ColumnKey:
+    """What a key of [source.columns] means.
+
+    Raises InputError for an unknown column, a missing unit and a unit that it cannot have.
+    """
+    numbered = _NUMBERED.fullmatch(key)
+    if numbered:
+        family, number, tail = numbered.groups()
+        if family == "joint" and not tail:
+            return ColumnKey(key, key, "", is_text=True)
+        stem, unit, general = f"{family}{number}", tail[1:], f"{family}#"
+    else:
+        if key in TEXTS:
+            return ColumnKey(key, key, "", is_text=True)
+        stem, unit = key, ""
+        if key not in _QUANTITIES:
+            stem, _, unit = key.rpartition("_")
+        general = stem
+    if general not in _QUANTITIES:
+        valid = [*TEXTS, *_ways()]
+        raise InputError(
+            f"{where}: unknown column {quoted(key)}{did_you_mean(key, valid)}; columns are "
+            f"{listed(valid, 40)}"
+        )
+    units = [u for quantity in _QUANTITIES[general] for u in FACTORS[quantity]]
+    if unit == AUTO and units != [""]:
+        return ColumnKey(key, stem, AUTO)
+    if unit not in units:
+        ways = listed(f"{stem}_{u}" if u else stem for u in units)
+        what = f"the unit {unit} is not one of its" if unit else "has no unit"
+        raise InputError(f"{where}: column {quoted(key)}: {what}; write {ways}")
+    return ColumnKey(key, stem, unit)
+
+
+def _ways() -> list[str]:
+    return [
+        f"{stem}_{next(iter(FACTORS[q[0]]))}".rstrip("_") if q[0] != "number" else stem
+        for stem, q in _QUANTITIES.items()
+    ]
+
 
 Where = int | str | list[str | int]
 MOST_JOINTS = 64
 
 
 @dataclass(frozen=True)
-class Column:
+class FileColumn:
     """`index` into the cells of a row (several are joined, for texts), the file's own name."""
 
-    target: Target
+    target: ColumnKey
     index: tuple[int, ...]
     header: str
     unit: str
@@ -30,8 +123,8 @@ class Column:
 class Wanted:
     """The keys of [source.columns] (required) and [source.optional]."""
 
-    required: tuple[tuple[Target, Where], ...]
-    optional: tuple[tuple[Target, Where], ...]
+    required: tuple[tuple[ColumnKey, Where], ...]
+    optional: tuple[tuple[ColumnKey, Where], ...]
 
     @property
     def by_name(self) -> bool:
@@ -42,9 +135,9 @@ class Wanted:
 def wanted(where: str, required: Mapping[str, Where], optional: Mapping[str, Where]) -> Wanted:
     """The keys checked.  Raises InputError for unknown columns and columns given twice."""
     seen: dict[str, str] = {}
-    result: list[list[tuple[Target, Where]]] = []
+    result: list[list[tuple[ColumnKey, Where]]] = []
     for part in (required, optional):
-        targets = [(target_of(where, key), at) for key, at in part.items()]
+        targets = [(column_key(where, key), at) for key, at in part.items()]
         for target, at in targets:
             # Seconds and nanoseconds of one clock stand in two columns, and are added.
             name = target.key if target.stem == "time" else target.stem
@@ -91,7 +184,7 @@ def no_header(source: str, asked: Wanted, rows: Sequence[tuple[int, list[str]]])
 def resolve(
     source: str, asked: Wanted, header: Sequence[str], width: int, units: UnitsTable,
     hint: str | None,
-) -> tuple[Column, ...]:  # fmt: skip
+) -> tuple[FileColumn, ...]:  # fmt: skip
     """Where each column stands, and in which unit.
 
     `header`: names of the columns, () without a header; `width`: cells of the first row;
@@ -100,7 +193,7 @@ def resolve(
     Raises InputError for names and numbers that the file does not have, names that stand for
     several columns, and units that contradict the header.
     """
-    columns: list[Column] = []
+    columns: list[FileColumn] = []
     for target, at in asked.required:
         columns += _columns(source, target, at, header, width, True)
     for target, at in asked.optional:
@@ -113,8 +206,8 @@ def _parts(at: Where) -> list[str | int]:
 
 
 def _columns(
-    source: str, target: Target, at: Where, header: Sequence[str], width: int, required: bool
-) -> list[Column]:
+    source: str, target: ColumnKey, at: Where, header: Sequence[str], width: int, required: bool
+) -> list[FileColumn]:
     if not target.is_template:
         found = _column(source, target, at, header, width, required)
         return [] if found is None else [found]
@@ -128,8 +221,8 @@ def _columns(
 
 
 def _column(
-    source: str, target: Target, at: Where, header: Sequence[str], width: int, required: bool
-) -> Column | None:
+    source: str, target: ColumnKey, at: Where, header: Sequence[str], width: int, required: bool
+) -> FileColumn | None:
     index, names = [], []
     for part in _parts(at):
         if isinstance(part, int):
@@ -155,10 +248,10 @@ def _column(
             )
         index.append(hits[0])
         names.append(header[hits[0]])
-    return Column(target, tuple(index), " + ".join(names), target.unit)
+    return FileColumn(target, tuple(index), " + ".join(names), target.unit)
 
 
-def _named(part: str, target: Target) -> list[str]:
+def _named(part: str, target: ColumnKey) -> list[str]:
     """The names "A|B#" stands for, with the joint's number from 1 (#) or 0 (#0)."""
     number = re.search(r"\d+", target.stem) if "#" in part else None
     if number:
@@ -180,7 +273,7 @@ def _find(names: Sequence[str], header: Sequence[str]) -> list[int]:
     return []
 
 
-def _absent(source: str, target: Target, names: Sequence[str], header: Sequence[str]) -> str:
+def _absent(source: str, target: ColumnKey, names: Sequence[str], header: Sequence[str]) -> str:
     what = " or ".join(quoted(name) for name in names)
     return (
         f"{source}: no column {what} for {target.key}{did_you_mean(names[0], header)}; the file "
@@ -188,7 +281,7 @@ def _absent(source: str, target: Target, names: Sequence[str], header: Sequence[
     )
 
 
-def _with_unit(source: str, column: Column, units: UnitsTable, hint: str | None) -> Column:
+def _with_unit(source: str, column: FileColumn, units: UnitsTable, hint: str | None) -> FileColumn:
     """The column with its unit found out, or compared with what the file says."""
     target = column.target
     if target.is_text or target.unit == "":
@@ -214,4 +307,4 @@ def _with_unit(source: str, column: Column, units: UnitsTable, hint: str | None)
             f"{source}: column {quoted(column.header)} states no unit; give {option}, [units] in "
             f"the mapping file, or {target.stem}_{option.split()[1]} in [source.columns]"
         )
-    return Column(target, column.index, column.header, unit)
+    return FileColumn(target, column.index, column.header, unit)

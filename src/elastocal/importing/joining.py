@@ -1,0 +1,601 @@
+"""The records of all files as one list of rows, and which joint values belong to which point."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.errors import InputError, require
+from elastocal.importing.records import Records
+from elastocal.importing.schema import JoinTable, JointsTable
+from elastocal.tables import Array, IntArray
+from elastocal.text import listed
+from elastocal.units import convert, quantities
+
+
+def with_joints(
+    where: str, records: Records, joints: JointsTable | None, model_names: Sequence[str] = ()
+) -> Records:
+    """The records with q1 … qn as the robot model counts them: order, sign, offset, coupling.
+
+        q_j = sign_j * c_{order(j)} + offset_j + Σ factor * q_i
+
+    with c the controller's values and the sum over the couplings of joint j; q_i there is the value
+    before any coupling, so the couplings do not depend on their order.
+
+    The order is that of [joints] order, else the joint names of the file (columns joint1 …) are
+    brought into the order of [joints] names, else of `model_names` where the file has them all.
+    Raises InputError for gaps in the joint numbers and for lists of another length.
+    """
+    stems = _stems(records)
+    if not stems:
+        return records
+    joints = joints or JointsTable()
+    values = [records.numbers[stem] for stem in stems]
+    units = [records.units[stem] for stem in stems]
+    taken = _order(where, records, joints, model_names, len(stems))
+    if taken is not None:
+        per_row = np.stack(values)
+        values = [per_row[taken[:, j], np.arange(len(records))] for j in range(taken.shape[1])]
+        units = [units[int(taken[0, j])] for j in range(taken.shape[1])]
+    n = len(values)
+    _check_lengths(where, joints, n)
+    for j in range(n):
+        revolute = "angle" in quantities(units[j])
+        if joints.sign is not None and joints.sign[j] != 1:
+            values[j] = values[j] * joints.sign[j]
+        given = joints.offset_deg if revolute else joints.offset_mm
+        if given is not None and given[j] != 0:
+            offset = convert(np.array([given[j]]), "deg" if revolute else "mm", units[j])
+            values[j] = values[j] + offset
+    before = list(values)
+    for k, coupling in enumerate(joints.coupling or ()):
+        for name in ("joint", "of"):
+            number = getattr(coupling, name)
+            require(
+                number <= n,
+                f"{where}: {name} = {number} of [joints] coupling no. {k + 1}: the file has {n} "
+                "joints",
+            )
+        j, i = coupling.joint - 1, coupling.of - 1
+        if quantities(units[j]) != quantities(units[i]):
+            raise InputError(
+                f"{where}: [joints] coupling no. {k + 1} joins a revolute and a prismatic joint; "
+                "give the factor in other units outside the mapping"
+            )
+        values[j] = values[j] + coupling.factor * convert(before[i], units[i], units[j])
+    numbers = {s: v for s, v in records.numbers.items() if s not in stems}
+    own = {s: u for s, u in records.units.items() if s not in stems}
+    for j in range(n):
+        numbers[f"q{j + 1}"], own[f"q{j + 1}"] = values[j], units[j]
+    return replace(records, numbers=numbers, units=own)
+
+
+def joint_stems(numbers: Sequence[str]) -> list[str]:
+    """q1, q2 … among the columns, in order."""
+    found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
+    return sorted(found, key=lambda stem: int(stem[1:]))
+
+
+def _stems(records: Records) -> list[str]:
+    stems = joint_stems(list(records.numbers))
+    wrong = [stem for i, stem in enumerate(stems, 1) if stem != f"q{i}"]
+    if wrong:
+        raise InputError(
+            f"{records.source}: the mapping fills {listed(stems)}, but not q"
+            f"{int(wrong[0][1:]) - 1}; joints are numbered from 1 without gaps"
+        )
+    return stems
+
+
+def _order(
+    where: str, records: Records, joints: JointsTable, model_names: Sequence[str], n: int
+) -> np.ndarray | None:
+    """(rows, joints) which of the file's values is each joint; None for their own order."""
+    if joints.order is not None:
+        order = joints.order
+        if max(order) > n or len(set(order)) < len(order):
+            raise InputError(
+                f"{where}: [joints] order = {order} takes each of the file's {n} joints at most "
+                "once"
+            )
+        return np.tile(np.array(order) - 1, (len(records), 1))
+    columns = [records.texts[f"joint{i}"] for i in range(1, n + 1) if f"joint{i}" in records.texts]
+    if len(columns) != n:
+        if joints.names is not None:
+            raise InputError(
+                f"{where}: [joints] names needs the joint names of the file: add "
+                'joint# = "name_#0" to [source.columns], or use order'
+            )
+        return None
+    seen = list(zip(*columns, strict=True))
+    wanted = joints.names or (model_names if set(model_names) <= set(seen[0]) else None)
+    if not wanted:
+        return None
+    orders: dict[tuple[str, ...], list[int]] = {}
+    rows = []
+    for i, names in enumerate(seen):
+        if names not in orders:
+            absent = [name for name in wanted if name not in names]
+            if absent:
+                raise InputError(
+                    f"{records.where(i)}: no joint {listed(absent)}; the row has {listed(names)}: "
+                    "correct [joints] names, or leave out messages of other joints"
+                )
+            orders[names] = [names.index(name) for name in wanted]
+        rows.append(orders[names])
+    return np.array(rows)
+
+
+def _check_lengths(where: str, joints: JointsTable, n: int) -> None:
+    for key in ("sign", "offset_deg", "offset_mm"):
+        given = getattr(joints, key)
+        if given is not None and len(given) != n:
+            raise InputError(
+                f"{where}: [joints] {key} has {len(given)} numbers, but there are {n} joints; give "
+                "one per joint"
+            )
+    for value in joints.sign or ():
+        require(abs(value) == 1, f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
+
+
+# What columns whose files disagree, or whose unit the measurement table does not take, become.
+DEFAULT = {
+    "length": "mm", "angle": "deg", "time": "s", "force": "N", "torque": "Nm",
+    "temperature": "C", "number": "",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PooledRecords:
+    """n rows of `files`; `file` (n,) and `line` (n,) say where each stands.
+
+    `numbers` stem → (n,) in `units[stem]`; `labels` configuration, marker, repeat, load → n
+    texts; `names` n texts; `time` (n,) s or None.
+    """
+
+    files: tuple[str, ...]
+    file: IntArray
+    line: IntArray
+    numbers: dict[str, Array]
+    units: dict[str, str]
+    names: list[str]
+    labels: dict[str, list[str]]
+    time: Array | None
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def where(self, i: int) -> str:
+        """File and line of row i, as messages begin."""
+        return f"{self.files[self.file[i]]}, line {self.line[i]}"
+
+    def shown(self, i: int) -> str:
+        """Row i for a list in a message: its name and line."""
+        name = self.names[i]
+        return f"{name} (line {self.line[i]})" if name else f"line {self.line[i]}"
+
+    @property
+    def q(self) -> Array:
+        """(n, joints) joint values in the units of their columns."""
+        stems = joint_stems(list(self.numbers))
+        return (
+            np.column_stack([self.numbers[s] for s in stems]) if stems else np.zeros((len(self), 0))
+        )
+
+    @property
+    def q_units(self) -> tuple[str, ...]:
+        return tuple(self.units[stem] for stem in joint_stems(list(self.numbers)))
+
+    def spread(self, deg: float, mm: float) -> Array:
+        """(joints,) these tolerances in the unit of each joint."""
+        sizes = [
+            convert(np.array([deg]), "deg", u)[0] if "angle" in quantities(u)
+            else convert(np.array([mm]), "mm", u)[0]
+            for u in self.q_units
+        ]  # fmt: skip
+        return np.array(sizes)
+
+
+def pooled(records: Sequence[Records]) -> PooledRecords:
+    """The rows of all files, in the order of the files.
+
+    Raises InputError where the files do not have the same columns.
+    """
+    first = records[0]
+    for other in records[1:]:
+        _same("columns", first, other, set(first.numbers), set(other.numbers))
+        loads = {"load"} if first.load is not None or other.load is not None else set()
+        _same("labels", first, other, set(first.labels) - loads, set(other.labels) - loads)
+        _same("times", first, other, {"time"} if first.time is not None else set(),
+              {"time"} if other.time is not None else set())  # fmt: skip
+    units = {stem: _common([r.units[stem] for r in records]) for stem in first.numbers}
+    numbers = {
+        stem: np.concatenate([convert(r.numbers[stem], r.units[stem], unit) for r in records])
+        for stem, unit in units.items()
+    }
+    labels = {
+        stem: [text for r in records for text in r.labels.get(stem, ())]
+        for stem in first.labels
+        if stem != "load"
+    }
+    if any(r.load is not None or "load" in r.labels for r in records):
+        labels["load"] = [text for r in records for text in _loads(r)]
+    times = [r.time for r in records if r.time is not None]
+    return PooledRecords(
+        files=tuple(r.source for r in records),
+        file=np.repeat(np.arange(len(records)), [len(r) for r in records]),
+        line=np.concatenate([r.line for r in records]),
+        numbers=numbers,
+        units=units,
+        names=[text for r in records for text in r.texts.get("name", [""] * len(r))],
+        labels=labels,
+        time=np.concatenate(times) if times else None,
+    )
+
+
+def _loads(records: Records) -> list[str]:
+    """The load of each row: what its name or column says, else what its file is said to be."""
+    named = records.labels.get("load")
+    if named is None and records.load is None:
+        raise InputError(
+            f"{records.source}: says no load, other files do; give load in its [[source]], or a "
+            "group (?P<load>…) in its pattern"
+        )
+    return named if named is not None else [str(records.load)] * len(records)
+
+
+def _common(units: list[str]) -> str:
+    return units[0] if len(set(units)) == 1 else DEFAULT[quantities(units[0])[0]]
+
+
+def _same(what: str, first: Records, other: Records, one: set[str], two: set[str]) -> None:
+    if one == two:
+        return
+    has, lacks = (first, other) if one - two else (other, first)
+    raise InputError(
+        f"{lacks.source}: has no {listed(sorted(one ^ two))}, but {has.source} has; files of one "
+        f"kind need the same {what}: correct [[source]], or import them one by one"
+    )
+
+
+CHUNK = 1024
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """Rows `first` to `last` of the log, both included; the arm's `q` (n,) then (median)."""
+
+    first: int
+    last: int
+    q: Array
+
+
+def standstills(time: Array, q: Array, still: Array, shortest: float) -> list[Standstill]:
+    """The longest runs of rows in which no joint moves by more than `still`.
+
+    `time` (m,) s, rising; `q` (m, n); `still` (n,): the largest max - min of each joint within a
+    standstill, in the unit of q; `shortest` s between its first and last row.  Runs are taken from
+    the start of the log on, each as long as it can be; shorter ones count as motion.
+    """
+    found: list[Standstill] = []
+    start, m = 0, len(time)
+    while start + 1 < m:
+        # The first row with which the run is long enough.
+        end = max(int(np.searchsorted(time, time[start] + shortest)), start + 1)
+        if end >= m:
+            break
+        spread = _spread(q[start : end + 1][::-1])[::-1]
+        moved = np.flatnonzero((spread > still).any(axis=1))
+        if len(moved):
+            # From there to `end` is too much, and every run that starts before holds both.
+            start += int(moved[-1]) + 1
+            continue
+        end = _last(q, start, still)
+        found.append(Standstill(start, end, np.median(q[start : end + 1], axis=0)))
+        start = end + 1
+    return found
+
+
+def _spread(q: Array) -> Array:
+    """(rows, n) max - min of each joint over the rows so far."""
+    return np.maximum.accumulate(q) - np.minimum.accumulate(q)
+
+
+def _last(q: Array, start: int, still: Array) -> int:
+    """The last row of the run from `start` in which no joint moves by more than `still`."""
+    size = CHUNK
+    while True:
+        over = np.flatnonzero((_spread(q[start : start + size]) > still).any(axis=1))
+        if len(over):
+            return start + int(over[0]) - 1
+        if start + size >= len(q):
+            return len(q) - 1
+        size *= 2
+
+
+def groups_alike(q: Array, tolerance: Array) -> NDArray[np.int64]:
+    """(m,) codes by first appearance: rows of q (m, n) within `tolerance` (n,) of a group's first
+    row are of that group."""
+    codes = np.empty(len(q), dtype=np.int64)
+    firsts: list[Array] = []
+    for i, row in enumerate(q):
+        if firsts:
+            near = np.flatnonzero((np.abs(np.array(firsts) - row) <= tolerance).all(axis=1))
+            if len(near):
+                codes[i] = near[0]
+                continue
+        codes[i] = len(firsts)
+        firsts.append(row)
+    return codes
+
+
+TOLERANCE_S, STILL_DEG, STILL_MM, STILL_S = 0.5, 0.01, 0.01, 1.0
+SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Joined:
+    """`row` (points,) into the joint log, -1 without a partner; `q` (points, joints).
+
+    `pose` (points,) names the pose where the log does, None where it does not; `left_out` and
+    `unused` say which points and which poses found no partner; `remarks` are for the preview.
+    """
+
+    how: str
+    row: IntArray
+    q: Array
+    pose: list[str] | None
+    left_out: tuple[str, ...]
+    unused: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def join(
+    where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable | None
+) -> Joined:
+    """The joint values of every point.
+
+    Raises InputError where points have no partner and [join] unmatched is not "leave_out", where
+    the counts of an order do not agree, and where names or times are missing.
+    """
+    settings = settings or JoinTable()
+    how = settings.by or _obvious(points, log)
+    ways = {"order": _by_order, "name": _by_name, "time": _by_time, "standstill": _by_standstill}
+    found = ways[how](where, points, log, settings)
+    if found.left_out and settings.unmatched != "leave_out":
+        raise InputError(
+            f"{points.files[0]}: {len(found.left_out)} of {len(points)} points have no joint "
+            f"values in {listed(log.files, 3)} (joined by {how}): {listed(found.left_out, SHOWN)}; "
+            f'{_ADVICE[how]}, or set unmatched = "leave_out" in [join]'
+        )
+    if (found.row < 0).all():
+        raise InputError(
+            f"{points.files[0]}: no point has joint values in {listed(log.files, 3)} (joined by "
+            f"{how}); {_ADVICE[how]}"
+        )
+    return found
+
+
+_ADVICE = {
+    "order": "set points_per_pose in [join], or join by name",
+    "name": "correct the patterns in [source.names], so that both files give the same names",
+    "time": "correct offset_s or tolerance_s in [join]",
+    "standstill": "correct offset_s, tolerance_s, still_deg or still_s in [join]",
+}
+
+
+def _obvious(points: PooledRecords, log: PooledRecords) -> str:
+    """By name where names agree, by time where both have one, else by order."""
+    if "configuration" in points.labels and _keys(points.labels["configuration"], _names_of(log)):
+        return "name"
+    return "time" if points.time is not None and log.time is not None else "order"
+
+
+def _names_of(log: PooledRecords) -> list[str]:
+    return log.labels.get("configuration") or (log.names if any(log.names) else [])
+
+
+def _key(name: str) -> str:
+    """The same text for names that people take for one: P01, p1."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", name.strip().casefold())
+
+
+def _number(name: str) -> str:
+    """The number at the end of a name: 7 for P07, pose_7 and 7."""
+    found = re.search(r"\d+$", _key(name))
+    return found[0] if found else _key(name)
+
+
+def _keys(ours: list[str], theirs: list[str]) -> Callable[[str], str] | None:
+    """What two lists of names have in common: whole names, else the numbers at their ends where
+    these tell the names of each list apart; None where there is nothing."""
+    for key in (_key, _number):
+        mine, other = {key(n) for n in ours}, {key(n) for n in theirs}
+        apart = all(len({key(n) for n in names}) == len({_key(n) for n in names})
+                    for names in (ours, theirs))  # fmt: skip
+        if mine & other and apart:
+            return key
+    return None
+
+
+def _loads_apart(points: PooledRecords, log: PooledRecords) -> list[tuple[str, IntArray, IntArray]]:
+    """(load, points, rows of the log): a log without loads serves every load state."""
+    if "load" not in points.labels:
+        return [("", np.arange(len(points)), np.arange(len(log)))]
+    loads = np.array(points.labels["load"], dtype=object)
+    own = log.labels.get("load")
+    parts = []
+    for load in dict.fromkeys(points.labels["load"]):
+        rows = np.arange(len(log)) if own is None else np.flatnonzero(np.array(own, object) == load)
+        parts.append((load, np.flatnonzero(loads == load), rows))
+    return parts
+
+
+def _visits(points: PooledRecords, chosen: IntArray, per_pose: int | None) -> IntArray:
+    """(chosen,) number of the visit: points measured without moving the arm in between."""
+    n = len(chosen)
+    if per_pose is not None:
+        return np.arange(n) // per_pose
+    if "configuration" in points.labels:
+        names = [points.labels["configuration"][i] for i in chosen]
+        return np.cumsum([k > 0 and names[k] != names[k - 1] for k in range(n)])
+    markers = [points.labels["marker"][i] for i in chosen] if "marker" in points.labels else []
+    if len(set(markers)) < 2:
+        return np.arange(n)
+    visit, seen, codes = 0, set[str](), []
+    for k, marker in enumerate(markers):
+        if marker in seen and marker != markers[k - 1]:
+            visit, seen = visit + 1, set()
+        seen.add(marker)
+        codes.append(visit)
+    return np.array(codes)
+
+
+def _by_order(where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable) -> Joined:
+    row = np.full(len(points), -1)
+    for load, chosen, rows in _loads_apart(points, log):
+        visits = _visits(points, chosen, settings.points_per_pose)
+        count = int(visits.max()) + 1
+        per = settings.points_per_pose
+        if count != len(rows) or (per is not None and len(chosen) % per):
+            of = f" under load {load}" if load else ""
+            sizes = np.bincount(visits)
+            odd = np.flatnonzero(sizes != np.bincount(sizes).argmax())
+            start = chosen[np.flatnonzero(visits == odd[0])[0]] if len(odd) else None
+            hint = "" if start is None else (
+                f"; the visit that begins at {points.shown(int(start))} has {sizes[odd[0]]} "
+                f"points, most have {np.bincount(sizes).argmax()}"
+            )  # fmt: skip
+            raise InputError(
+                f"{points.files[0]}: {len(chosen)} points{of} in {count} visits, but "
+                f"{listed(log.files, 3)} has {len(rows)} poses, and they are joined by "
+                f"order{hint}; "
+                f"{_ADVICE['order']}"
+            )
+        row[chosen] = rows[visits]
+    names = _names_of(log)
+    pose = [names[r] for r in row] if names else None
+    return Joined("order", row, log.q[row], pose, (), (), ())
+
+
+def _by_name(where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable) -> Joined:
+    names = _names_of(log)
+    for pool, has in ((log, bool(names)), (points, "configuration" in points.labels)):
+        if not has:
+            raise InputError(
+                f"{pool.files[0]}: no names of poses, by which [join] is to join; map name or "
+                "configuration in [source.columns], and a pattern in [source.names]"
+            )
+    q, row = log.q, np.full(len(points), -1)
+    key = _keys(points.labels["configuration"], names) or _key
+    unused: set[int] = set(range(len(log)))
+    for _, chosen, rows in _loads_apart(points, log):
+        known: dict[str, int] = {}
+        for r in rows:
+            first = known.setdefault(key(names[r]), int(r))
+            if first != r and not np.array_equal(q[first], q[r]):
+                raise InputError(
+                    f"{log.where(int(r))}: pose {names[r]} has other joint values than in line "
+                    f"{log.line[first]}; name visits apart, or say which load each belongs to"
+                )
+        for i in chosen:
+            row[i] = known.get(key(points.labels["configuration"][i]), -1)
+        used = {key(names[r]) for r in row[chosen] if r >= 0}
+        unused -= {int(r) for r in rows if key(names[r]) in used}
+    left_out = tuple(points.shown(int(i)) for i in np.flatnonzero(row < 0))
+    spare = tuple(dict.fromkeys(log.shown(r) for r in sorted(unused)))
+    pairs = [(points.labels["configuration"][i], names[row[i]]) for i in range(len(row))]
+    told = next((f"{a} is {b}" for (a, b), r in zip(pairs, row, strict=True) if r >= 0), "")
+    remarks = (f"by the numbers at the ends of the names ({told})",) if key is _number else ()
+    return Joined("name", row, q[row], None, left_out, spare, remarks)
+
+
+def _clocks(
+    points: PooledRecords, log: PooledRecords, settings: JoinTable, how: str
+) -> tuple[Array, Array, IntArray]:
+    """Times of the points and, sorted and with the offset, of the log, and the log's rows so."""
+    for pool in (points, log):
+        if pool.time is None:
+            raise InputError(
+                f"{pool.files[0]}: no times, by which [join] is to join by {how}; map time_s or "
+                "time_text in [source.columns], or join by order or name"
+            )
+    assert points.time is not None and log.time is not None
+    order = np.argsort(log.time, kind="stable")
+    return points.time, log.time[order] + (settings.offset_s or 0.0), order
+
+
+def _by_time(where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable) -> Joined:
+    at, clock, order = _clocks(points, log, settings, "time")
+    tolerance = TOLERANCE_S if settings.tolerance_s is None else settings.tolerance_s
+    after = np.clip(np.searchsorted(clock, at), 1, max(len(clock) - 1, 1))
+    after = np.minimum(after, len(clock) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(at - clock[before]) <= np.abs(clock[after] - at), before, after)
+    apart = np.abs(clock[nearest] - at)
+    row = np.where(apart <= tolerance, order[nearest], -1)
+    good = row >= 0
+    remarks = []
+    if good.any():
+        remarks.append(
+            f"clocks differ by {apart[good].max():.3g} s at most, {np.median(apart[good]):.3g} s "
+            "in the median"
+        )
+        still = log.spread(settings.still_deg or STILL_DEG, settings.still_mm or STILL_MM)
+        q = log.q[order]
+        around = np.abs(q[np.minimum(nearest + 1, len(q) - 1)] - q[np.maximum(nearest - 1, 0)])
+        moving = np.flatnonzero(good & (around > still).any(axis=1))
+        if len(moving):
+            remarks.append(
+                f"WARNING: the arm moved while {len(moving)} points were measured: "
+                f"{listed((points.shown(int(i)) for i in moving), SHOWN)}; set offset_s, or join "
+                "by standstill"
+            )
+    left_out = tuple(
+        f"{points.shown(int(i))}, {apart[i]:.3g} s from the nearest"
+        for i in np.flatnonzero(~good)
+    )  # fmt: skip
+    return Joined("time", row, log.q[row], None, left_out, (), tuple(remarks))
+
+
+def _by_standstill(
+    where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable
+) -> Joined:
+    at, clock, order = _clocks(points, log, settings, "standstill")
+    tolerance = TOLERANCE_S if settings.tolerance_s is None else settings.tolerance_s
+    still = log.spread(settings.still_deg or STILL_DEG, settings.still_mm or STILL_MM)
+    shortest = STILL_S if settings.still_s is None else settings.still_s
+    found = standstills(clock, log.q[order], still, shortest)
+    if not found:
+        raise InputError(
+            f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
+            "still_deg in [join], or join by time"
+        )
+    first = np.array([clock[s.first] for s in found])
+    last = np.array([clock[s.last] for s in found])
+    # 0 within a standstill, else the time to its nearer end: (points, standstills) at most a few
+    # thousand each.
+    best = np.zeros(len(at), dtype=np.int64)
+    apart = np.zeros(len(at))
+    for i, t in enumerate(at):
+        away = np.maximum(np.maximum(first - t, t - last), 0.0)
+        best[i] = int(np.argmin(away))
+        apart[i] = away[best[i]]
+    good = apart <= tolerance
+    q = np.array([s.q for s in found])[best]
+    row = np.where(good, order[np.array([s.first for s in found])[best]], -1)
+    left_out = tuple(
+        f"{points.shown(int(i))}, {apart[i]:.3g} s from the nearest standstill"
+        for i in np.flatnonzero(~good)
+    )  # fmt: skip
+    empty = np.setdiff1d(np.arange(len(found)), best[good])
+    unused = tuple(
+        f"standstill {k + 1} (from line {log.line[order[found[k].first]]})" for k in empty
+    )
+    remarks = (f"{len(found)} standstills of {shortest:g} s or more in {len(log)} rows",)
+    return Joined("standstill", row, q, None, left_out, unused, remarks)

@@ -1,0 +1,585 @@
+"""Delimited tables: one reader and one writer for readings, plans, targets, DH tables and masses.
+
+A table is CSV (UTF-8; comma, semicolon or tab between columns; decimal commas where columns are not
+separated by them) or Parquet.  Its first line names the columns, and units stand in the names.
+What a table may hold is stated as families of columns; the reader returns numbers in the file's own
+units beside the line of each row, and refuses everything else by file, line and column, with what
+was found and what to do.  A file is read in chunks, so a large one that is no table is refused
+early and in little memory.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO, StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.csv_lines import Chunk, CsvLines, first_bad_cell
+from elastocal.errors import InputError
+from elastocal.files import open_input
+from elastocal.text import did_you_mean, is_label, listed, quoted
+from elastocal.units import to_si
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+NO_UNIT = ("",)
+IGNORED = ("#", "_", "note")
+# Seen in other people's tables: they make a name such as x_cm a wrong unit, not a typing error.
+OTHER_UNITS = frozenset(
+    ("cm", "km", "nm", "inch", "in", "mrad", "urad", "grad", "turn", "rev", "kN", "kg", "mNm",
+     "kNm", "h", "ms", "us", "K", "F", "mm", "m", "um", "deg", "rad", "N", "Nm", "s", "min", "C")
+)  # fmt: skip
+
+
+# What a table may hold
+
+
+@dataclass(frozen=True)
+class Family:
+    """Columns that belong together: all of them or none.
+
+    `units`: stem → the units it may be written in; stems with the same choice share one unit.
+    `is_label`: texts instead of numbers; `optional`: stems that may be absent, and whose cells may
+    be empty.
+    """
+
+    name: str
+    meaning: str
+    units: Mapping[str, tuple[str, ...]]
+    is_label: bool = False
+    optional: Container[str] = ()
+
+    def columns(self, stem: str) -> tuple[str, ...]:
+        """Every way to write the column `stem`."""
+        return tuple(column(stem, unit) for unit in self.units[stem])
+
+    @property
+    def required(self) -> list[str]:
+        """The stems that must be there where the family is."""
+        return [stem for stem in self.units if stem not in self.optional]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a file: its header, the stem of that, and its unit, "" where there is none."""
+
+    header: str
+    stem: str
+    unit: str
+
+
+def column(stem: str, unit: str) -> str:
+    """The header of a column: x_mm, or approach_1 where there is no unit."""
+    return f"{stem}_{unit}" if unit else stem
+
+
+@dataclass(frozen=True)
+class Layout:
+    """`columns`: the families present, each with its columns in the order of its stems.
+
+    `labels`, `numbers`: the headers of the columns of texts and of numbers; `blanks`: of those
+    whose cells may be empty.
+    """
+
+    columns: Mapping[str, tuple[Column, ...]]
+    labels: tuple[str, ...]
+    numbers: tuple[str, ...]
+    blanks: frozenset[str] = frozenset()
+
+
+ChooseLayout = Callable[[Sequence[str]], Layout]
+# The columns found so far: family → stem → column.
+Present = dict[str, dict[str, Column]]
+
+
+def match_columns(
+    source: str,
+    header: Sequence[str],
+    known: Mapping[str, Family],
+    passed_over: Callable[[str], bool] = lambda text: False,
+    explain: Callable[[str], str | None] = lambda text: None,
+) -> Present:
+    """Which column of a header is which of the `known` families.
+
+    `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one.
+    Raises InputError for unnamed, repeated, unknown and unitless columns, and for mixed units.
+    """
+    _check_names(source, header)
+    meaning = {
+        column(stem, unit): (family, stem, unit)
+        for family in known.values()
+        for stem, units in family.units.items()
+        for unit in units
+    }
+    present: Present = {}
+    for text in header:
+        if text.startswith(IGNORED) or passed_over(text):
+            continue
+        if text not in meaning:
+            raise InputError(f"{source}: {explain(text) or _unknown(text, known, list(meaning))}")
+        family, stem, unit = meaning[text]
+        found = present.setdefault(family.name, {})
+        if stem in found:
+            raise InputError(
+                f"{source}: columns {found[stem].header} and {text} say the same; keep one"
+            )
+        for other_stem, other in found.items():
+            if family.units[other_stem] == family.units[stem] and other.unit != unit:
+                raise InputError(
+                    f"{source}: columns {other.header} and {text} mix units; give all "
+                    f"{family.meaning} in one unit"
+                )
+        found[stem] = Column(text, stem, unit)
+    return present
+
+
+def layout_of_columns(
+    source: str,
+    present: Present,
+    known: Mapping[str, Family],
+    needed: Sequence[Sequence[str]] = (),
+    needed_by: str = "",
+    exclusive: Sequence[tuple[str, str]] = (),
+) -> Layout:
+    """The layout of a table with these columns.
+
+    `needed`: of each entry one family must be there, because `needed_by` (as in "a DH table
+    needs"); `exclusive`: pairs of families that say the same.
+    Raises InputError for incomplete and missing families, and for what is said twice.
+    """
+    for name, found in present.items():
+        _check_complete(source, known[name], found, alone=(name,) in needed)
+    for one, other in exclusive:
+        if one in present and other in present:
+            pair = [next(iter(present[name].values())).header for name in (one, other)]
+            raise InputError(
+                f"{source}: {pair[0]} … and {pair[1]} … say the same in two ways "
+                f"({known[one].meaning}, {known[other].meaning}); keep one"
+            )
+    for choices in needed:
+        if not any(name in present for name in choices):
+            wanted = " or ".join(
+                ",".join(known[name].columns(stem)[0] for stem in known[name].required)
+                for name in choices
+            )
+            there = listed((c.header for cs in present.values() for c in cs.values()), 12)
+            raise InputError(
+                f"{source}: the columns {wanted} are missing, which {needed_by}; found "
+                f"{there or 'no known column'}"
+            )
+    columns = {
+        name: tuple(found[stem] for stem in known[name].units if stem in found)
+        for name, found in present.items()
+    }
+
+    every = [(known[name], c) for name, cs in columns.items() for c in cs]
+    return Layout(
+        columns,
+        labels=tuple(c.header for family, c in every if family.is_label),
+        numbers=tuple(c.header for family, c in every if not family.is_label),
+        blanks=frozenset(c.header for family, c in every if c.stem in family.optional),
+    )
+
+
+def _check_names(source: str, header: Sequence[str]) -> None:
+    for i, text in enumerate(header, start=1):
+        if not text:
+            raise InputError(
+                f"{source}: column {i} of {len(header)} has no name in the header; name it or "
+                "remove the separator too many"
+            )
+    for text, count in Counter(header).items():
+        if count > 1:
+            raise InputError(f"{source}: column {quoted(text)} appears {count} times; keep one")
+
+
+def _unknown(text: str, known: Mapping[str, Family], valid: Sequence[str]) -> str:
+    ways: dict[str, list[str]] = {}
+    for family in known.values():
+        for stem in family.units:
+            ways.setdefault(stem, []).extend(family.columns(stem))
+    if text in ways:
+        return f"column {quoted(text)} has no unit; write {' or '.join(ways[text])}"
+    stem, _, unit = text.rpartition("_")
+    if stem in ways and unit in OTHER_UNITS:
+        return (
+            f"column {quoted(text)}: the unit {unit} is not taken here; write "
+            f"{' or '.join(ways[stem])}"
+        )
+    return (
+        f"unknown column {quoted(text)}{did_you_mean(text, valid)}; correct the name, or start "
+        "it with '#', '_' or 'note' to have it ignored"
+    )
+
+
+def _check_complete(source: str, family: Family, found: Mapping[str, Column], alone: bool) -> None:
+    missing = [stem for stem in family.required if stem not in found]
+    if missing:
+        unit = next(iter(found.values())).unit
+        absent = [column(s, unit if unit in family.units[s] else family.units[s][0])
+                  for s in missing]  # fmt: skip
+        raise InputError(
+            f"{source}: {listed(c.header for c in found.values())} without {listed(absent)}; "
+            f"the table needs all columns of the {family.meaning}{'' if alone else ', or none'}"
+        )
+
+
+# What a table holds
+
+
+@dataclass(frozen=True)
+class Labels:
+    """`codes` (n,) index into `names`, which stand in order of first appearance."""
+
+    codes: IntArray
+    names: tuple[str, ...]
+
+
+class LabelCollector:
+    """Gathers the labels of a column piece by piece, coded by first appearance."""
+
+    def __init__(self) -> None:
+        self._code_of: dict[str, int] = {}
+        self._pieces: list[IntArray] = []
+
+    def add(self, codes: NDArray[np.integer], names: Iterable[object]) -> None:
+        """More rows: `codes` (n,) index into `names`, which stand in order of appearance.
+
+        Blanks at the ends of a name are cut off.
+        """
+        new = [self._code_of.setdefault(str(n).strip(), len(self._code_of)) for n in names]
+        self._pieces.append(np.array(new, dtype=np.int64)[codes])
+
+    def labels(self) -> Labels:
+        """All rows so far."""
+        return Labels(np.concatenate(self._pieces), tuple(self._code_of))
+
+
+@dataclass(frozen=True)
+class RawTable:
+    """n rows; `row` (n,) is the line (CSV) or row (Parquet) in the file, `noun` says which.
+
+    `numbers`: header → (n,) floats in the file's unit, finite, NaN for a cell that is empty where
+    it may be; `labels`: header → Labels.
+    """
+
+    source: str
+    noun: str
+    row: IntArray
+    layout: Layout
+    numbers: Mapping[str, Array]
+    labels: Mapping[str, Labels]
+
+    def where(self, i: int, *headers: str) -> str:
+        """File, line and columns of row i, as messages begin."""
+        columns = f"column{'s' if len(headers) > 1 else ''} {' and '.join(headers)}"
+        return f"{self.source}, {self.noun} {self.row[i]}, {columns}"
+
+    def column(self, family: str, stem: str) -> Column | None:
+        """The column of a stem, None where the file has none."""
+        found = self.layout.columns.get(family, ())
+        return next((column for column in found if column.stem == stem), None)
+
+    def text(self, i: int, header: str) -> str:
+        """The text of row i in a column of labels, "" where the file has no such column."""
+        labels = self.labels.get(header)
+        return "" if labels is None else labels.names[labels.codes[i]]
+
+    def si(self, family: str) -> Array | None:
+        """The columns of a family side by side (n, k) in SI units, None where there are none.
+
+        Raises InputError for numbers that are not finite in SI units.
+        """
+        if family not in self.layout.columns:
+            return None
+        with np.errstate(over="ignore"):
+            values = np.column_stack(
+                [to_si(self.numbers[c.header], c.unit) for c in self.layout.columns[family]]
+            )
+        self.check(family, ~np.isinf(values), "too large to be a number here")
+        return values
+
+    def check(self, family: str, good: np.ndarray, rule: str) -> None:
+        """Raises InputError with `rule` for the first cell of a family (n, k) that is not good."""
+        if good.all():
+            return
+        i, k = (int(v) for v in np.argwhere(~good)[0])
+        header = self.layout.columns[family][k].header
+        raise InputError(
+            f"{self.where(i, header)}: {rule}; found {self.numbers[header][i]:.6g}; correct or "
+            f"drop the {self.noun}"
+        )
+
+    def check_labels(self) -> None:
+        """Raises InputError for the first label that is empty or has control characters."""
+        for header, labels in self.labels.items():
+            for code, name in enumerate(labels.names):
+                if not is_label(name) and (name or header not in self.layout.blanks):
+                    i = int(np.argmax(labels.codes == code))
+                    what = f"{quoted(name)} has control characters" if name else "empty cell"
+                    raise InputError(f"{self.where(i, header)}: {what}; write a name or number")
+
+
+# Sources
+
+
+def read_table(
+    path: str | Path,
+    choose: ChooseLayout,
+    *,
+    what: str = "measurement table",
+    comments: bool = False,
+    text: str | None = None,
+) -> RawTable:
+    """The columns of a CSV or Parquet (.parquet, .pq) file that `choose` picks from its header.
+
+    `what` names the kind of table in messages; `comments`: lines that begin with # are passed
+    over, and so are lines of empty cells.  With `text` the table is that CSV text, and `path` only
+    its name.  Raises InputError that names file, line, column and the offending text.
+    """
+    source = str(path)
+    if text is not None:
+        return _read_csv(CsvLines(source, BytesIO(text.encode()), what, comments), choose)
+    if Path(path).suffix.lower() in (".parquet", ".pq"):
+        return _read_parquet(source, choose, what)
+    with open_input(path, what) as handle:
+        return _read_csv(CsvLines(source, handle, what, comments), choose)
+
+
+def _read_csv(lines: CsvLines, choose: ChooseLayout) -> RawTable:
+    layout = choose(lines.header)
+    parser = (_CellParser if layout.blanks or lines.comments else _PandasParser)(lines, layout)
+    rows: list[IntArray] = []
+    numbers: dict[str, list[Array]] = {name: [] for name in layout.numbers}
+    labels = {name: LabelCollector() for name in layout.labels}
+    for chunk in lines.chunks():
+        parsed = parser.parse(chunk)
+        rows.append(parsed.row)
+        for name, values in parsed.numbers.items():
+            numbers[name].append(values)
+        for name, found in parsed.labels.items():
+            labels[name].add(*found)
+    table = RawTable(
+        lines.source,
+        "line",
+        np.concatenate(rows),
+        layout,
+        {name: np.concatenate(numbers.pop(name)) for name in layout.numbers},
+        {name: collector.labels() for name, collector in labels.items()},
+    )
+    table.check_labels()
+    return table
+
+
+def _read_parquet(source: str, choose: ChooseLayout, what: str) -> RawTable:
+    """The same of a Parquet file, where pandas finds an engine to read it; rows from 1."""
+    import pandas as pd
+
+    with open_input(source, what) as handle:
+        if handle.read(4) != b"PAR1":
+            raise InputError(f"{source}: is not a Parquet file; check it, or name a CSV .csv")
+    try:
+        frame = pd.read_parquet(source)
+    except ImportError:
+        raise InputError(
+            f"{source}: reading Parquet needs pyarrow; run 'pip install pyarrow', or save the "
+            "table as CSV"
+        ) from None
+    except Exception as error:  # each engine has its own exceptions
+        raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
+    frame.columns = [str(name) for name in frame.columns]
+    layout = choose(list(frame.columns))
+    if not len(frame):
+        raise InputError(f"{source}: has columns but no rows; add measurements")
+    table = RawTable(
+        source,
+        "row",
+        np.arange(1, len(frame) + 1),
+        layout,
+        {name: _parquet_numbers(source, name, frame[name]) for name in layout.numbers},
+        {name: _parquet_labels(source, name, frame[name]) for name in layout.labels},
+    )
+    table.check_labels()
+    return table
+
+
+def _parquet_numbers(source: str, name: str, column: pd.Series) -> Array:
+    import pandas as pd
+
+    if not pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
+        raise InputError(f"{source}, column {name}: holds {column.dtype}, not numbers; convert it")
+    values: Array = column.to_numpy(dtype=np.float64, na_value=np.nan)
+    if not np.isfinite(values).all():
+        i = int(np.argmin(np.isfinite(values)))
+        raise InputError(
+            f"{source}, row {i + 1}, column {name}: {values[i]} is not a finite number; "
+            "drop the row, or measure again"
+        )
+    return values
+
+
+def _parquet_labels(source: str, name: str, column: pd.Series) -> Labels:
+    if column.isna().any():
+        i = int(np.argmax(column.isna().to_numpy()))
+        raise InputError(
+            f"{source}, row {i + 1}, column {name}: empty cell; write a name or number"
+        )
+    collector = LabelCollector()
+    collector.add(*column.astype(str).factorize())
+    return collector.labels()
+
+
+# Cells of CSV files
+
+
+@dataclass(frozen=True)
+class _Parsed:
+    """Columns of a chunk; `labels`: header → codes and the texts that they index."""
+
+    row: IntArray
+    numbers: dict[str, Array]
+    labels: dict[str, tuple[NDArray[np.integer], Iterable[object]]]
+
+
+class _CellParser:
+    """Chunks of text → columns, cell by cell, for the small tables in which cells may be empty."""
+
+    def __init__(self, lines: CsvLines, layout: Layout) -> None:
+        self.lines, self.layout = lines, layout
+        self.columns = {
+            i: name for i, name in enumerate(lines.header) if name in set(layout.numbers)
+        }
+
+    def parse(self, chunk: Chunk) -> _Parsed:
+        """The columns of a chunk; raises InputError for the first bad cell."""
+        if problem := self.problem([chunk]):
+            raise problem
+        rows = [cells for _, cells in self.lines.cells(chunk)]
+        texts = dict(zip(self.lines.header, zip(*rows, strict=True), strict=True))
+        return _Parsed(
+            np.array(chunk.numbers, dtype=np.int64),
+            {name: np.array(list(map(_number, texts[name]))) for name in self.layout.numbers},
+            {name: (np.arange(len(rows)), texts[name]) for name in self.layout.labels},
+        )
+
+    def problem(self, some: Iterable[Chunk]) -> InputError | None:
+        """What is wrong with the first bad cell of these chunks, None where none is bad."""
+        rows = (row for chunk in some for row in self.lines.cells(chunk))
+        commas = self.lines.delimiter != ","
+        return first_bad_cell(self.lines.source, rows, self.columns, commas, self.layout.blanks)
+
+
+class _PandasParser(_CellParser):
+    """Chunks of text → columns, fast, with one decimal mark throughout the file."""
+
+    def __init__(self, lines: CsvLines, layout: Layout) -> None:
+        import pandas as pd
+
+        super().__init__(lines, layout)
+        self.decimals = "." if lines.delimiter == "," else ".,"
+        self.first = True
+        # Not "category": pandas would take the labels 00 and 01 for the numbers 0 and 1.
+        types: dict[str, Any] = dict.fromkeys(layout.numbers, np.float64)
+        types |= dict.fromkeys(layout.labels, object)
+        self.options: dict[str, Any] = dict(
+            sep=lines.delimiter,
+            header=None,
+            names=list(lines.header),
+            usecols=list(types),
+            index_col=False,
+            dtype=types,
+            na_filter=False,
+            keep_default_na=False,
+            skipinitialspace=True,
+            engine="c",
+            encoding="utf-8",
+        )
+        if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
+            self.options["float_precision"] = "round_trip"  # from 3.1 on always so, and deprecated
+
+    def parse(self, chunk: Chunk) -> _Parsed:
+        """The columns of a chunk, numbers finite; raises InputError for the first bad cell."""
+        if chunk.truth_values and (problem := self.problem([chunk])):
+            raise problem
+        frame = self._frame(chunk)
+        numbers = {name: frame[name].to_numpy() for name in self.layout.numbers}
+        if not all(np.isfinite(values).all() for values in numbers.values()):
+            raise self.problem([chunk]) or self._unclear("not finite")
+        self.first = False
+        row = np.array(chunk.numbers, dtype=np.int64)
+        labels = {name: frame[name].factorize() for name in self.layout.labels}
+        return _Parsed(row, numbers, labels)
+
+    def _frame(self, chunk: Chunk) -> pd.DataFrame:
+        import pandas as pd
+
+        reason = "no decimal mark fits"
+        for decimal in self.decimals:
+            try:
+                frame = pd.read_csv(BytesIO(chunk.data), decimal=decimal, **self.options)
+            except ValueError as error:
+                reason = str(error)
+                continue
+            if len(frame) != len(chunk.numbers):
+                raise self._unclear("line ends")
+            if decimal == "," and len(self.decimals) > 1:
+                # Earlier chunks were read with points: fine only if they had none.
+                if not self.first and (problem := self._problem_anywhere()):
+                    raise problem
+                self.decimals = ","
+            return frame
+        raise self.problem([chunk]) or self._problem_anywhere() or self._unclear(reason)
+
+    def _problem_anywhere(self) -> InputError | None:
+        here = self.lines.handle.tell()
+        try:
+            return self.problem(self.lines.chunks())
+        finally:
+            self.lines.handle.seek(here)
+
+    def _unclear(self, reason: str) -> InputError:
+        return InputError(
+            f"{self.lines.source}: cannot be read as a table ({reason}); check its format"
+        )
+
+
+def _number(cell: str) -> float:
+    """The number in a cell that `first_bad_cell` lets pass; NaN for an empty one."""
+    return float(cell.replace(",", ".")) if cell.strip() else math.nan
+
+
+# Writing
+
+
+def write_csv(
+    handle: TextIO,
+    header: Iterable[str],
+    rows: Iterable[Iterable[object]],
+    comments: Iterable[str] = (),
+) -> None:
+    """Write a table as CSV, each of `comments` on a line of its own above it, after #."""
+    handle.writelines(f"# {comment}\n" for comment in comments)
+    writer = csv.writer(handle, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+
+
+def csv_text(
+    header: Iterable[str], rows: Iterable[Iterable[object]], comments: Iterable[str] = ()
+) -> str:
+    """The text that `write_csv` writes."""
+    text = StringIO()
+    write_csv(text, header, rows, comments)
+    return text.getvalue()

@@ -1,0 +1,70 @@
+"""Words in messages and files: the nearest name, lists, quoted text, labels, and strict JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import unicodedata
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+from typing import Any
+
+SHOWN = 60
+
+
+def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str | None:
+    """The valid name closest to `name`, upper and lower case alike; None where none is near."""
+    by_lower = {v.lower(): v for v in reversed(list(valid))}
+    # difflib is quadratic, and a name this long is no typing error anyway.
+    near = get_close_matches(name[:SHOWN].lower(), by_lower, n=1, cutoff=cutoff)
+    return by_lower[near[0]] if near else None
+
+
+def did_you_mean(name: str, valid: Iterable[str]) -> str:
+    """' (did you mean 'x'?)' for the nearest valid name, or '' where none is near."""
+    near = nearest(name, valid)
+    return f" (did you mean '{near}'?)" if near else ""
+
+
+def listed(names: Iterable[str], limit: int = 30) -> str:
+    """Names joined by commas, cut after `limit` with the number left off."""
+    names = list(names)
+    more = f", … ({len(names) - limit} more)" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more
+
+
+def quoted(found: object) -> str:
+    """`found` as a message shows it: quoted, on one line, cut when long."""
+    text = found if isinstance(found, str) else str(found)
+    text = repr(text[:SHOWN] + "…") if len(text) > SHOWN else repr(text)
+    return text if isinstance(found, str) else text[1:-1]
+
+
+def is_label(text: str) -> bool:
+    """Can this text stand in a table cell and be read back: one line, no blanks at its ends?"""
+    return bool(text) and text == text.strip() and not any(map(_is_control, text))
+
+
+def _is_control(character: str) -> bool:
+    return unicodedata.category(character) in ("Cc", "Cs") or character == "\ufeff"
+
+
+def plain(value: Any) -> Any:
+    """`value` with numpy numbers and arrays as plain ones, and None for numbers not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    # numpy's arrays and numbers, without loading numpy for it: --help comes by here.
+    return plain(value.tolist()) if hasattr(value, "tolist") else value
+
+
+def json_text(value: Any) -> str:
+    """`value` as strict JSON over several lines, without a newline at its end.
+
+    Numbers that do not exist become null; documentation of each key says what its null means.
+    Raises TypeError for what JSON has no form for.
+    """
+    return json.dumps(plain(value), indent=1, allow_nan=False)

@@ -1,0 +1,88 @@
+"""What every table that people hand us has in common: comments, empty cells, headers, and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from elastocal.errors import InputError
+from elastocal.tables import (
+    NO_UNIT,
+    Family,
+    csv_text,
+    layout_of_columns,
+    match_columns,
+    read_table,
+)
+
+FAMILIES = {
+    family.name: family
+    for family in (
+        Family("name", "names", {"name": NO_UNIT}, is_label=True, optional=("name",)),
+        Family("place", "places", {"x": ("mm", "m"), "y": ("mm", "m")}),
+        Family("end", "ends", dict.fromkeys(("low", "high"), ("N",)), optional=("low", "high")),
+    )
+}
+
+
+def read(text, **options):
+    def choose(header):
+        present = match_columns("t.csv", header, FAMILIES)
+        return layout_of_columns("t.csv", present, FAMILIES, [("place",)], "this table needs")
+
+    return read_table("t.csv", choose, what="list", text=text, **options)
+
+
+def test_comments_and_lines_of_empty_cells_are_passed_over():
+    table = read("\ufeff# by hand\n\nname,x_mm,y_mm\n#,a\na,1,2\n,,\nb,3,4\n", comments=True)
+    assert table.row.tolist() == [5, 7]
+    assert table.si("place").tolist() == [[0.001, 0.002], [0.003, 0.004]]
+    assert [table.text(i, "name") for i in range(2)] == ["a", "b"]
+
+
+def test_cells_may_be_empty_where_the_column_may_be_absent_and_only_there():
+    table = read("name;x_m;y_m;high_N\n;1,5;2;\nb;3;4;5\n")
+    assert table.text(0, "name") == ""
+    assert math.isnan(table.numbers["high_N"][0]) and table.numbers["high_N"][1] == 5
+    assert table.numbers["x_m"].tolist() == [1.5, 3]
+    assert table.column("end", "low") is None
+    with pytest.raises(InputError, match=r"^t.csv, line 2, column y_m: empty cell"):
+        read("x_m,y_m,high_N\n1,,3\n")
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("x_mm,y_mm,x_m", "columns x_mm and x_m say the same; keep one"),
+        ("x_mm,y_m", "columns x_mm and y_m mix units; give all places in one unit"),
+        ("x_mm", "x_mm without y_mm; the table needs all columns of the places$"),
+        ("low_N", "the columns x_mm,y_mm are missing, which this table needs; found low_N"),
+        ("x,y_mm", "column 'x' has no unit; write x_mm or x_m"),
+        ("x_cm,y_mm", "the unit cm is not taken here; write x_mm or x_m"),
+    ],
+)
+def test_what_is_wrong_with_a_header_is_told(header, message):
+    with pytest.raises(InputError, match=f"^t.csv: .*{message}"):
+        read(f"{header}\n1,2,3\n")
+
+
+CELL = st.text(st.characters(exclude_categories=("Cc", "Cs")), max_size=5)
+
+
+@given(st.lists(st.lists(CELL, min_size=2, max_size=2), max_size=5))
+def test_what_is_written_is_csv_whatever_the_cells(rows):
+    text = csv_text(["a", "b"], rows, comments=["made by hand"])
+    assert text.startswith("# made by hand\na,b\n")
+    assert list(csv.reader(io.StringIO(text, newline=""), strict=True))[1:] == [["a", "b"], *rows]
+
+
+def test_a_rule_that_a_cell_breaks_is_told_with_its_place():
+    table = read("x_m,y_m\n1,2\n3,4\n")
+    with pytest.raises(InputError, match=r"^t.csv, line 3, column y_m: too far; found 4; correct"):
+        table.check("place", np.array([[True, True], [True, False]]), "too far")
