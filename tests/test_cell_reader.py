@@ -7,10 +7,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from elastocal.cell import CartesianNoise, EffectChoice, PolarNoise
-from elastocal.cell_design import DesignSpec
-from elastocal.cell_reader import read_cell
-from elastocal.cell_workspace import Workspace
+from elastocal.cell import (
+    CartesianNoise,
+    DesignSpec,
+    EffectChoice,
+    PolarNoise,
+    Workspace,
+    read_cell,
+)
 from elastocal.errors import InputError
 
 ROBOT = '[robot]\nurdf = "arm.urdf"\n'

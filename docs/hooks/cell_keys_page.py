@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from elastocal.cell_schema import CellTable
+from elastocal.cell import Cell, table_of
 
 HEAD = """# Keys of the cell file
 
@@ -33,7 +33,7 @@ def page() -> str:
 
 def tables() -> list[tuple[str, type[BaseModel]]]:
     """Each table of the file as it is headed there, with its schema; the file itself first."""
-    return [("cell.toml", CellTable), *_inside(CellTable, "")]
+    return [("cell.toml", table_of(Cell)), *_inside(table_of(Cell), "")]
 
 
 def _inside(table: type[BaseModel], above: str) -> list[tuple[str, type[BaseModel]]]:

@@ -9,7 +9,7 @@ import cell_keys_page
 import pytest
 from typer.testing import CliRunner
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.cli import app
 from elastocal.diagnosis.diagnose import diagnose
 from elastocal.diagnosis.options import DiagnosisOptions

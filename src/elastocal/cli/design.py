@@ -169,8 +169,7 @@ def _target(target: float | None, poses: int | None) -> float | None:
 
 def _read(path: Path, asked: dict[str, Any]) -> Cell:
     """The cell, with what the command line says of [design] in its place."""
-    from elastocal.cell_design import CriterionName
-    from elastocal.cell_reader import read_cell
+    from elastocal.cell import CriterionName, read_cell
     from elastocal.manipulator.effects import CATALOGUE
     from elastocal.nearest import did_you_mean, listed, quoted
 

@@ -10,8 +10,7 @@ from typing import Any
 
 import tomli_w
 
-from elastocal.cell import Cell
-from elastocal.cell_reader import read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.diagnosis.result import Finding
 from elastocal.files import atomic_write_text
 

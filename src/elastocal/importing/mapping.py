@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from elastocal.cell_keys import place
+from elastocal.config import place
 from elastocal.errors import InputError
 from elastocal.files import read_text
 from elastocal.importing.schema import MappingTable, SourceTable

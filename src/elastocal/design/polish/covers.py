@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Solid
 from elastocal.design.feasibility.shapes import mesh_hull
 from elastocal.manipulator import rigid
 

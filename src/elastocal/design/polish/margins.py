@@ -14,8 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell import Cell
-from elastocal.cell_workspace import HalfSpace
+from elastocal.cell import Cell, HalfSpace
 from elastocal.design.feasibility.bodies import Body, data_base
 from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.contact_rules import POSE_SLACK

@@ -1,0 +1,139 @@
+"""The work cell: everything known about arm, tool, tracker and model before measuring."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker
+from elastocal.cell.file_keys import (
+    TUPLE,
+    File,
+    Spot,
+    existing_file,
+    from_table,
+    joint_values,
+    key,
+    record,
+    table_of,
+)
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell.workspace_rules import Workspace
+from elastocal.config import Table, Text, Vector2, checked, header, optional_key, read_toml
+from elastocal.errors import InputError, require
+from elastocal.nearest import did_you_mean, listed, quoted
+
+KnownEffects = tuple[str, ...] | Callable[["Cell"], Iterable[str]]
+
+
+class PluginsTable(Table):
+    """Effects, criteria and noise models of the user's own."""
+
+    modules: list[Text] | None = optional_key(
+        'a list of Python files or modules, as in ["my_effects.py", "my_package.effects"]'
+    )
+
+
+def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
+    """Files as paths that exist, modules as they are named."""
+    return tuple(
+        str(existing_file(module, spot / name, f"modules[{i}]")) if is_file(module) else module
+        for i, module in enumerate(table.modules or ())
+    )
+
+
+def is_file(module: str) -> bool:
+    """Whether an entry of [plugins] modules is a Python file, and no importable module."""
+    return module.endswith(".py")
+
+
+def _limits(table: Mapping[str, Any], spot: Spot, name: str) -> dict[str, tuple[float, float]]:
+    return {joint: (low, high) for joint, (low, high) in joint_values(table, spot, name).items()}
+
+
+@record
+class Cell:
+    """Everything known about arm, tool, tracker and model before measuring.
+
+    `limits` joint → (lower, upper) in rad or m, which narrow those of the robot.  `plugins`:
+    Python files, as absolute paths or relative to the working folder, and importable modules.
+    `path`: the file that it was read from.
+    """
+
+    name: str = key("a text", form=Text)
+    path: File | None = None
+    robot: Robot = key(
+        'a table with urdf = "arm.urdf" or dh = "dh.csv"', required=True, default_factory=Robot
+    )
+    tool: Tool = key("a table", default_factory=Tool)
+    tracker: Tracker = key("a table", default_factory=Tracker)
+    model: ModelSpec = key("a table", default_factory=ModelSpec)
+    limits: dict[str, Annotated[tuple[float, float], TUPLE]] = key(
+        "two numbers per joint, as in joint1_deg = [-170.0, 170.0]",
+        form=dict[str, Vector2],
+        into=_limits,
+        default_factory=dict,
+    )
+    workspace: Workspace = key("a table", default_factory=Workspace)
+    design: DesignSpec = key("a table", default_factory=DesignSpec)
+    plugins: Annotated[tuple[Text, ...], TUPLE] = key(
+        "a table", form=PluginsTable, into=_modules, default=()
+    )
+
+    def __post_init__(self) -> None:
+        for joint, (low, high) in self.limits.items():
+            require(
+                low < high,
+                f"the limits of {joint} in [limits] take [lower, upper] with lower < upper; swap "
+                "or correct them",
+            )
+        sight = self.workspace.visibility
+        self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
+        self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
+        require(
+            not self.workspace.urdf_geometry or self.robot.urdf is not None,
+            'key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm for capsules '
+            "along the links instead",
+        )
+
+    def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:
+        markers = tuple(self.tool.markers)
+        for name in names:
+            require(
+                name in markers,
+                f"{header(table)} names {quoted(name)}, which is no marker of the cell"
+                f"{did_you_mean(name, markers)}; [tool.markers_m] has {listed(markers) or 'none'}",
+            )
+
+    @classmethod
+    def read(cls, path: str | Path, known_effects: KnownEffects | None = None) -> Cell:
+        """Returns the cell that a TOML file describes, in SI units.
+
+        Args:
+            path: the cell file; paths in it are relative to it, and its files must exist.
+            known_effects: the names that [model] effects may use, or a function of the cell that
+                returns them (after loading its plug-ins); None leaves them unchecked.
+
+        Raises:
+            InputError: names file, key, what the key takes and the nearest valid name.
+        """
+        path = Path(path)
+        table = checked(table_of(cls), read_toml(path, "cell file"), path)
+        cell = from_table(cls, table, Spot(path), path=path, name=table.name or path.stem)  # type: ignore[attr-defined]
+        known = known_effects(cell) if callable(known_effects) else known_effects
+        if known is not None:
+            cell._check_effects(tuple(known))
+        return cell
+
+    def _check_effects(self, known: tuple[str, ...]) -> None:
+        for i, choice in enumerate(self.model.effects):
+            if choice.name not in known:
+                raise InputError(
+                    f"{self.path}: key model.effects[{i}] names the unknown effect "
+                    f"{quoted(choice.name)}{did_you_mean(choice.name, known)}; known effects: "
+                    f"{listed(known)}"
+                )
+
+
+read_cell = Cell.read
