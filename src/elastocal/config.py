@@ -45,13 +45,13 @@ class Table(BaseModel):
 TableType = TypeVar("TableType", bound=Table)
 
 
-def optional_key(takes: str) -> Any:
+def key(takes: str) -> Any:
     """An optional key; `takes` completes the sentence 'key … takes …' in messages."""
     return Field(default=None, description=takes)
 
 
-def required_key(takes: str) -> Any:
-    """A key that must be there; `takes` as for `optional_key`."""
+def required(takes: str) -> Any:
+    """A key that must be there; `takes` as for `key`."""
     return Field(description=takes)
 
 
@@ -187,7 +187,7 @@ def _complaint(root: type[BaseModel], data: dict[str, Any], error: ValidationErr
     here = place(*spot.keys)
     if first["type"] == "extra_forbidden":
         return f"unknown key {here}{_advice(spot, root)}"
-    if first["type"] == "missing":
+    if first["type"] == "missing" and spot.found is None:
         return f"key {here} is missing; it takes {spot.takes}"
     hint = ""
     if first["type"] == "literal_error" and isinstance(spot.found, str):
@@ -214,6 +214,8 @@ def _spot(root: type[BaseModel], data: Any, loc: Keys) -> _Spot:
         inner = list(_inside(kinds, part, stated))
         if isinstance(part, int) and not any(map(is_table, inner)):
             break  # a number in a list: the list is shown whole
+        if chosen and not tables:
+            break  # a name in a table of the user's own: that table is shown whole
         if not (fields or inner or (stated and tables)):
             continue  # pydantic's name for a branch of a union
         takes = spot.takes

@@ -120,7 +120,7 @@ def test_every_path_of_the_schema_is_redirected():
                     found |= paths(annotation, (*above, key))
         return found
 
-    assert paths(CellTable, ()) == {(*table, key) for table, keys in PATHS for key in keys}
+    assert paths(table_of(Cell), ()) == {(*table, key) for table, keys in PATHS for key in keys}
 
 
 def test_the_model_gains_the_parameters_of_the_effects_and_no_others(tmp_path):

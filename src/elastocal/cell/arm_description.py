@@ -11,16 +11,14 @@ from pydantic import BeforeValidator, Field
 from elastocal.cell.file_keys import (
     TUPLE,
     File,
-    Floats,
-    Matrix3,
+    Many,
+    Rotation,
     Spot,
-    existing_file,
     from_table,
     joint_values,
-    key,
+    keyed,
     keys_of,
     record,
-    rotation_from_rpy,
 )
 from elastocal.config import (
     Array,
@@ -30,9 +28,9 @@ from elastocal.config import (
     Table,
     Text,
     Vector3,
+    key,
     numbers,
-    optional_key,
-    required_key,
+    required,
 )
 from elastocal.errors import InputError, require
 from elastocal.labels import is_label
@@ -57,20 +55,13 @@ class Robot:
     `masses`: the table of link masses of a DH robot.  Files as absolute or relative paths.
     """
 
-    urdf: File | None = key(
-        'the path of a URDF file, e.g. "arm.urdf"', form=Text, into=existing_file, default=None
-    )
-    base: Text | None = key("the name of a link of the URDF", default=None)
-    flange: Text | None = key("the name of a link of the URDF", default=None)
-    dh: File | None = key(
-        'the path of a DH table, e.g. "nominal_dh.csv"', form=Text, into=existing_file, default=None
-    )
-    dh_convention: Convention = key('"standard" or "modified"', default="standard")
-    masses: File | None = key(
-        'the path of a table of link masses, e.g. "links.csv"',
-        form=Text,
-        into=existing_file,
-        default=None,
+    urdf: File | None = keyed('the path of a URDF file, e.g. "arm.urdf"', default=None)
+    base: Text | None = keyed("the name of a link of the URDF", default=None)
+    flange: Text | None = keyed("the name of a link of the URDF", default=None)
+    dh: File | None = keyed('the path of a DH table, e.g. "nominal_dh.csv"', default=None)
+    dh_convention: Convention = keyed('"standard" or "modified"', default="standard")
+    masses: File | None = keyed(
+        'the path of a table of link masses, e.g. "links.csv"', default=None
     )
 
     def __post_init__(self) -> None:
@@ -134,10 +125,10 @@ class Robot:
 class Tool:
     """`load_point` (3,) and `markers` name → (3,), in m in the flange frame."""
 
-    load_point: Vector3 = key(
+    load_point: Vector3 = keyed(
         "three numbers in m, in the flange frame", "load_point_m", default_factory=_zeros
     )
-    markers: dict[str, Vector3] = key(
+    markers: dict[str, Vector3] = keyed(
         "three numbers in m per marker, flange frame", "markers_m", default_factory=dict
     )
 
@@ -154,17 +145,17 @@ class Tool:
 class CartesianNoise:
     """Standard deviations (3,) in m along x, y, z of the tracker frame; one number for all."""
 
-    sigma: Sigma = key("one positive number in µm, or three for x, y, z", "sigma_um")
+    sigma: Sigma = keyed("one positive number in µm, or three for x, y, z", "sigma_um")
 
 
 @record
 class PolarNoise:
     """Range and transverse standard deviation: constant part in m, part per metre of range (1)."""
 
-    range: Positive = key("a positive number in µm", "range_um")
-    range_per_m: NonNegative = key("a number >= 0 in µm per m", "range_ppm")
-    transverse: Positive = key("a positive number in µm", "transverse_um")
-    transverse_per_m: NonNegative = key("a number >= 0 in µm per m", "transverse_ppm")
+    range: Positive = keyed("a positive number in µm", "range_um")
+    range_per_m: NonNegative = keyed("a number >= 0 in µm per m", "range_ppm")
+    transverse: Positive = keyed("a positive number in µm", "transverse_um")
+    transverse_per_m: NonNegative = keyed("a number >= 0 in µm per m", "transverse_ppm")
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
@@ -183,15 +174,15 @@ class Tracker:
     `rotation_sigma` rad and `distance_sigma` m: noise of pose and distance readings, if known.
     """
 
-    position: Vector3 = key("three numbers in m", "position_m", default_factory=_zeros)
-    noise: CartesianNoise | PolarNoise | None = key(
+    position: Vector3 = keyed("three numbers in m", "position_m", default_factory=_zeros)
+    noise: CartesianNoise | PolarNoise | None = keyed(
         keys=keys_of(CartesianNoise, PolarNoise), default=None
     )
-    anchor: Vector3 | None = key("three numbers in m", "anchor_m", default=None)
-    rotation_sigma: Positive | None = key(
+    anchor: Vector3 | None = keyed("three numbers in m", "anchor_m", default=None)
+    rotation_sigma: Positive | None = keyed(
         "a positive number in µrad", "rotation_urad", default=None
     )
-    distance_sigma: Positive | None = key("a positive number in µm", "distance_um", default=None)
+    distance_sigma: Positive | None = keyed("a positive number in µm", "distance_um", default=None)
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
@@ -254,13 +245,13 @@ def _choices(entries: object) -> object:
 class CompensatorTable(Table):
     """A spring between two anchor points that takes a part of a joint's load."""
 
-    joint: JointName = required_key('the joint the spring spans, e.g. "joint2"')
-    stiffness_N_per_m: NonNegative | None = optional_key("a number >= 0 in N/m")
-    anchor_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = optional_key(
+    joint: JointName = required('the joint the spring spans, e.g. "joint2"')
+    stiffness_N_per_m: NonNegative | None = key("a number >= 0 in N/m")
+    anchor_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = key(
         "two numbers in m"
     )
-    arm_m: Positive | None = optional_key("a positive number in m")
-    free_length_m: NonNegative | None = optional_key("a number >= 0 in m")
+    arm_m: Positive | None = key("a positive number in m")
+    free_length_m: NonNegative | None = key("a number >= 0 in m")
 
 
 @record
@@ -270,24 +261,20 @@ class Nominal:
     `settings`: place → key → value of the constants that effects do not fit, in the key's unit.
     """
 
-    joint_compliance: Annotated[tuple[NonNegative, ...], TUPLE, Field(min_length=1)] | None = key(
+    joint_compliance: Annotated[tuple[NonNegative, ...], TUPLE, Field(min_length=1)] | None = keyed(
         "one number >= 0 per joint, in rad/(N m)", default=None
     )
-    base_position: Vector3 | None = key("three numbers in m", "base_position_m", default=None)
-    base_rotation: Matrix3 | None = key(
-        "three numbers in degrees: roll, pitch, yaw",
-        "base_rpy_deg",
-        form=Vector3,
-        into=rotation_from_rpy,
-        default=None,
+    base_position: Vector3 | None = keyed("three numbers in m", "base_position_m", default=None)
+    base_rotation: Rotation | None = keyed(
+        "three numbers in degrees: roll, pitch, yaw", "base_rpy_deg", default=None
     )
-    gravity_compensator: dict[str, Any] | None = key(
+    gravity_compensator: dict[str, Any] | None = keyed(
         'a table with joint = "joint2"',
         form=CompensatorTable,
         into=lambda table, *_: table.model_dump(exclude_none=True),
         default=None,
     )
-    settings: dict[str, dict[str, float]] = key(
+    settings: dict[str, dict[str, float]] = keyed(
         "a table per place, as in settings.joint2 = { jump_time_s = 720.0 }", default_factory=dict
     )
 
@@ -299,29 +286,29 @@ class ModelSpec:
     `effects` may be stated as texts, "effect" or "effect:where".
     """
 
-    observe: Observe = key('"position", "deflection", "pose" or "distance"', default="position")
-    effects: Annotated[tuple[EffectChoice, ...], BeforeValidator(_choices)] = key(
+    observe: Observe = keyed('"position", "deflection", "pose" or "distance"', default="position")
+    effects: Annotated[tuple[EffectChoice, ...], BeforeValidator(_choices)] = keyed(
         'a list of "effect" or "effect:where"', form=list[Text], default=()
     )
-    torque: Literal["computed", "measured"] = key('"computed" or "measured"', default="computed")
-    link_gravity: bool = key("true or false", default=False)
-    deflection_model: Literal["equilibrium", "linear"] = key(
+    torque: Literal["computed", "measured"] = keyed('"computed" or "measured"', default="computed")
+    link_gravity: bool = keyed("true or false", default=False)
+    deflection_model: Literal["equilibrium", "linear"] = keyed(
         '"equilibrium" or "linear"', default="equilibrium"
     )
-    compliance_levels: dict[str, Floats] = key(
+    compliance_levels: dict[str, Many[float]] = keyed(
         "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
         form=dict[str, Numbers],
         into=joint_values,
         default_factory=dict,
     )
-    gear_ripple_orders: Annotated[tuple[Positive, ...], TUPLE] = key(
-        "a list of positive numbers", default=()
+    gear_ripple_orders: Many[Positive] = keyed("a list of positive numbers", default=())
+    thermal_driver: Literal["time", "temperature"] = keyed(
+        '"time" or "temperature"', default="time"
     )
-    thermal_driver: Literal["time", "temperature"] = key('"time" or "temperature"', default="time")
-    play_side: Literal["load", "load_and_approach"] = key(
+    play_side: Literal["load", "load_and_approach"] = keyed(
         '"load" or "load_and_approach"', default="load"
     )
-    nominal: Nominal = key("a table", default_factory=Nominal)
+    nominal: Nominal = keyed("a table", default_factory=Nominal)
 
     def __post_init__(self) -> None:
         for i, choice in enumerate(self.effects):

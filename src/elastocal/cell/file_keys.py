@@ -1,7 +1,7 @@
 """How the classes of the cell state their keys in the cell file, and are built from it.
 
 A class of the cell is a `record`: a frozen dataclass in SI units whose fields pydantic checks.  A
-field that a cell file may state is a `key`: its name and unit there, and what it takes.  From
+field that a cell file may state is `keyed`: its name and unit there, and what it takes.  From
 these keys come the table that a file is checked against (`table_of`), the record of a checked
 table (`from_table`), and what is said of a wrong argument in Python.
 """
@@ -9,15 +9,17 @@ table (`from_table`), and what is said of a wrong argument in Python.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, wraps
 from pathlib import Path
+from types import UnionType
 from typing import (
     Annotated,
     Any,
     ClassVar,
     TypeVar,
+    Union,
     dataclass_transform,
     get_args,
     get_origin,
@@ -40,6 +42,8 @@ from elastocal.config import (
     STRICT,
     Array,
     Table,
+    Text,
+    Vector3,
     alternatives,
     dotted,
     numbers,
@@ -52,6 +56,7 @@ from elastocal.nearest import did_you_mean, listed
 from elastocal.units import to_si
 
 Record = TypeVar("Record")
+Member = TypeVar("Member")
 JOINT_UNITS = ("deg", "rad", "m", "mm")
 JOINT_KEY = re.compile(r"(joint[1-9][0-9]{0,2})(?:_(deg|rad|mm|m))?", re.ASCII)
 # Units that key names end with, in words, and the SI unit in its place in Python.
@@ -104,7 +109,15 @@ class Key:
         return max((u for u in UNITS if self.name.endswith("_" + u)), key=len, default="")
 
 
-def key(
+@dataclass(frozen=True)
+class FromFile:
+    """In the Annotated of a type: the `form` and `into` of its keys, as of `Key`."""
+
+    form: Any
+    into: Callable[[Any, Spot, str], Any]
+
+
+def keyed(
     takes: str = "",
     *names: str,
     form: Any = None,
@@ -129,7 +142,7 @@ def key(
 CONFIG = STRICT | ConfigDict(arbitrary_types_allowed=True)
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(field, key))
+@dataclass_transform(frozen_default=True, field_specifiers=(field, keyed))
 def record(cls: type[Record]) -> type[Record]:
     """Make a class a frozen dataclass whose fields are checked, in SI units.
 
@@ -161,7 +174,7 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
         return f"{own}: {name} is missing; it takes {listed(fields)}"
     told = first["msg"].removeprefix("Input should be ")
     for known in fields[name][:1]:
-        if known.form is None and "dataclass" not in kind:
+        if known.form is None and kind != "matrix" and "dataclass" not in kind:
             told = known.takes.replace(*UNITS.get(known.unit, ("", "")))
     hint = did_you_mean(str(first["input"]), re.findall(r'"(\w+)"', told))
     return f"{own}: {name} takes {told}; found {shown(first['input'])}{hint}"
@@ -170,10 +183,23 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
 @cache
 def fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     """The fields of a record by name, each with the keys that state it in a cell file."""
-    return {
-        name: tuple(replace(k, name=k.name or name) for k in one.metadata.get("keys", ()))
-        for name, one in cls.__dataclass_fields__.items()
-    }
+    hints = get_type_hints(cls, include_extras=True)
+    found = {}
+    for name, one in cls.__dataclass_fields__.items():
+        how = next((note for note in _notes(hints[name]) if isinstance(note, FromFile)), None)
+        found[name] = tuple(
+            replace(known, name=known.name or name, into=known.into or (how and how.into))
+            for known in one.metadata.get("keys", ())
+        )
+    return found
+
+
+def _notes(hint: Any) -> Iterator[Any]:
+    """What stands in the Annotated of a type, or of a member of a union."""
+    yield from getattr(hint, "__metadata__", ())
+    if get_origin(hint) in (Union, UnionType):
+        for member in get_args(hint):
+            yield from _notes(member)
 
 
 # --- From the file -------------------------------------------------------------------------------
@@ -201,7 +227,10 @@ def keys_of(*records: Any, without: Sequence[str] = (), optional: bool = False) 
 
 
 def _form(hint: Any) -> Any:
-    """The type that a field has in the file: tables in place of records."""
+    """The type that a field has in the file: there are tables in place of records."""
+    for note in _notes(hint):
+        if isinstance(note, FromFile):
+            return note.form
     for kind in alternatives(hint):
         if _is_record(kind):
             return table_of(kind)
@@ -368,8 +397,8 @@ def _path(value: object) -> object:
 
 
 TUPLE = BeforeValidator(_tuple)
-Floats = Annotated[tuple[float, ...], TUPLE]
-File = Annotated[Path, BeforeValidator(_path)]
-Matrix3 = Annotated[Array, _matrix(3)]
-Matrix4 = Annotated[Array, _matrix(4)]
-Direction = Annotated[Array, PlainValidator(_direction)]
+Many = Annotated[tuple[Member, ...], TUPLE]
+File = Annotated[Path, BeforeValidator(_path), FromFile(Text, existing_file)]
+Rotation = Annotated[Array, _matrix(3), FromFile(Vector3, rotation_from_rpy)]
+Transform = Annotated[Array, _matrix(4)]
+Direction = Annotated[Array, PlainValidator(_direction), FromFile(Vector3, direction)]

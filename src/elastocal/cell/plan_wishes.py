@@ -8,18 +8,15 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from elastocal.cell.file_keys import (
-    TUPLE,
     File,
-    Floats,
     Key,
-    Matrix3,
+    Many,
+    Rotation,
     Spot,
-    existing_file,
     fields_of,
     joint_values,
-    key,
+    keyed,
     record,
-    rotation_from_rpy,
     stated,
 )
 from elastocal.config import (
@@ -32,8 +29,8 @@ from elastocal.config import (
     Text,
     Vector3,
     header,
+    key,
     numbers,
-    optional_key,
 )
 from elastocal.errors import require
 
@@ -62,11 +59,11 @@ def _per_joint(name: str) -> tuple[Key, ...]:
 
 
 def _force() -> Any:
-    return key("three numbers in N, a force in the data's frame", "load_N", default=None)
+    return keyed("three numbers in N, a force in the data's frame", "load_N", default=None)
 
 
 def _point() -> Any:
-    return key("three numbers in m, a point in the flange frame", "point_m", default=None)
+    return keyed("three numbers in m, a point in the flange frame", "point_m", default=None)
 
 
 @record
@@ -79,9 +76,9 @@ class TargetPose:
     revolute joints only.
     """
 
-    q: Numbers = key(keys=_per_joint("q"))
+    q: Numbers = keyed(keys=_per_joint("q"))
     force: Vector3 | None = _force()
-    weight: Positive = key("a positive number", default=1.0)
+    weight: Positive = keyed("a positive number", default=1.0)
     point: Vector3 | None = _point()
     degrees: bool = False
 
@@ -100,12 +97,7 @@ class TargetPose:
 class TargetPath:
     """A table of poses: q1_deg … (force_x_N …), or x_mm, y_mm, z_mm (rx_deg …) of the point."""
 
-    file: File = key(
-        'the path of a table of poses, e.g. "path.csv"',
-        form=Text,
-        into=existing_file,
-        required=True,
-    )
+    file: File = keyed('the path of a table of poses, e.g. "path.csv"', required=True)
     force: Vector3 | None = _force()
     point: Vector3 | None = _point()
 
@@ -117,19 +109,15 @@ class TargetBox:
     `rotation` (3, 3) of the flange in the data's frame, None for any that the arm reaches.
     """
 
-    lower: Vector3 = key(
+    lower: Vector3 = keyed(
         "three numbers in m, a corner in the data's frame", "lower_m", required=True
     )
-    upper: Vector3 = key(
+    upper: Vector3 = keyed(
         "three numbers in m, the opposite corner in the data's frame", "upper_m", required=True
     )
-    count: Annotated[int, Field(ge=1, le=10_000)] = key("a whole number, 1 to 10000", default=20)
-    rotation: Matrix3 | None = key(
-        "three numbers in degrees: roll, pitch, yaw of the flange",
-        "rpy_deg",
-        form=Vector3,
-        into=rotation_from_rpy,
-        default=None,
+    count: Annotated[int, Field(ge=1, le=10_000)] = keyed("a whole number, 1 to 10000", default=20)
+    rotation: Rotation | None = keyed(
+        "three numbers in degrees: roll, pitch, yaw of the flange", "rpy_deg", default=None
     )
     force: Vector3 | None = _force()
     point: Vector3 | None = _point()
@@ -151,12 +139,12 @@ class Motion:
     `both_directions`: approach every pose from both sides (`overshoot` rad), to show backlash.
     `degrees`: speed or home were stated in degrees, which fits revolute joints only."""
 
-    speed: Positives | None = key(keys=SPEED_KEYS, default=None)
-    home: Numbers | None = key(keys=_per_joint("home"), default=None)
-    dwell: NonNegative = key("a number >= 0 in s", "dwell_s", default=30.0)
-    load_change: NonNegative = key("a number >= 0 in s", "load_change_s", default=600.0)
-    both_directions: bool = key("true or false", default=False)
-    overshoot: Positive = key("a positive number in degrees", "overshoot_deg", default=0.05)
+    speed: Positives | None = keyed(keys=SPEED_KEYS, default=None)
+    home: Numbers | None = keyed(keys=_per_joint("home"), default=None)
+    dwell: NonNegative = keyed("a number >= 0 in s", "dwell_s", default=30.0)
+    load_change: NonNegative = keyed("a number >= 0 in s", "load_change_s", default=600.0)
+    both_directions: bool = keyed("true or false", default=False)
+    overshoot: Positive = keyed("a positive number in degrees", "overshoot_deg", default=0.05)
     degrees: bool = False
 
     @classmethod
@@ -178,7 +166,7 @@ class LevelsTable(Table):
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Numbers] = Field(init=False)
-    poses_per_level: Count | Annotated[list[Count], Field(min_length=1)] | None = optional_key(
+    poses_per_level: Count | Annotated[list[Count], Field(min_length=1)] | None = key(
         "a whole number >= 1, or one per level"
     )
 
@@ -192,47 +180,47 @@ class DesignSpec:
     m per marker instead of the tracker's noise; `interest`: parameters, places or effects that
     D, A, E and O count (default all but base and markers); `combination` name → factor for c."""
 
-    poses: Count | None = key("a whole number >= 1", default=None)
-    criterion: CriterionName = key(CRITERIA, default="test_pose")
-    levels: dict[str, Floats] = key(
+    poses: Count | None = keyed("a whole number >= 1", default=None)
+    criterion: CriterionName = keyed(CRITERIA, default="test_pose")
+    levels: dict[str, Many[float]] = keyed(
         "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
         form=LevelsTable,
         default_factory=dict,
     )
-    per_level: Annotated[tuple[Count, ...], TUPLE] = ()
-    repeats: Count = key("a whole number >= 1", default=1)
-    loads: Array | None = key(
+    per_level: Many[Count] = ()
+    repeats: Count = keyed("a whole number >= 1", default=1)
+    loads: Array | None = keyed(
         "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]",
         "loads_N",
         form=Annotated[list[Vector3], Field(min_length=1)],
         into=lambda found, *_: np.array(found),
         default=None,
     )
-    load_choice: bool = key("true or false", default=False)
-    repeatability: NonNegative = key("a number >= 0 in µm", "repeatability_um", default=0.0)
-    marker_sigma: dict[str, Positive] = key(
+    load_choice: bool = keyed("true or false", default=False)
+    repeatability: NonNegative = keyed("a number >= 0 in µm", "repeatability_um", default=0.0)
+    marker_sigma: dict[str, Positive] = keyed(
         "a positive number in µm per marker", "marker_sigma_um", default_factory=dict
     )
-    interest: Annotated[tuple[Text, ...], TUPLE] = key(
+    interest: Many[Text] = keyed(
         'a list of names, as in ["joint_compliance", "joint2"]', default=()
     )
-    combination: dict[str, float] = key(
+    combination: dict[str, float] = keyed(
         'factors by parameter, with names in quotes, as in { "joint2.compliance" = 1.0 }',
         default_factory=dict,
     )
-    prior: Literal["none", "typical"] = key('"none" or "typical"', default="none")
-    robust: Literal["none", "average", "worst"] = key(
+    prior: Literal["none", "typical"] = keyed('"none" or "typical"', default="none")
+    robust: Literal["none", "average", "worst"] = keyed(
         '"none", "average" or "worst"', default="none"
     )
-    robust_samples: Count = key("a whole number >= 1", default=8)
-    candidates: Count = key("a whole number >= 1", default=20_000)
-    target: Positive | None = key("a positive number in µm", "target_um", default=None)
-    test_poses: Annotated[tuple[TargetPose, ...], TUPLE] = key(
+    robust_samples: Count = keyed("a whole number >= 1", default=8)
+    candidates: Count = keyed("a whole number >= 1", default=20_000)
+    target: Positive | None = keyed("a positive number in µm", "target_um", default=None)
+    test_poses: Many[TargetPose] = keyed(
         "tables, each headed [[design.test_pose]]", "test_pose", default=()
     )
-    test_path: TargetPath | None = key("a table headed [design.test_path]", default=None)
-    test_box: TargetBox | None = key("a table headed [design.test_box]", default=None)
-    motion: Motion = key("a table headed [design.motion]", default_factory=Motion)
+    test_path: TargetPath | None = keyed("a table headed [design.test_path]", default=None)
+    test_box: TargetBox | None = keyed("a table headed [design.test_box]", default=None)
+    motion: Motion = keyed("a table headed [design.motion]", default_factory=Motion)
 
     def __post_init__(self) -> None:
         joints = " and ".join(self.levels)

@@ -10,17 +10,18 @@ from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker
 from elastocal.cell.file_keys import (
     TUPLE,
     File,
+    Many,
     Spot,
     existing_file,
     from_table,
     joint_values,
-    key,
+    keyed,
     record,
     table_of,
 )
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.config import Table, Text, Vector2, checked, header, optional_key, read_toml
+from elastocal.config import Table, Text, Vector2, checked, header, key, read_toml
 from elastocal.errors import InputError, require
 from elastocal.nearest import did_you_mean, listed, quoted
 
@@ -30,7 +31,7 @@ KnownEffects = tuple[str, ...] | Callable[["Cell"], Iterable[str]]
 class PluginsTable(Table):
     """Effects, criteria and noise models of the user's own."""
 
-    modules: list[Text] | None = optional_key(
+    modules: list[Text] | None = key(
         'a list of Python files or modules, as in ["my_effects.py", "my_package.effects"]'
     )
 
@@ -61,25 +62,23 @@ class Cell:
     `path`: the file that it was read from.
     """
 
-    name: str = key("a text", form=Text)
+    name: str = keyed("a text", form=Text)
     path: File | None = None
-    robot: Robot = key(
+    robot: Robot = keyed(
         'a table with urdf = "arm.urdf" or dh = "dh.csv"', required=True, default_factory=Robot
     )
-    tool: Tool = key("a table", default_factory=Tool)
-    tracker: Tracker = key("a table", default_factory=Tracker)
-    model: ModelSpec = key("a table", default_factory=ModelSpec)
-    limits: dict[str, Annotated[tuple[float, float], TUPLE]] = key(
+    tool: Tool = keyed("a table", default_factory=Tool)
+    tracker: Tracker = keyed("a table", default_factory=Tracker)
+    model: ModelSpec = keyed("a table", default_factory=ModelSpec)
+    limits: dict[str, Annotated[tuple[float, float], TUPLE]] = keyed(
         "two numbers per joint, as in joint1_deg = [-170.0, 170.0]",
         form=dict[str, Vector2],
         into=_limits,
         default_factory=dict,
     )
-    workspace: Workspace = key("a table", default_factory=Workspace)
-    design: DesignSpec = key("a table", default_factory=DesignSpec)
-    plugins: Annotated[tuple[Text, ...], TUPLE] = key(
-        "a table", form=PluginsTable, into=_modules, default=()
-    )
+    workspace: Workspace = keyed("a table", default_factory=Workspace)
+    design: DesignSpec = keyed("a table", default_factory=DesignSpec)
+    plugins: Many[Text] = keyed("a table", form=PluginsTable, into=_modules, default=())
 
     def __post_init__(self) -> None:
         for joint, (low, high) in self.limits.items():

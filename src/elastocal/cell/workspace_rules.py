@@ -16,15 +16,14 @@ from elastocal.cell.file_keys import (
     TUPLE,
     Direction,
     File,
-    Floats,
     Key,
-    Matrix4,
+    Many,
     Spot,
+    Transform,
     direction,
-    existing_file,
     fields_of,
     from_table,
-    key,
+    keyed,
     keys_of,
     record,
     rotation_from_rpy,
@@ -99,17 +98,11 @@ class Solid:
     the file `mesh`.
     """
 
-    name: str = key('a name of its own, e.g. "table"', form=Text, required=True)
-    shape: Shape = key(SHAPES, required=True)
-    size: Numbers = key(keys=SIZE_KEYS)
-    placement: Matrix4 = key(keys=PLACE_KEYS, default_factory=lambda: np.eye(4))
-    mesh: File | None = key(
-        'the path of a mesh, e.g. "fixture.stl"',
-        "file",
-        form=Text,
-        into=existing_file,
-        default=None,
-    )
+    name: str = keyed('a name of its own, e.g. "table"', form=Text, required=True)
+    shape: Shape = keyed(SHAPES, required=True)
+    size: Numbers = keyed(keys=SIZE_KEYS)
+    placement: Transform = keyed(keys=PLACE_KEYS, default_factory=lambda: np.eye(4))
+    mesh: File | None = keyed('the path of a mesh, e.g. "fixture.stl"', "file", default=None)
 
     def __post_init__(self) -> None:
         count = {"box": 3, "mesh": 3, "sphere": 1}.get(self.shape, 2)
@@ -151,8 +144,8 @@ class Solid:
 class CarriedBody:
     """A solid fixed to `on`: "base", "link1" … "linkN" (moved by joint N) or "flange"."""
 
-    solid: Solid = key(keys=keys_of(Solid))
-    on: Part = key(
+    solid: Solid = keyed(keys=keys_of(Solid))
+    on: Part = keyed(
         '"flange", "base", or a link as in "link3" (the one joint 3 moves)', default="flange"
     )
 
@@ -166,15 +159,12 @@ class CarriedBody:
 class HalfSpace:
     """Nothing may be where normal · (x − point) < 0; `normal` (3,) is a unit vector."""
 
-    name: str = key('a name of its own, e.g. "walkway"', form=Text, required=True)
-    point: Vector3 = key(
+    name: str = keyed('a name of its own, e.g. "walkway"', form=Text, required=True)
+    point: Vector3 = keyed(
         "three numbers in m, a point of the boundary plane", "point_m", required=True
     )
-    normal: Direction = key(
-        "three numbers, a direction to the side where the arm may be",
-        form=Vector3,
-        into=direction,
-        required=True,
+    normal: Direction = keyed(
+        "three numbers, a direction to the side where the arm may be", required=True
     )
 
 
@@ -187,14 +177,14 @@ class HangingLoad:
     vertical by `max_angle` rad.  `min_height` in m: lowest point of the load in the data's frame.
     """
 
-    solid: Solid = key(keys=keys_of(Solid, without=("name", "position_m", "rpy_deg")))
-    rope: NonNegative = key("a number >= 0 in m, from load point to load", "rope_m", default=0.0)
-    rope_radius: Positive = key("a positive number in mm", "rope_radius_mm", default=0.01)
-    rope_axis: Direction | None = key(
-        "three numbers, a direction in the flange frame", form=Vector3, into=direction, default=None
+    solid: Solid = keyed(keys=keys_of(Solid, without=("name", "position_m", "rpy_deg")))
+    rope: NonNegative = keyed("a number >= 0 in m, from load point to load", "rope_m", default=0.0)
+    rope_radius: Positive = keyed("a positive number in mm", "rope_radius_mm", default=0.01)
+    rope_axis: Direction | None = keyed(
+        "three numbers, a direction in the flange frame", default=None
     )
-    max_angle: float | None = key(ANGLE, "max_angle_deg", form=Angle, default=None)
-    min_height: float | None = key(
+    max_angle: float | None = keyed(ANGLE, "max_angle_deg", form=Angle, default=None)
+    min_height: float | None = keyed(
         "a number in m, a height in the data's frame", "min_height_m", default=None
     )
 
@@ -227,18 +217,18 @@ class Visibility:
     `range` m; `beam_radius` m of free sight.
     """
 
-    normals: dict[str, Direction] = key(
+    normals: dict[str, Direction] = keyed(
         "three numbers per marker, in the flange frame",
         form=dict[str, Vector3],
         into=_normals,
         default_factory=dict,
     )
-    max_incidence: float | None = key(ANGLE, "max_incidence_deg", form=Angle, default=None)
-    range: Annotated[tuple[Reach, Reach], TUPLE] = key(
+    max_incidence: float | None = keyed(ANGLE, "max_incidence_deg", form=Angle, default=None)
+    range: Annotated[tuple[Reach, Reach], TUPLE] = keyed(
         "two numbers in m, [nearest, farthest]", "range_m", form=Vector2, default=(0.0, np.inf)
     )
-    beam_radius: NonNegative = key("a number >= 0 in mm", "beam_radius_mm", default=0.005)
-    line_of_sight: bool = key("true or false", default=True)
+    beam_radius: NonNegative = keyed("a number >= 0 in mm", "beam_radius_mm", default=0.005)
+    line_of_sight: bool = keyed("true or false", default=True)
 
     def __post_init__(self) -> None:
         low, high = self.range
@@ -266,32 +256,26 @@ class Workspace:
     `self_clearance` m between bodies of the arm; `ignored_pairs` of body names that may touch;
     `torque_limits` (n,) N m static, () none."""
 
-    obstacles: Annotated[tuple[Solid, ...], TUPLE] = key(
+    obstacles: Many[Solid] = keyed(
         "tables, each headed [[workspace.obstacle]]", "obstacle", default=()
     )
-    bodies: Annotated[tuple[CarriedBody, ...], TUPLE] = key(
-        "tables, each headed [[workspace.body]]", "body", default=()
-    )
-    keep_out: Annotated[tuple[HalfSpace, ...], TUPLE] = key(
-        "tables, each headed [[workspace.keep_out]]", default=()
-    )
-    load: HangingLoad | None = key("a table headed [workspace.load]", default=None)
-    visibility: Visibility | None = key("a table headed [workspace.visibility]", default=None)
-    link_radius: Floats = key(keys=RADIUS_KEYS, default=())
-    urdf_geometry: bool = key(
+    bodies: Many[CarriedBody] = keyed("tables, each headed [[workspace.body]]", "body", default=())
+    keep_out: Many[HalfSpace] = keyed("tables, each headed [[workspace.keep_out]]", default=())
+    load: HangingLoad | None = keyed("a table headed [workspace.load]", default=None)
+    visibility: Visibility | None = keyed("a table headed [workspace.visibility]", default=None)
+    link_radius: Many[float] = keyed(keys=RADIUS_KEYS, default=())
+    urdf_geometry: bool = keyed(
         '"capsules", "urdf" or "none"',
         "geometry",
         form=Literal["capsules", "urdf", "none"],
         into=lambda found, *_: found == "urdf",
         default=False,
     )
-    self_collision: bool = key("true or false", default=True)
-    ignored_pairs: Annotated[tuple[Pair, ...], TUPLE] = key(
-        'pairs of names, as in [["link2", "link4"]]', default=()
-    )
-    clearance: NonNegative = key(keys=_lengths("clearance"), default=0.0)
-    self_clearance: NonNegative = key(keys=_lengths("self_clearance"), default=0.0)
-    torque_limits: Annotated[tuple[Positive, ...], TUPLE] = key(
+    self_collision: bool = keyed("true or false", default=True)
+    ignored_pairs: Many[Pair] = keyed('pairs of names, as in [["link2", "link4"]]', default=())
+    clearance: NonNegative = keyed(keys=_lengths("clearance"), default=0.0)
+    self_clearance: NonNegative = keyed(keys=_lengths("self_clearance"), default=0.0)
+    torque_limits: Many[Positive] = keyed(
         "one positive number per joint, in N m", "torque_limits_Nm", default=()
     )
 
