@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from elastocal.cell.file_keys import Spot, direction
 from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.cell import Workspace, read_cell
+from elastocal.cell.file_keys import Spot, direction
 from elastocal.errors import InputError
 
 CELL = """

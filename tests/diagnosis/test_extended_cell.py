@@ -11,14 +11,13 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from elastocal.cell_schema import CellTable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel
 from support.diagnoses import ECCENTRICITY, JUMP
 from support.robots import KR270
 
-from elastocal.cell import EffectChoice, read_cell
+from elastocal.cell import Cell, EffectChoice, read_cell, table_of
 from elastocal.diagnosis.extended_cell import PATHS, write_extended_cell
 from elastocal.errors import InputError
 from elastocal.manipulator.effects import CATALOGUE

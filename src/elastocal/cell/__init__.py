@@ -25,7 +25,7 @@ from elastocal.cell.plan_wishes import (
     TargetPath,
     TargetPose,
 )
-from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell.work_cell import Cell, is_plugin_file, read_cell
 from elastocal.cell.workspace_rules import (
     CarriedBody,
     HalfSpace,
@@ -63,6 +63,7 @@ __all__ = [
     "Tracker",
     "Visibility",
     "Workspace",
+    "is_plugin_file",
     "read_cell",
     "rotation_from_rpy",
     "table_of",

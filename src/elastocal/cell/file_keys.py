@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, wraps
 from pathlib import Path
@@ -165,18 +166,20 @@ def record(cls: type[Record]) -> type[Record]:
 def _wrong_argument(cls: Any, error: ValidationError) -> str:
     """What is wrong with the arguments of a record, as a sentence."""
     first = error.errors(include_url=False)[0]
-    kind, name, own, fields = first["type"], str(first["loc"][0]), cls.__name__, fields_of(cls)
+    kind, name, own, fields = first["type"], first["loc"][0], cls.__name__, list(fields_of(cls))
     if kind == "unexpected_keyword_argument":
-        return f"{own} has no {name}{did_you_mean(name, fields)}; it takes {listed(fields)}"
+        return f"{own} has no {name}{did_you_mean(str(name), fields)}; it takes {listed(fields)}"
     if kind == "unexpected_positional_argument":
         return f"{own} takes at most {len(fields)} values: {listed(fields)}"
     if kind == "missing":
         return f"{own}: {name} is missing; it takes {listed(fields)}"
+    name = fields[name] if isinstance(name, int) else name
     told = first["msg"].removeprefix("Input should be ")
-    for known in fields[name][:1]:
+    for known in fields_of(cls)[name][:1]:
         if known.form is None and kind != "matrix" and "dataclass" not in kind:
             told = known.takes.replace(*UNITS.get(known.unit, ("", "")))
-    hint = did_you_mean(str(first["input"]), re.findall(r'"(\w+)"', told))
+    words = re.findall(r'"(\w+)"', told) if kind == "literal_error" else ()
+    hint = did_you_mean(str(first["input"]), words)
     return f"{own}: {name} takes {told}; found {shown(first['input'])}{hint}"
 
 
@@ -361,14 +364,16 @@ def _tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _matrix(size: int) -> PlainValidator:
-    row = numbers(size).func
+def matrix(rows: int | None, columns: int) -> PlainValidator:
+    """The validator of an array (rows, columns) of finite numbers; None counts any but zero."""
+    one_row = numbers(columns).func
 
     def check(value: object) -> Array:
-        rows = value.tolist() if isinstance(value, np.ndarray) else value
-        if isinstance(rows, list | tuple) and len(rows) == size:
-            return np.array([row(r) for r in rows])
-        raise PydanticCustomError("matrix", f"an array ({size}, {size})")  # type: ignore[arg-type]
+        listing = value.tolist() if isinstance(value, np.ndarray) else value
+        if isinstance(listing, list | tuple) and len(listing) == (rows or len(listing) or 1):
+            with suppress(PydanticCustomError):
+                return np.array([one_row(row) for row in listing])  # type: ignore[call-arg]
+        raise PydanticCustomError("matrix", f"an array ({rows or 'n'}, {columns})")  # type: ignore[arg-type]
 
     return PlainValidator(check)
 
@@ -399,6 +404,6 @@ def _path(value: object) -> object:
 TUPLE = BeforeValidator(_tuple)
 Many = Annotated[tuple[Member, ...], TUPLE]
 File = Annotated[Path, BeforeValidator(_path), FromFile(Text, existing_file)]
-Rotation = Annotated[Array, _matrix(3), FromFile(Vector3, rotation_from_rpy)]
-Transform = Annotated[Array, _matrix(4)]
+Rotation = Annotated[Array, matrix(3, 3), FromFile(Vector3, rotation_from_rpy)]
+Transform = Annotated[Array, matrix(4, 4)]
 Direction = Annotated[Array, PlainValidator(_direction), FromFile(Vector3, direction)]

@@ -16,6 +16,7 @@ from elastocal.cell.file_keys import (
     fields_of,
     joint_values,
     keyed,
+    matrix,
     record,
     stated,
 )
@@ -189,12 +190,8 @@ class DesignSpec:
     )
     per_level: Many[Count] = ()
     repeats: Count = keyed("a whole number >= 1", default=1)
-    loads: Array | None = keyed(
-        "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]",
-        "loads_N",
-        form=Annotated[list[Vector3], Field(min_length=1)],
-        into=lambda found, *_: np.array(found),
-        default=None,
+    loads: Annotated[Array, matrix(None, 3)] | None = keyed(
+        "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]", "loads_N", default=None
     )
     load_choice: bool = keyed("true or false", default=False)
     repeatability: NonNegative = keyed("a number >= 0 in µm", "repeatability_um", default=0.0)

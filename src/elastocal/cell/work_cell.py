@@ -12,7 +12,6 @@ from elastocal.cell.file_keys import (
     File,
     Many,
     Spot,
-    existing_file,
     from_table,
     joint_values,
     keyed,
@@ -23,6 +22,7 @@ from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.workspace_rules import Workspace
 from elastocal.config import Table, Text, Vector2, checked, header, key, read_toml
 from elastocal.errors import InputError, require
+from elastocal.files import check_exists
 from elastocal.nearest import did_you_mean, listed, quoted
 
 KnownEffects = tuple[str, ...] | Callable[["Cell"], Iterable[str]]
@@ -38,13 +38,14 @@ class PluginsTable(Table):
 
 def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
     """Files as paths that exist, modules as they are named."""
-    return tuple(
-        str(existing_file(module, spot / name, f"modules[{i}]")) if is_file(module) else module
-        for i, module in enumerate(table.modules or ())
-    )
+    modules = table.modules or ()
+    for i, module in enumerate(modules):
+        if is_plugin_file(module):
+            check_exists(spot.path.parent / module, f"plugins.modules[{i}]", spot.path)
+    return tuple(str(spot.path.parent / m) if is_plugin_file(m) else m for m in modules)
 
 
-def is_file(module: str) -> bool:
+def is_plugin_file(module: str) -> bool:
     """Whether an entry of [plugins] modules is a Python file, and no importable module."""
     return module.endswith(".py")
 
