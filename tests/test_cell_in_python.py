@@ -143,7 +143,8 @@ MISTAKES = {
     "levels": (lambda: DesignSpec(levels={"joint1": (0,), "joint2": (0,)}), "only one joint"),
     "reflector": (lambda: Visibility({"M1": [0, 0, 1]}), "without max_incidence_deg"),
     "no marker": (
-        lambda: Cell("a", design=DesignSpec(marker_sigma={"M1": 1e-5})), "no marker of the cell",
+        lambda: Cell("a", design=DesignSpec(marker_sigma={"M1": 1e-5})).check(),
+        "a: .*no marker of the cell",
     ),
 }  # fmt: skip
 

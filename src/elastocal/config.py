@@ -80,7 +80,7 @@ def numbers(
             right = len(found) == count if count else len(found) > 0
             if right and (found >= least).all() and (found > above).all():
                 return found
-        raise PydanticCustomError("numbers", f"{count or 'a list of'} numbers")  # type: ignore[arg-type]
+        raise PydanticCustomError("numbers", f"{count or 'a list of'} numbers")
 
     return PlainValidator(check)
 

@@ -160,7 +160,7 @@ def record(cls: type[Record]) -> type[Record]:
             raise InputError(_wrong_argument(made, error)) from None
 
     made.__init__ = init
-    return made  # type: ignore[no-any-return]
+    return made
 
 
 def _wrong_argument(cls: Any, error: ValidationError) -> str:
@@ -183,8 +183,7 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
     return f"{own}: {name} takes {told}; found {shown(first['input'])}{hint}"
 
 
-@cache
-def fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
+def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     """The fields of a record by name, each with the keys that state it in a cell file."""
     hints = get_type_hints(cls, include_extras=True)
     found = {}
@@ -195,6 +194,9 @@ def fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
             for known in one.metadata.get("keys", ())
         )
     return found
+
+
+fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)
 
 
 def _notes(hint: Any) -> Iterator[Any]:
@@ -246,8 +248,7 @@ def _is_record(kind: Any) -> bool:
     return hasattr(kind, "__dataclass_fields__")
 
 
-@cache
-def table_of(cls: Any) -> type[RecordTable]:
+def _table_of(cls: Any) -> type[RecordTable]:
     """The table of the cell file that states a record: its keys, their types, what they take."""
     fields: dict[str, Any] = {
         k.name: (k.form, Field(... if k.required else None, description=k.takes))
@@ -256,6 +257,9 @@ def table_of(cls: Any) -> type[RecordTable]:
     made = create_model(f"{cls.__name__}Table", __base__=RecordTable, **fields)
     made.record = cls
     return made
+
+
+table_of: Callable[[Any], type[RecordTable]] = cache(_table_of)
 
 
 def from_table(cls: type[Record], table: RecordTable, spot: Spot, **values: Any) -> Record:
@@ -269,7 +273,7 @@ def from_table(cls: type[Record], table: RecordTable, spot: Spot, **values: Any)
     known: Any = cls
     if hasattr(cls, "from_keys"):
         values |= known.from_keys(table, spot)
-    for name, keys in fields_of(cls).items():
+    for name, keys in fields_of(known).items():
         if name not in values and (given := stated(table, spot, keys)):
             values[name] = given[0]
     try:
@@ -318,9 +322,9 @@ def rotation_from_rpy(rpy_deg: Sequence[float] | Array, *_: object) -> Array:
     return about_z @ about_y @ about_x
 
 
-def direction(vector: Sequence[float], spot: Spot, name: str) -> Array:
+def direction(vector: Array, spot: Spot, name: str) -> Array:
     """A vector (3,) at unit length; raises InputError that names the key where it is zero."""
-    unit = _unit_vector(np.asarray(vector))
+    unit = _unit_vector(np.asarray(vector, dtype=float))
     if unit is None:
         what = f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]"
         raise InputError(f"{spot.path}: {what}")
@@ -366,14 +370,14 @@ def _tuple(value: object) -> object:
 
 def matrix(rows: int | None, columns: int) -> PlainValidator:
     """The validator of an array (rows, columns) of finite numbers; None counts any but zero."""
-    one_row = numbers(columns).func
+    one_row: Any = numbers(columns).func
 
     def check(value: object) -> Array:
         listing = value.tolist() if isinstance(value, np.ndarray) else value
         if isinstance(listing, list | tuple) and len(listing) == (rows or len(listing) or 1):
             with suppress(PydanticCustomError):
-                return np.array([one_row(row) for row in listing])  # type: ignore[call-arg]
-        raise PydanticCustomError("matrix", f"an array ({rows or 'n'}, {columns})")  # type: ignore[arg-type]
+                return np.array([one_row(row) for row in listing])
+        raise PydanticCustomError("matrix", f"an array ({rows or 'n'}, {columns})")
 
     return PlainValidator(check)
 
@@ -389,7 +393,8 @@ def _unit_vector(vector: Array) -> Array | None:
 
 
 def _direction(value: object) -> Array:
-    vector: Array = numbers(3).func(value)
+    check: Any = numbers(3).func
+    vector: Array = check(value)
     unit = _unit_vector(vector)
     if unit is None:
         raise PydanticCustomError("zero", "a direction, as in [0, 0, 1]")

@@ -21,11 +21,11 @@ from elastocal.cell.file_keys import (
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.workspace_rules import Workspace
 from elastocal.config import Table, Text, Vector2, checked, header, key, read_toml
-from elastocal.errors import InputError, require
+from elastocal.errors import require
 from elastocal.files import check_exists
 from elastocal.nearest import did_you_mean, listed, quoted
 
-KnownEffects = tuple[str, ...] | Callable[["Cell"], Iterable[str]]
+KnownEffects = tuple[str, ...] | Callable[["Cell"], tuple[str, ...]]
 
 
 class PluginsTable(Table):
@@ -88,23 +88,6 @@ class Cell:
                 f"the limits of {joint} in [limits] take [lower, upper] with lower < upper; swap "
                 "or correct them",
             )
-        sight = self.workspace.visibility
-        self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
-        self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
-        require(
-            not self.workspace.urdf_geometry or self.robot.urdf is not None,
-            'key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm for capsules '
-            "along the links instead",
-        )
-
-    def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:
-        markers = tuple(self.tool.markers)
-        for name in names:
-            require(
-                name in markers,
-                f"{header(table)} names {quoted(name)}, which is no marker of the cell"
-                f"{did_you_mean(name, markers)}; [tool.markers_m] has {listed(markers) or 'none'}",
-            )
 
     @classmethod
     def read(cls, path: str | Path, known_effects: KnownEffects | None = None) -> Cell:
@@ -112,28 +95,53 @@ class Cell:
 
         Args:
             path: the cell file; paths in it are relative to it, and its files must exist.
-            known_effects: the names that [model] effects may use, or a function of the cell that
-                returns them (after loading its plug-ins); None leaves them unchecked.
+            known_effects: as of `check`.
 
         Raises:
             InputError: names file, key, what the key takes and the nearest valid name.
         """
         path = Path(path)
-        table = checked(table_of(cls), read_toml(path, "cell file"), path)
-        cell = from_table(cls, table, Spot(path), path=path, name=table.name or path.stem)  # type: ignore[attr-defined]
-        known = known_effects(cell) if callable(known_effects) else known_effects
-        if known is not None:
-            cell._check_effects(tuple(known))
+        table: Any = checked(table_of(cls), read_toml(path, "cell file"), path)
+        cell = from_table(cls, table, Spot(path), path=path, name=table.name or path.stem)
+        cell.check(known_effects)
         return cell
 
-    def _check_effects(self, known: tuple[str, ...]) -> None:
+    def check(self, known_effects: KnownEffects | None = None) -> None:
+        """Checks that the parts of the cell fit together, which `replace` may leave otherwise.
+
+        Args:
+            known_effects: the names that `model.effects` may use, or a function of the cell that
+                returns them (and may load its plug-ins first); None leaves them unchecked.
+
+        Raises:
+            InputError: an effect or a marker is unknown, or shapes of a URDF are asked for that
+                there is none of.
+        """
+        where, sight = self.path or self.name, self.workspace.visibility
+        self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
+        self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
+        require(
+            not self.workspace.urdf_geometry or self.robot.urdf is not None,
+            f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
+            "for capsules along the links instead",
+        )
+        known = known_effects(self) if callable(known_effects) else known_effects
         for i, choice in enumerate(self.model.effects):
-            if choice.name not in known:
-                raise InputError(
-                    f"{self.path}: key model.effects[{i}] names the unknown effect "
-                    f"{quoted(choice.name)}{did_you_mean(choice.name, known)}; known effects: "
-                    f"{listed(known)}"
-                )
+            require(
+                known is None or choice.name in known,
+                f"{where}: key model.effects[{i}] names the unknown effect {quoted(choice.name)}"
+                f"{did_you_mean(choice.name, known or ())}; known effects: {listed(known or ())}",
+            )
+
+    def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:
+        markers = tuple(self.tool.markers)
+        for name in names:
+            require(
+                name in markers,
+                f"{self.path or self.name}: {header(table)} names {quoted(name)}, which is no "
+                f"marker of the cell{did_you_mean(name, markers)}; [tool.markers_m] has "
+                f"{listed(markers) or 'none'}",
+            )
 
 
 read_cell = Cell.read
