@@ -14,7 +14,7 @@ Value = TypeVar("Value", float, NDArray[np.float64])
 # need not be.
 _MULTIPLY = {"deg": math.pi / 180.0, "deg_per_s": math.pi / 180.0, "min": 60.0}
 _DIVIDE = {"mm": 1e3, "um": 1e6, "urad": 1e6, "ppm": 1e6}
-_SI = {"", "m", "rad", "N", "Nm", "s", "C"}
+_SI = {"", "si", "m", "rad", "N", "Nm", "s", "C"}
 
 LENGTH = ("mm", "m", "um")
 ANGLE = ("deg", "rad")

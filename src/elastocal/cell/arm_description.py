@@ -59,7 +59,7 @@ class Robot:
     base: Text | None = keyed("the name of a link of the URDF", default=None)
     flange: Text | None = keyed("the name of a link of the URDF", default=None)
     dh: File | None = keyed('the path of a DH table, e.g. "nominal_dh.csv"', default=None)
-    dh_convention: Convention = keyed('"standard" or "modified"', default="standard")
+    dh_convention: Convention = keyed(default="standard")
     masses: File | None = keyed(
         'the path of a table of link masses, e.g. "links.csv"', default=None
     )
@@ -286,15 +286,13 @@ class ModelSpec:
     `effects` may be stated as texts, "effect" or "effect:where".
     """
 
-    observe: Observe = keyed('"position", "deflection", "pose" or "distance"', default="position")
+    observe: Observe = keyed(default="position")
     effects: Annotated[tuple[EffectChoice, ...], BeforeValidator(_choices)] = keyed(
         'a list of "effect" or "effect:where"', form=list[Text], default=()
     )
-    torque: Literal["computed", "measured"] = keyed('"computed" or "measured"', default="computed")
-    link_gravity: bool = keyed("true or false", default=False)
-    deflection_model: Literal["equilibrium", "linear"] = keyed(
-        '"equilibrium" or "linear"', default="equilibrium"
-    )
+    torque: Literal["computed", "measured"] = keyed(default="computed")
+    link_gravity: bool = keyed(default=False)
+    deflection_model: Literal["equilibrium", "linear"] = keyed(default="equilibrium")
     compliance_levels: dict[str, Many[float]] = keyed(
         "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
         form=dict[str, Numbers],
@@ -302,12 +300,8 @@ class ModelSpec:
         default_factory=dict,
     )
     gear_ripple_orders: Many[Positive] = keyed("a list of positive numbers", default=())
-    thermal_driver: Literal["time", "temperature"] = keyed(
-        '"time" or "temperature"', default="time"
-    )
-    play_side: Literal["load", "load_and_approach"] = keyed(
-        '"load" or "load_and_approach"', default="load"
-    )
+    thermal_driver: Literal["time", "temperature"] = keyed(default="time")
+    play_side: Literal["load", "load_and_approach"] = keyed(default="load")
     nominal: Nominal = keyed("a table", default_factory=Nominal)
 
     def __post_init__(self) -> None:

@@ -19,6 +19,7 @@ from typing import (
     Annotated,
     Any,
     ClassVar,
+    Literal,
     TypeVar,
     Union,
     dataclass_transform,
@@ -62,6 +63,8 @@ JOINT_UNITS = ("deg", "rad", "m", "mm")
 JOINT_KEY = re.compile(r"(joint[1-9][0-9]{0,2})(?:_(deg|rad|mm|m))?", re.ASCII)
 # Units that key names end with, in words, and the SI unit in its place in Python.
 UNITS = {
+    "m": ("m", "m"),
+    "si": ("rad or m", "rad or m"),
     "um": ("µm", "m"),
     "mm": ("mm", "m"),
     "ppm": ("µm per m", "m per m"),
@@ -129,12 +132,13 @@ def keyed(
 ) -> Any:
     """A field of a record that a cell file states; `default` or `default_factory` as of `field`.
 
-    `names` of its key, which end with their unit; none is the field's own name, and of several
-    the user chooses one.  `keys` in their place where several state the field together; then
-    `from_keys` of the record puts them together.  The others are as of `Key`.
+    `names` of its key, which end with their unit, {} in `takes`; none is the field's own name, and
+    of several the user chooses one.  Without `takes` it is one of a Literal, or true or false.
+    `keys` in their place where several state the field together; then `from_keys` of the record
+    puts them together.  The others are as of `Key`.
     """
-    own = [Key(name, takes, form, into, required) for name in names or ("",)] if takes else keys
-    return field(metadata={"keys": tuple(own)}, **default)
+    own = [Key(name, takes, form, into, required) for name in names or ("",)]
+    return field(metadata={"keys": tuple(keys or own)}, **default)
 
 
 # --- Records -------------------------------------------------------------------------------------
@@ -190,10 +194,24 @@ def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     for name, one in cls.__dataclass_fields__.items():
         how = next((note for note in _notes(hints[name]) if isinstance(note, FromFile)), None)
         found[name] = tuple(
-            replace(known, name=known.name or name, into=known.into or (how and how.into))
+            replace(
+                known,
+                name=known.name or name,
+                takes=known.takes.replace("{}", UNITS[known.unit][0] if known.unit else "")
+                or _choice(known.form or hints[name]),
+                into=known.into or (how and how.into),
+            )
             for known in one.metadata.get("keys", ())
         )
     return found
+
+
+def _choice(hint: Any) -> str:
+    """The members of a Literal as a sentence lists them, or true or false."""
+    if get_origin(hint) is not Literal:
+        return "true or false"
+    *first, last = (f'"{name}"' for name in get_args(hint))
+    return f"{', '.join(first)} or {last}"
 
 
 fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)

@@ -51,14 +51,6 @@ SPEED_KEYS = (
 )
 
 
-CRITERIA = '"test_pose", "D", "A", "E", "G", "I", "c", "O1", "O2", "O3", "O4" or "O5"'
-
-
-def _per_joint(name: str) -> tuple[Key, ...]:
-    words = {"deg": "in degrees", "si": "in rad or m"}
-    return tuple(Key(f"{name}_{u}", f"one number per joint, {w}") for u, w in words.items())
-
-
 def _force() -> Any:
     return keyed("three numbers in N, a force in the data's frame", "load_N", default=None)
 
@@ -77,7 +69,7 @@ class TargetPose:
     revolute joints only.
     """
 
-    q: Numbers = keyed(keys=_per_joint("q"))
+    q: Numbers = keyed("one number per joint, in {}", "q_deg", "q_si")
     force: Vector3 | None = _force()
     weight: Positive = keyed("a positive number", default=1.0)
     point: Vector3 | None = _point()
@@ -141,10 +133,10 @@ class Motion:
     `degrees`: speed or home were stated in degrees, which fits revolute joints only."""
 
     speed: Positives | None = keyed(keys=SPEED_KEYS, default=None)
-    home: Numbers | None = keyed(keys=_per_joint("home"), default=None)
+    home: Numbers | None = keyed("one number per joint, in {}", "home_deg", "home_si", default=None)
     dwell: NonNegative = keyed("a number >= 0 in s", "dwell_s", default=30.0)
     load_change: NonNegative = keyed("a number >= 0 in s", "load_change_s", default=600.0)
-    both_directions: bool = keyed("true or false", default=False)
+    both_directions: bool = keyed(default=False)
     overshoot: Positive = keyed("a positive number in degrees", "overshoot_deg", default=0.05)
     degrees: bool = False
 
@@ -182,7 +174,7 @@ class DesignSpec:
     D, A, E and O count (default all but base and markers); `combination` name → factor for c."""
 
     poses: Count | None = keyed("a whole number >= 1", default=None)
-    criterion: CriterionName = keyed(CRITERIA, default="test_pose")
+    criterion: CriterionName = keyed(default="test_pose")
     levels: dict[str, Many[float]] = keyed(
         "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
         form=LevelsTable,
@@ -193,7 +185,7 @@ class DesignSpec:
     loads: Annotated[Array, matrix(None, 3)] | None = keyed(
         "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]", "loads_N", default=None
     )
-    load_choice: bool = keyed("true or false", default=False)
+    load_choice: bool = keyed(default=False)
     repeatability: NonNegative = keyed("a number >= 0 in µm", "repeatability_um", default=0.0)
     marker_sigma: dict[str, Positive] = keyed(
         "a positive number in µm per marker", "marker_sigma_um", default_factory=dict
@@ -205,10 +197,8 @@ class DesignSpec:
         'factors by parameter, with names in quotes, as in { "joint2.compliance" = 1.0 }',
         default_factory=dict,
     )
-    prior: Literal["none", "typical"] = keyed('"none" or "typical"', default="none")
-    robust: Literal["none", "average", "worst"] = keyed(
-        '"none", "average" or "worst"', default="none"
-    )
+    prior: Literal["none", "typical"] = keyed(default="none")
+    robust: Literal["none", "average", "worst"] = keyed(default="none")
     robust_samples: Count = keyed("a whole number >= 1", default=8)
     candidates: Count = keyed("a whole number >= 1", default=20_000)
     target: Positive | None = keyed("a positive number in µm", "target_um", default=None)

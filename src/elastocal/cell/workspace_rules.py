@@ -65,15 +65,6 @@ NEEDED = {
     "capsule": ("radius_m", "length_m"),
     "mesh": ("file",),
 }
-
-
-def _lengths(name: str, takes: str = "a number >= 0 in {}", form: Any = None) -> tuple[Key, Key]:
-    return tuple(Key(f"{name}_{unit}", takes.format(unit), form) for unit in ("mm", "m"))  # type: ignore[return-value]
-
-
-RADIUS_KEYS = _lengths(
-    "link_radius", "a positive number in {}, or one per link (0: no body)", Radii
-)
 SIZE_KEYS = (
     Key("size_m", "three positive numbers in m, the edges of a box", Edges),
     Key("radius_m", "a positive number in m", Positive),
@@ -84,7 +75,6 @@ PLACE_KEYS = (
     Key("position_m", "three numbers in m, the solid's centre or the mesh's origin", Vector3),
     Key("rpy_deg", "three numbers in degrees: roll, pitch, yaw", Vector3),
 )
-SHAPES = '"box", "sphere", "cylinder", "capsule" or "mesh"'
 ANGLE = "a number in degrees, over 0 and up to 180"
 PARTS = re.compile(r"base|flange|load|rope|link[0-9]+")
 
@@ -99,7 +89,7 @@ class Solid:
     """
 
     name: str = keyed('a name of its own, e.g. "table"', form=Text, required=True)
-    shape: Shape = keyed(SHAPES, required=True)
+    shape: Shape = keyed(required=True)
     size: Numbers = keyed(keys=SIZE_KEYS)
     placement: Transform = keyed(keys=PLACE_KEYS, default_factory=lambda: np.eye(4))
     mesh: File | None = keyed('the path of a mesh, e.g. "fixture.stl"', "file", default=None)
@@ -228,7 +218,7 @@ class Visibility:
         "two numbers in m, [nearest, farthest]", "range_m", form=Vector2, default=(0.0, np.inf)
     )
     beam_radius: NonNegative = keyed("a number >= 0 in mm", "beam_radius_mm", default=0.005)
-    line_of_sight: bool = keyed("true or false", default=True)
+    line_of_sight: bool = keyed(default=True)
 
     def __post_init__(self) -> None:
         low, high = self.range
@@ -263,18 +253,28 @@ class Workspace:
     keep_out: Many[HalfSpace] = keyed("tables, each headed [[workspace.keep_out]]", default=())
     load: HangingLoad | None = keyed("a table headed [workspace.load]", default=None)
     visibility: Visibility | None = keyed("a table headed [workspace.visibility]", default=None)
-    link_radius: Many[float] = keyed(keys=RADIUS_KEYS, default=())
+    link_radius: Many[float] = keyed(
+        "a positive number in {}, or one per link (0: no body)",
+        "link_radius_mm",
+        "link_radius_m",
+        form=Radii,
+        default=(),
+    )
     urdf_geometry: bool = keyed(
-        '"capsules", "urdf" or "none"',
+        "",
         "geometry",
         form=Literal["capsules", "urdf", "none"],
         into=lambda found, *_: found == "urdf",
         default=False,
     )
-    self_collision: bool = keyed("true or false", default=True)
+    self_collision: bool = keyed(default=True)
     ignored_pairs: Many[Pair] = keyed('pairs of names, as in [["link2", "link4"]]', default=())
-    clearance: NonNegative = keyed(keys=_lengths("clearance"), default=0.0)
-    self_clearance: NonNegative = keyed(keys=_lengths("self_clearance"), default=0.0)
+    clearance: NonNegative = keyed(
+        "a number >= 0 in {}", "clearance_mm", "clearance_m", default=0.0
+    )
+    self_clearance: NonNegative = keyed(
+        "a number >= 0 in {}", "self_clearance_mm", "self_clearance_m", default=0.0
+    )
     torque_limits: Many[Positive] = keyed(
         "one positive number per joint, in N m", "torque_limits_Nm", default=()
     )
