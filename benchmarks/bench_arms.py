@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.limits import finite_ranges, joint_limits
 from elastocal.manipulator.model import Model

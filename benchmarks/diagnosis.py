@@ -17,7 +17,7 @@ import numpy as np
 from bench_clock import Ran, elastocal
 from bench_part import HERE, Part, Table, run_alone
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
 

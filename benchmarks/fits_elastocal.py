@@ -22,7 +22,7 @@ with clock.step("import"):
     import numpy as np
 
     # What reading would import when first called.
-    import elastocal.cell_reader
+    import elastocal.cell
     import elastocal.manipulator.effects
     import elastocal.manipulator.urdf
     import elastocal.measurements  # noqa: F401

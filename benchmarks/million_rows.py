@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.identification import partition
 from elastocal.identification.identify import identify
 from elastocal.identification.result import IdentificationResult

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.design.candidates import draw
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space

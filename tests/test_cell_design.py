@@ -12,8 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from elastocal.cell_design import DesignSpec
-from elastocal.cell_reader import read_cell
+from elastocal.cell import DesignSpec, read_cell
 from elastocal.errors import InputError
 
 CELL = """

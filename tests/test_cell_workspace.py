@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.cell_reader import read_cell
-from elastocal.cell_values import direction
-from elastocal.cell_workspace import Workspace
+from elastocal.cell import Workspace, read_cell
+from elastocal.cell.file_keys import Spot, direction
 from elastocal.errors import InputError
 
 CELL = """
@@ -157,7 +156,7 @@ def test_geometry_of_the_urdf_or_none(read):
 def test_a_direction_has_length_one_whatever_its_size(vector):
     from pathlib import Path
 
-    unit = direction(Path("cell.toml"), "normal", vector)
+    unit = direction(vector, Spot(Path("cell.toml")), "normal")
     assert np.linalg.norm(unit) == pytest.approx(1.0, abs=1e-12)
     scaled = np.array(vector) / np.abs(vector).max()
     assert np.linalg.norm(np.cross(unit, scaled)) < 1e-12

@@ -8,7 +8,7 @@ import pytest
 import typer
 from support.robots import KR270
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.cli import app
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model

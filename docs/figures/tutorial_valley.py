@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from style import ROOT, Colours, draw, plt
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.manipulator.model import Model
 from elastocal.measurements import read_plan
 from elastocal.simulation.simulate import expand_plan, simulate, values_from

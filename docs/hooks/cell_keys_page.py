@@ -1,14 +1,11 @@
-"""Every key of the cell file as a page, from the schema that reads it."""
+"""Every key of the cell file as a page, from the classes that a cell is made of."""
 
 from __future__ import annotations
 
-import types
-import typing
-from typing import Any
-
 from pydantic import BaseModel
 
-from elastocal.cell_schema import CellTable
+from elastocal.cell import Cell, table_of
+from elastocal.config import tables_in
 
 HEAD = """# Keys of the cell file
 
@@ -33,26 +30,14 @@ def page() -> str:
 
 def tables() -> list[tuple[str, type[BaseModel]]]:
     """Each table of the file as it is headed there, with its schema; the file itself first."""
-    return [("cell.toml", CellTable), *_inside(CellTable, "")]
+    return [("cell.toml", table_of(Cell)), *_inside(table_of(Cell), "")]
 
 
 def _inside(table: type[BaseModel], above: str) -> list[tuple[str, type[BaseModel]]]:
     found = []
     for name, field in table.model_fields.items():
-        for inner, many in _models(field.annotation, False):
+        for inner, many in tables_in(field.annotation):
             path = f"{above}{name}"
             found.append((f"[[{path}]]" if many else f"[{path}]", inner))
             found += _inside(inner, f"{path}.")
     return found
-
-
-def _models(annotation: Any, many: bool) -> list[tuple[type[BaseModel], bool]]:
-    """The schemas in an annotation, and whether it is a list of them."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [(annotation, many)]
-    origin = typing.get_origin(annotation)
-    if origin is None:
-        return []
-    if origin in (typing.Union, types.UnionType, typing.Annotated):
-        return [m for part in typing.get_args(annotation) for m in _models(part, many)]
-    return [m for part in typing.get_args(annotation) for m in _models(part, origin is list)]

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from elastocal import demo
-from elastocal.cell import Cell
-from elastocal.cell_reader import read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.choice import load_chain
 from elastocal.manipulator.effects import CATALOGUE

@@ -13,7 +13,7 @@ import numpy as np
 from draw import World
 from numpy.typing import NDArray
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline
 from elastocal.diagnosis.gram import Grams, scales_of
 from elastocal.diagnosis.hypotheses import Hypothesis, possible

@@ -23,7 +23,7 @@ from joblib import Parallel, delayed
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.compensation.compensate import compensate, nominal_flanges
 from elastocal.compensation.point import tool_point
 from elastocal.compensation.targets import read_targets

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "kr270_reproduct
 
 from campaign import DEMO, campaign
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.demo import LOAD_N, published_compliances
 from elastocal.identification.variance.readings import Readings
 from elastocal.manipulator.model import Model

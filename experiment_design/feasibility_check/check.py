@@ -18,7 +18,7 @@ from joblib import Parallel, delayed
 from mujoco_cell import MujocoCell
 from scipy.stats import qmc
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.feasibility.rule_book import joint_limits
 from elastocal.design.feasibility.sight import END

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Cell
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Cell, Solid
 from elastocal.design.feasibility.bodies import Body, data_base
 from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.pairs import Pair

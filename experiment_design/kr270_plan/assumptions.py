@@ -13,8 +13,7 @@ from dataclasses import replace
 import numpy as np
 from compared import HERE, table_2
 
-from elastocal.cell import Cell, Tool
-from elastocal.cell_reader import read_cell
+from elastocal.cell import Cell, Tool, read_cell
 from elastocal.design.candidates import draw
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space

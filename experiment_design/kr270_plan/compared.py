@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell import Cell
-from elastocal.cell_reader import read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.design.candidates import draw
 from elastocal.design.checkpoint import Checkpoint
 from elastocal.design.design import design

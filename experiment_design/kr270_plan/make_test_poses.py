@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.design.candidates import sobol
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.joint_space import joint_space

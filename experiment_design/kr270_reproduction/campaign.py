@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.demo import LOAD_N, REPEATS, published_compliances, reading_sigma
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe

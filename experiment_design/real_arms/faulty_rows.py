@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from prepare import HERE, prepare
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.identification.identify import Options, identify
 from elastocal.identification.outliers import blocks
 from elastocal.identification.result import IdentificationResult

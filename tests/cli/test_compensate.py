@@ -12,7 +12,7 @@ import pytest
 from support.calibration import with_values
 from typer.testing import CliRunner
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.cli import app
 from elastocal.manipulator.calibrated import nominal_flange_rows
 from elastocal.manipulator.effects import CATALOGUE

@@ -15,7 +15,7 @@ from support.diagnoses import AMBIGUOUS, EXPLAINED, EXTRA, INSEPARABLE, TWO, VER
 from support.files import write_campaign
 from typer.testing import CliRunner
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.cli import app
 from elastocal.cli.diagnosis_files import write_extra_poses
 from elastocal.errors import InsufficientDataError

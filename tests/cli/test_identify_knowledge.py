@@ -11,7 +11,7 @@ from support.cells import COMPLIANCE, SLANTED, TABLE_2, table_of
 from support.robots import KR270
 from typer.testing import CliRunner
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.cli import app
 from elastocal.manipulator.model import Model
 

@@ -13,10 +13,16 @@ from support.calibration import random_chain
 from support.cells import kr270_cell, kr270_chain
 from support.robots import KR270
 
-from elastocal.cell import Cell
-from elastocal.cell_design import DesignSpec, Motion, TargetPose
-from elastocal.cell_reader import read_cell
-from elastocal.cell_workspace import CarriedBody, Solid, Workspace
+from elastocal.cell import (
+    CarriedBody,
+    Cell,
+    DesignSpec,
+    Motion,
+    Solid,
+    TargetPose,
+    Workspace,
+    read_cell,
+)
 from elastocal.design import target_poses
 from elastocal.design.checks import check_cell
 from elastocal.errors import InputError

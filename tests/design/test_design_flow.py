@@ -16,9 +16,17 @@ from support.cells import DOWN
 from support.design_cells import FULL, any_cell, plan_cell, scara, sliding_chain
 from support.robots import packaged_urdf
 
-from elastocal.cell import Cell, Robot
-from elastocal.cell_design import Motion, TargetPose
-from elastocal.cell_workspace import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell import (
+    CarriedBody,
+    Cell,
+    HalfSpace,
+    HangingLoad,
+    Motion,
+    Robot,
+    Solid,
+    TargetPose,
+    Workspace,
+)
 from elastocal.design import design as design_module
 from elastocal.design.design import design
 from elastocal.design.feasibility.feasibility import Feasibility

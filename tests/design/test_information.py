@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from support.cells import DOWN, TABLE_2, kr270_cell, kr270_chain
 
-from elastocal.cell import CartesianNoise, Cell, PolarNoise, Tracker
-from elastocal.cell_design import DesignSpec
+from elastocal.cell import CartesianNoise, Cell, DesignSpec, PolarNoise, Tracker
 from elastocal.design.information import PoseInformation
 from elastocal.design.readings import ALL_LOADS, load_states
 from elastocal.errors import InputError

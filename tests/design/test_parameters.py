@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
 from support.design_cells import FULL, all_loads, any_cell, plan_cell, scara, setup_of, spread
 
-from elastocal.cell import Cell
-from elastocal.cell_design import TargetPose
+from elastocal.cell import Cell, TargetPose
 from elastocal.design import parameters
 from elastocal.design.information import PoseInformation
 from elastocal.design.readings import load_states

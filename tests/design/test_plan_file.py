@@ -11,7 +11,7 @@ from support.discs import Discs
 from support.files import write_campaign
 from typer.testing import CliRunner
 
-from elastocal.cell_design import Motion
+from elastocal.cell import Motion
 from elastocal.cli import app
 from elastocal.design.order.schedule import schedule
 from elastocal.design.plan_file import PlanRows, plan_rows, write_plan, write_plan_json

@@ -22,8 +22,7 @@ from support.design_cells import (
 )  # fmt: skip
 from support.robots import packaged_urdf
 
-from elastocal.cell import Cell, Nominal, PolarNoise
-from elastocal.cell_design import TargetPose
+from elastocal.cell import Cell, Nominal, PolarNoise, TargetPose
 from elastocal.design import target_poses
 from elastocal.design.setup import Known
 from elastocal.design.target_poses import TargetPoses

@@ -13,8 +13,16 @@ from scipy.spatial.transform import Rotation
 from support.calibration import placement
 from support.cells import kr270_cell, kr270_chain, nominal_flanges, random_poses
 
-from elastocal.cell import Cell, Nominal, Tool
-from elastocal.cell_design import DesignSpec, Motion, TargetBox, TargetPath, TargetPose
+from elastocal.cell import (
+    Cell,
+    DesignSpec,
+    Motion,
+    Nominal,
+    TargetBox,
+    TargetPath,
+    TargetPose,
+    Tool,
+)
 from elastocal.design import target_poses
 from elastocal.design.target_poses import TargetPoses
 from elastocal.errors import InputError, InsufficientDataError

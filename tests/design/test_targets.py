@@ -12,8 +12,7 @@ from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, r
 from support.cells import table_of as rows_with_markers
 from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain, spread
 
-from elastocal.cell import Cell, Nominal
-from elastocal.cell_design import TargetPose
+from elastocal.cell import Cell, Nominal, TargetPose
 from elastocal.design import target_poses
 from elastocal.design.information import PoseInformation
 from elastocal.design.readings import load_states

@@ -17,9 +17,7 @@ from pydantic import BaseModel
 from support.diagnoses import ECCENTRICITY, JUMP
 from support.robots import KR270
 
-from elastocal.cell import EffectChoice
-from elastocal.cell_reader import read_cell
-from elastocal.cell_schema import CellTable
+from elastocal.cell import Cell, EffectChoice, read_cell, table_of
 from elastocal.diagnosis.extended_cell import PATHS, write_extended_cell
 from elastocal.errors import InputError
 from elastocal.manipulator.effects import CATALOGUE
@@ -121,7 +119,7 @@ def test_every_path_of_the_schema_is_redirected():
                     found |= paths(annotation, (*above, key))
         return found
 
-    assert paths(CellTable, ()) == {(*table, key) for table, keys in PATHS for key in keys}
+    assert paths(table_of(Cell), ()) == {(*table, key) for table, keys in PATHS for key in keys}
 
 
 def test_the_model_gains_the_parameters_of_the_effects_and_no_others(tmp_path):

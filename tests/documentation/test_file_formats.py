@@ -9,14 +9,15 @@ import cell_keys_page
 import pytest
 from typer.testing import CliRunner
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.cli import app
+from elastocal.config import tables_in
 from elastocal.diagnosis.diagnose import diagnose
 from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.diagnosis.published import publish
 from elastocal.diagnosis.result import Curve, Untested
 from elastocal.diagnosis.separate.result import RivalPair
-from elastocal.identification.knowledge_schema import TABLES, KnowledgeTable
+from elastocal.identification.knowledge import KnowledgeTable
 from elastocal.identification.outlier import Outlier
 from elastocal.identification.robust.report import Finding
 from elastocal.manipulator.dh import DH_FAMILIES
@@ -55,6 +56,10 @@ def missing(wanted, text):
     return sorted(k for k in set(wanted) if not re.search(rf"(?<!\w){re.escape(k)}(?!\w)", code))
 
 
+KNOWLEDGE_FIELDS = KnowledgeTable.model_fields.values()
+KNOWLEDGE_TABLES = [t for field in KNOWLEDGE_FIELDS for t, _ in tables_in(field.annotation)]
+
+
 @pytest.mark.parametrize("title, table", cell_keys_page.tables())
 def test_every_key_of_the_cell_file_is_on_the_page(title, table):
     toml = PAGE.split("\n## Measurement table", 1)[0]
@@ -62,7 +67,7 @@ def test_every_key_of_the_cell_file_is_on_the_page(title, table):
     assert not absent, f"{title}: {absent}"
 
 
-@pytest.mark.parametrize("table", [KnowledgeTable, *TABLES.values()])
+@pytest.mark.parametrize("table", [KnowledgeTable, *KNOWLEDGE_TABLES])
 def test_every_key_of_the_knowledge_file_is_on_the_page(table):
     assert not [k for k in table.model_fields if k not in section("Knowledge file")]
 

@@ -37,9 +37,9 @@ def test_the_mapping_itself_is_right(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
-        ("[[source]]", "[[sorce]]", r"mapping.toml: unknown key .*sorce.*'source'"),
+        ("[[source]]", "[[sorce]]", r"mapping.toml: unknown key sorce; did you mean source\?"),
         ("[[source]]", '[[source]]\nrole = "tracker"', r"role.*\"points\", \"joints\".*'tracker'"),
-        ("[source.columns]", "[source.colums]", r"unknown key colums.*'columns'"),
+        ("[source.columns]", "[source.colums]", r"unknown key colums of .*did you mean columns\?"),
         ('x_mm = "x"', 'x = "x"', r"'x': has no unit; write x_mm, x_m"),
         ('x_mm = "x"', 'x_mn = "x"', r"'x_mn'"),
         ('x_mm = "x"', 'x_mm = "xx"',
@@ -151,7 +151,7 @@ def test_a_fit_within_millimetres_is_no_warning(tmp_path, readings):
 def test_what_would_make_the_readings_fit_is_named(tmp_path, readings, change, words):
     from dataclasses import replace
 
-    from elastocal.cell_reader import read_cell
+    from elastocal.cell import read_cell
 
     cell = replace(read_cell(readings[0].path), limits={})
     found = with_cell(tmp_path, (cell, *readings[1:]), f"[joints]\n{change}\n")

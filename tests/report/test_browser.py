@@ -18,8 +18,7 @@ import pytest
 from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, HOSTILE
 
-from elastocal.cell import Tracker
-from elastocal.cell_design import DesignSpec
+from elastocal.cell import DesignSpec, Tracker
 from elastocal.design.design import design
 from elastocal.design.options import DesignOptions
 from elastocal.diagnosis.baseline import Baseline

@@ -51,8 +51,7 @@ def plan():
 
     from support.cells import kr270_cell
 
-    from elastocal.cell import CartesianNoise, Tracker
-    from elastocal.cell_design import DesignSpec
+    from elastocal.cell import CartesianNoise, DesignSpec, Tracker
     from elastocal.design.design import design
     from elastocal.design.options import DesignOptions
 

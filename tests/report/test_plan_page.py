@@ -13,8 +13,7 @@ from support.design_commands import design as design_command
 from support.design_commands import everything_in, write_cell
 from support.pages import Page
 
-from elastocal.cell import Tracker
-from elastocal.cell_design import DesignSpec
+from elastocal.cell import DesignSpec, Tracker
 from elastocal.design.design import design
 from elastocal.design.options import DesignOptions
 from elastocal.design.plan import Certificate, SizePoint

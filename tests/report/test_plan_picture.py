@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges, random_poses
 
-from elastocal.cell import Nominal, Tracker
-from elastocal.cell_workspace import HalfSpace, Solid, Workspace
+from elastocal.cell import HalfSpace, Nominal, Solid, Tracker, Workspace
 from elastocal.errors import InputError
 from elastocal.report.plan_picture import draw_plan, write_plan_picture
 from elastocal.report.wireframe import wireframe

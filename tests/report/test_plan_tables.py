@@ -9,8 +9,7 @@ from rich.cells import cell_len
 from rich.console import Console
 from support.cells import kr270_cell
 
-from elastocal.cell import Tracker
-from elastocal.cell_design import DesignSpec
+from elastocal.cell import DesignSpec, Tracker
 from elastocal.design.design import design
 from elastocal.design.options import DesignOptions
 from elastocal.design.plan import Certificate, SizePoint

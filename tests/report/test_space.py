@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges
 from support.robots import packaged_urdf
 
-from elastocal.cell import Robot, Tracker
-from elastocal.cell_workspace import Solid, Workspace
+from elastocal.cell import Robot, Solid, Tracker, Workspace
 from elastocal.design.feasibility.carriers import WORLD
 from elastocal.manipulator.choice import load_chain
 from elastocal.report import residual_space as residual_module

@@ -32,8 +32,7 @@ from mjcf import GRAVITY, Spring
 from skeleton import Skeleton
 from world_files import write_table, write_world
 
-from elastocal.cell import EffectChoice
-from elastocal.cell_reader import read_cell
+from elastocal.cell import EffectChoice, read_cell
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements, read_measurements
 

@@ -17,7 +17,7 @@ sys.path.insert(0, str(FOLDER))
 import scenarios
 from support.study_scripts import study_of
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.demo import LOAD_N, published_compliances
 from elastocal.identification.identify import Options, identify
 from elastocal.manipulator.model import Model

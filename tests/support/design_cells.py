@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.calibration import cell_of, placement, random_chain
 from support.cells import kr270_cell, kr270_chain
 
-from elastocal.cell import Array, CartesianNoise, Cell, Tool, Tracker
-from elastocal.cell_design import DesignSpec
+from elastocal.cell import Array, CartesianNoise, Cell, DesignSpec, Tool, Tracker
 from elastocal.design import target_poses
 from elastocal.design.readings import ALL_LOADS, load_states
 from elastocal.design.setup import Known, Setup, set_up

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell import Array
-from elastocal.cell_reader import read_cell
+from elastocal.cell import Array, read_cell
 from elastocal.export.cost import random_table
 from elastocal.export.export import Exported, Wish, export
 from elastocal.export.kept import Conditions

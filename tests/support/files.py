@@ -24,7 +24,7 @@ def write_campaign(folder: Path, poses: int = 12) -> tuple[Path, Path]:
     """cell.toml, arm.urdf and an exact data.csv (degrees, millimetres) in `folder`."""
     from support.cells import random_poses, table_of
 
-    from elastocal.cell_reader import read_cell
+    from elastocal.cell import read_cell
     from elastocal.manipulator.model import Model
 
     shutil.copyfile(KR270, folder / "arm.urdf")

@@ -9,8 +9,7 @@ import numpy as np
 from support.cells import random_poses, table_of
 from support.robots import KR270
 
-from elastocal.cell import Cell
-from elastocal.cell_reader import read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.importing.import_files import Imported, import_files
 from elastocal.importing.mapping import read_mapping
 from elastocal.manipulator.model import Model

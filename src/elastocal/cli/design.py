@@ -188,9 +188,8 @@ def _target(target: float | None, poses: int | None) -> float | None:
 
 def _read(path: Path, asked: dict[str, Any]) -> Cell:
     """The cell, with what the command line says of [design] in its place."""
-    from elastocal.cell_reader import read_cell
+    from elastocal.cell import read_cell
     from elastocal.manipulator.effects import CATALOGUE
-    from elastocal.nearest import did_you_mean, listed, quoted
     from elastocal.planning.criteria import CRITERIA
     from elastocal.text import did_you_mean, listed, quoted
 

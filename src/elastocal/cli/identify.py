@@ -157,7 +157,7 @@ def identify(
 
 def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]:
     """Model and tables; every file is checked before anything is computed."""
-    from elastocal.cell_reader import read_cell
+    from elastocal.cell import read_cell
     from elastocal.manipulator.choice import load_chain
     from elastocal.manipulator.effects import CATALOGUE
     from elastocal.manipulator.model import Model

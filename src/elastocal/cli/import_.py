@@ -110,7 +110,7 @@ def _import(paths: list[Path], read: Any, cell: Path | None, output: Path | None
 
     known = None
     if cell is not None:
-        from elastocal.cell_reader import read_cell
+        from elastocal.cell import read_cell
         from elastocal.manipulator.effects import CATALOGUE
 
         known = read_cell(cell, known_effects=tuple(CATALOGUE))

@@ -38,7 +38,7 @@ def check_programs(cell: Cell, programs: tuple[Path, ...]) -> None:
     """Can these robot programs be written for this arm?  Told before the work, not after it."""
     import numpy as np
 
-    from elastocal.cell_design import Motion
+    from elastocal.cell import Motion
     from elastocal.design.order.execution import Execution
     from elastocal.manipulator.choice import load_chain
 

@@ -58,7 +58,7 @@ def simulate(
     """
     import numpy as np
 
-    from elastocal.cell_reader import read_cell
+    from elastocal.cell import read_cell
     from elastocal.files import atomic_write_text
     from elastocal.identification.checks import check_limits
     from elastocal.manipulator.effects import CATALOGUE

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell import Cell
-from elastocal.cell_keys import place
+from elastocal.config import place
 from elastocal.errors import InputError, require
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.inputs import LEVEL_TOLERANCE

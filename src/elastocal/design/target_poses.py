@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from elastocal.cell import Cell
-from elastocal.cell_design import TargetBox, TargetPath
-from elastocal.cell_keys import place
+from elastocal.cell import Cell, TargetBox, TargetPath
+from elastocal.config import place
 from elastocal.design.checks import beyond_limits, check_posture
 from elastocal.design.target_path import PathTable, read_path
 from elastocal.design.target_reach import (

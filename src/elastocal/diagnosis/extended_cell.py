@@ -10,8 +10,7 @@ from typing import Any
 
 import tomli_w
 
-from elastocal.cell import Cell
-from elastocal.cell_reader import read_cell
+from elastocal.cell import Cell, is_plugin_file, read_cell
 from elastocal.diagnosis.result import Finding
 from elastocal.files import atomic_write_text
 
@@ -76,6 +75,8 @@ def _redirect(data: dict[str, Any], old: Path, new: Path) -> None:
 
     for table, keys in PATHS:
         _change(data, table, keys, redirected)
+    if modules := data.get("plugins", {}).get("modules"):
+        data["plugins"]["modules"] = [redirected(m) if is_plugin_file(m) else m for m in modules]
 
 
 def _change(

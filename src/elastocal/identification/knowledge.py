@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import ValidationError
+from pydantic import Field
 
+from elastocal.config import Positive, Table, Text, checked, read_toml, required
 from elastocal.errors import InputError, require
-from elastocal.files import read_text
 from elastocal.identification.constrained.constraints import (
     Bounds,
     Constraints,
@@ -19,11 +19,52 @@ from elastocal.identification.constrained.constraints import (
 )
 from elastocal.identification.constrained.physical import physical_constraints
 from elastocal.identification.constrained.prior import GaussianPrior
-from elastocal.identification.knowledge_schema import KnowledgeTable, complaint
 from elastocal.manipulator.model import Model
 from elastocal.text import quoted
 
-MAX_BYTES = 5_000_000
+Terms = Annotated[dict[Text, float], Field(min_length=1)]
+FACTORS = (
+    "factors by parameter, with names in quotes, as in "
+    '{ "joint2.compliance" = 1.0, "joint3.compliance" = -1.0 }'
+)
+
+
+class PriorTable(Table):
+    mean: float = required("a finite number in SI units")
+    std: Positive = required("a positive number in SI units")
+
+
+class BoundsTable(Table):
+    parameter: Text = required('the name of a parameter, as in "joint2.compliance"')
+    lower: float | None = Field(None, description="a finite number in SI units; without one, none")
+    upper: float | None = Field(None, description="a finite number in SI units; without one, none")
+
+
+class EqualityTable(Table):
+    terms: Terms = required(FACTORS)
+    value: float = Field(0.0, description="a finite number in SI units")
+    label: str = Field("", description="a text")
+
+
+class SemidefiniteTable(Table):
+    entries: Annotated[list[list[str | float | dict[str, float]]], Field(min_length=1)] = Field(
+        description="rows of parameter names, numbers or factors by parameter, as in "
+        '[["a", "b"], ["b", "c"]]'
+    )
+    label: str = Field("", description="a text")
+
+
+class KnowledgeTable(Table):
+    physical: bool = Field(False, description="true or false")
+    prior: dict[Text, PriorTable] = Field(
+        default_factory=dict,
+        description='tables by parameter, as in [prior."joint2.compliance"]',
+    )
+    bounds: list[BoundsTable] = Field(default_factory=list, description="[[bounds]] tables")
+    equality: list[EqualityTable] = Field(default_factory=list, description="[[equality]] tables")
+    semidefinite: list[SemidefiniteTable] = Field(
+        default_factory=list, description="[[semidefinite]] tables"
+    )
 
 
 @dataclass(frozen=True)
@@ -61,17 +102,7 @@ def read_knowledge(path: str | Path) -> Knowledge:
     Raises InputError that names file, key, what the key takes and the nearest valid key.
     """
     path = Path(path)
-    text = read_text(path, "knowledge file", MAX_BYTES)
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise InputError(f"{path}: nested too deeply for a knowledge file") from None
-    try:
-        table = KnowledgeTable.model_validate(data)
-    except ValidationError as error:
-        raise complaint(path, data, error) from None
+    table = checked(KnowledgeTable, read_toml(path, "knowledge file"), path)
     try:
         return Knowledge(table.physical, _constraints(table), _prior(table), str(path))
     except InputError as error:

@@ -10,11 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
-
-from elastocal.cell_keys import place
+from elastocal.config import checked, place, read_toml
 from elastocal.errors import InputError
-from elastocal.files import read_text
 from elastocal.importing.schema import MappingTable, SourceTable
 from elastocal.text import did_you_mean, listed, quoted
 
@@ -50,7 +47,7 @@ def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> Mappin
     Raises InputError that names file, key, what the key takes and what was found.
     """
     where = "--preset" if path is None else str(path)
-    data: dict[str, Any] = {} if path is None else _parse(Path(path))
+    data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file", MAX_BYTES)
     if presets and data.get("source"):
         raise InputError(
             f"{where}: has [[source]] tables, so --preset {presets[0]} has no place; write "
@@ -58,14 +55,14 @@ def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> Mappin
         )
     if presets:
         data = {**data, "source": [{"preset": name} for name in presets]}
-    _check(where, data)
+    checked(MappingTable, data, where)
     if not data.get("source"):
         raise InputError(
             f'{where}: no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or '
             "give --preset"
         )
     merged = {**data, "source": [_with_preset(where, s) for s in data["source"]]}
-    table = _check(where, merged)
+    table = checked(MappingTable, merged, where)
     sources = table.source or []
     for k, source in enumerate(sources):
         if not source.columns:
@@ -83,15 +80,7 @@ def with_units(mapping: Mapping, length: str | None, angle: str | None) -> Mappi
         return mapping
     data = mapping.table.model_dump(exclude_none=True)
     data["units"] = data.get("units", {}) | given
-    return replace(mapping, table=_check("--length-unit, --angle-unit", data))
-
-
-def _parse(path: Path) -> dict[str, Any]:
-    text = read_text(path, "mapping file", MAX_BYTES)
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    return replace(mapping, table=checked(MappingTable, data, "--length-unit, --angle-unit"))
 
 
 def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
@@ -116,68 +105,3 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
         }
         merged[part] = kept | source.get(part, {})
     return merged
-
-
-def _check(where: str, data: dict[str, Any]) -> MappingTable:
-    try:
-        return MappingTable.model_validate(data)
-    except ValidationError as error:
-        raise _complaint(where, data, error) from None
-
-
-def _complaint(where: str, data: dict[str, Any], error: ValidationError) -> InputError:
-    """The first problem as a sentence: file, key, what it takes, what was found."""
-    problems = error.errors(include_url=False, include_context=False)
-    # A misspelt key is the cause, the key then missing only its consequence.
-    first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
-    keys, tables, found = _trace(first["loc"], data)
-    name = str(keys[-1])
-    valid = [field for table in tables for field in table.model_fields]
-    if first["type"] == "extra_forbidden":
-        return InputError(
-            f"{where}: unknown key {place(*keys)}{did_you_mean(name, valid)}; there "
-            f"{'is' if len(valid) == 1 else 'are'} {listed(valid)}"
-        )
-    takes = next(
-        (
-            table.model_fields[k].description
-            for k in reversed([str(k) for k in keys])
-            for table in tables
-            if k in table.model_fields
-        ),
-        "a table",
-    )
-    if first["type"] == "missing":
-        return InputError(f"{where}: key {place(*keys)} is missing; it takes {takes}")
-    shown = quoted(found) if not isinstance(found, bool) else str(found).lower()
-    return InputError(f"{where}: key {place(*keys)} takes {takes}; found {shown}")
-
-
-def _trace(
-    loc: Sequence[int | str], data: Any
-) -> tuple[list[str | int], list[type[BaseModel]], Any]:
-    """The keys of a location as far as the file goes, the tables there, and what stands there."""
-    keys: list[str | int] = []
-    tables: list[type[BaseModel]] = [MappingTable]
-    for part in loc:
-        inside = isinstance(data, dict) and part in data
-        if inside or (isinstance(data, list) and isinstance(part, int) and part < len(data)):
-            data = data[part]
-        elif any(part in table.model_fields for table in tables):
-            data = None  # a key that is missing
-        else:
-            continue  # pydantic's name for a branch of a union
-        if isinstance(part, str):
-            found = [t.model_fields[part].annotation for t in tables if part in t.model_fields]
-            tables = [inner for a in found for inner in _tables(a)] or tables
-        if isinstance(part, str) or isinstance(data, dict):
-            keys.append(part)
-    return keys or [str(loc[0])], tables, data
-
-
-def _tables(annotation: Any) -> list[type[BaseModel]]:
-    from typing import get_args
-
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [inner for a in get_args(annotation) for inner in _tables(a)]

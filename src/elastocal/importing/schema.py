@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from elastocal.cell_table import NonNegative, Positive, Table, Text, Vector3, key
+from elastocal.config import NonNegative, Positive, Table, Text, Vector3, key
 
 Place = Annotated[int, Field(ge=1)] | Text
 Where = Place | Annotated[list[Place], Field(min_length=1)]

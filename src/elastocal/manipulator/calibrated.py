@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.errors import InputError
 from elastocal.files import read_text
 from elastocal.manipulator.chain import Array, Chain

@@ -25,8 +25,10 @@ from typing import Any, Self, TypeVar, get_args
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.labels import is_label
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import is_label
+from elastocal.text import did_you_mean
+from elastocal.text import listed
+from elastocal.text import quoted
 from elastocal.planning.criterion import (
     Cone,
     Criterion,

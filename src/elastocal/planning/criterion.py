@@ -17,7 +17,9 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean
+from elastocal.text import listed
+from elastocal.text import quoted
 from elastocal.planning.information_matrices import Array, IntArray, Interest, candidate_sums
 
 Robust = Literal["none", "average", "worst"]

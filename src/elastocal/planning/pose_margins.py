@@ -17,8 +17,7 @@ from itertools import product
 import casadi as ca
 import numpy as np
 
-from elastocal.cell import Cell
-from elastocal.cell_workspace import HalfSpace, Solid
+from elastocal.cell import Cell, HalfSpace, Solid
 from elastocal.design.feasibility.bodies import Body, data_base
 from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.contact_rules import POSE_SLACK

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell import Cell
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Cell, Solid
 from elastocal.design.feasibility.bodies import Body, cell_bodies, skeleton
 from elastocal.design.feasibility.carriers import WORLD
 from elastocal.design.feasibility.shapes import hull, mesh_hull

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Solid
 from elastocal.design.feasibility.shapes import CORNERS, mesh_hull
 
 Array = NDArray[np.float64]

@@ -27,7 +27,7 @@ from typing import Any, Self
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, require
 from elastocal.files import atomic_write_text
-from elastocal.nearest import quoted
+from elastocal.text import quoted
 from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
 from elastocal.studies.study_results import SOONEST, Recorder, StudyResults, opened, read_results
 

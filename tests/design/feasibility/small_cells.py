@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from support.robots import KR270
 
-from elastocal.cell import Cell, Robot, Tool, Tracker
-from elastocal.cell_workspace import Solid, Workspace
+from elastocal.cell import Cell, Robot, Solid, Tool, Tracker, Workspace
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.manipulator.chain import Chain, Joint
 from elastocal.manipulator.urdf import read_urdf

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Solid
 from elastocal.design.feasibility.shapes import (
     capsule_between,
     few_points,

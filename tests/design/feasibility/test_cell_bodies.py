@@ -7,8 +7,7 @@ import pytest
 from design.feasibility.small_cells import KR270_CHAIN, at, box, cell, gantry, sphere
 from support.robots import packaged_urdf
 
-from elastocal.cell import Nominal, Robot
-from elastocal.cell_workspace import CarriedBody, HangingLoad, Solid, Workspace
+from elastocal.cell import CarriedBody, HangingLoad, Nominal, Robot, Solid, Workspace
 from elastocal.design.feasibility.bodies import cell_bodies
 from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.shapes import hull, support

@@ -22,8 +22,7 @@ from design.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.cell import Tool
-from elastocal.cell_workspace import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell import CarriedBody, HalfSpace, HangingLoad, Solid, Tool, Workspace
 from elastocal.design.feasibility.bodies import Body
 from elastocal.design.feasibility.collision import Collisions
 from elastocal.design.feasibility.contact_rules import POSE_SLACK

@@ -8,8 +8,7 @@ from design.feasibility.small_cells import DOWN, KR270_CHAIN, NOTHING, box, cell
 from design.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
 from design.feasibility.test_single_rules import full_cell
 
-from elastocal.cell import Tool, Tracker
-from elastocal.cell_workspace import CarriedBody, HalfSpace, Visibility, Workspace
+from elastocal.cell import CarriedBody, HalfSpace, Tool, Tracker, Visibility, Workspace
 from elastocal.design.feasibility.feasibility import Feasibility
 
 

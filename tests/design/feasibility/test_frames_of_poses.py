@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.robots import random_chain_urdf
 
-from elastocal.cell import Nominal, Tool
-from elastocal.cell_workspace import Workspace
+from elastocal.cell import Nominal, Tool, Workspace
 from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.collision import arm_configuration, arm_model
 from elastocal.design.feasibility.frames import Kinematics

@@ -21,8 +21,7 @@ from design.feasibility.small_cells import (
 )
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Tool
-from elastocal.cell_workspace import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell import CarriedBody, HalfSpace, HangingLoad, Solid, Tool, Workspace
 from elastocal.design.feasibility.collision import Collisions
 from elastocal.design.feasibility.contact_rules import POSE_SLACK
 from elastocal.design.feasibility.feasibility import Feasibility

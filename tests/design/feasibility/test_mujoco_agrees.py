@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from design.feasibility.small_cells import CHECK, DOWN, NOTHING, study_module
 
-from elastocal.cell_reader import read_cell
+from elastocal.cell import read_cell
 from elastocal.design.feasibility.collision import Collisions
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.feasibility.sight import END

@@ -20,8 +20,16 @@ from design.feasibility.small_cells import (
 from design.feasibility.test_frames_of_poses import random_chain
 from design.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
 
-from elastocal.cell import EffectChoice, Tool, Tracker
-from elastocal.cell_workspace import CarriedBody, HalfSpace, HangingLoad, Visibility, Workspace
+from elastocal.cell import (
+    CarriedBody,
+    EffectChoice,
+    HalfSpace,
+    HangingLoad,
+    Tool,
+    Tracker,
+    Visibility,
+    Workspace,
+)
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.feasibility.frames import Kinematics
 from elastocal.design.feasibility.load import StaticTorque

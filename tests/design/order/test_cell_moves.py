@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from support.cells import kr270_cell, kr270_chain, random_poses
 
-from elastocal.cell_design import Motion
-from elastocal.cell_workspace import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell import CarriedBody, HalfSpace, HangingLoad, Motion, Solid, Workspace
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.order.blockers import Blockers
 from elastocal.design.order.schedule import schedule

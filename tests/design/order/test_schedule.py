@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.discs import Discs, best_time
 
-from elastocal.cell_design import Motion
+from elastocal.cell import Motion
 from elastocal.design.order.schedule import schedule
 from elastocal.errors import InputError, InsufficientDataError
 

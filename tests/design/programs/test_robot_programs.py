@@ -8,7 +8,7 @@ import pytest
 from support.cells import kr270_chain, random_poses
 from support.discs import Discs
 
-from elastocal.cell_design import Motion
+from elastocal.cell import Motion
 from elastocal.design.order.schedule import schedule
 from elastocal.design.programs.krl import krl_program
 from elastocal.design.programs.steps import load_name

@@ -10,7 +10,7 @@ import pytest
 from support.cells import DOWN, table_of
 from support.rivals import ECCENTRIC, JUMP_TIME, SCALE, campaign, diagnosis_of, measured
 
-from elastocal.cell_workspace import Workspace
+from elastocal.cell import Workspace
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.result import Location
 from elastocal.diagnosis.separate.neighbours import with_neighbours

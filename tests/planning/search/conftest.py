@@ -12,9 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from support.calibration import cell_of, planar_chain
 
-from elastocal.cell import Array, CartesianNoise, Nominal, Tracker
-from elastocal.cell_design import DesignSpec
-from elastocal.cell_workspace import Workspace
+from elastocal.cell import Array, CartesianNoise, DesignSpec, Nominal, Tracker, Workspace
 from elastocal.design.candidates import Candidates, draw
 from elastocal.design.feasibility.feasibility import Feasibility
 from elastocal.design.information import PoseInformation

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from elastocal.cell_workspace import HalfSpace, Solid, Workspace
+from elastocal.cell import HalfSpace, Solid, Workspace
 from elastocal.design import candidates as module
 from elastocal.design.candidates import CHUNK, feasible
 from elastocal.design.joint_space import joint_space

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.cell import Array
-from elastocal.cell_workspace import HalfSpace, Workspace
+from elastocal.cell import Array, HalfSpace, Workspace
 from elastocal.design.candidates import CHUNK
 from elastocal.design.certificate import tangent_bound
 from elastocal.design.continuum import estimate

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Array
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Array, Solid
 from elastocal.design.feasibility.shapes import coal_shape
 from elastocal.planning.pose_margins import (
     MOST_SPHERES,

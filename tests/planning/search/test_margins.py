@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.cell import Array, Tracker
-from elastocal.cell_workspace import (
+from elastocal.cell import (
+    Array,
     CarriedBody,
     HalfSpace,
     HangingLoad,
     Solid,
+    Tracker,
     Visibility,
     Workspace,
 )

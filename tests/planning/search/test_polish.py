@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.cell import Array, PolarNoise, Tracker
-from elastocal.cell_workspace import HalfSpace, Solid, Workspace
+from elastocal.cell import Array, HalfSpace, PolarNoise, Solid, Tracker, Workspace
 from elastocal.design.candidates import sobol
 from elastocal.errors import InputError
 from elastocal.planning.polish import polish

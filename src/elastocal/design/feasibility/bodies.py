@@ -13,8 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell import Cell
-from elastocal.cell_workspace import CarriedBody, HangingLoad, Solid
+from elastocal.cell import CarriedBody, Cell, HangingLoad, Solid
 from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.shapes import capsule_between, support
 from elastocal.errors import InputError

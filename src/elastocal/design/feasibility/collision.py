@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell_workspace import HalfSpace
+from elastocal.cell import HalfSpace
 from elastocal.design.feasibility.bodies import Body
 from elastocal.design.feasibility.carriers import HANGING, WORLD
 from elastocal.design.feasibility.frames import Kinematics, Poses

@@ -8,8 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from elastocal.cell import Cell
-from elastocal.cell_workspace import HalfSpace, Workspace
+from elastocal.cell import Cell, HalfSpace, Workspace
 from elastocal.design.feasibility.bodies import Body, distal_placements
 from elastocal.design.feasibility.carriers import WORLD
 from elastocal.design.feasibility.shapes import hull, touches

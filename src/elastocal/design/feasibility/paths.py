@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell_workspace import HangingLoad
+from elastocal.cell import HangingLoad
 from elastocal.design.feasibility.bodies import Body
 from elastocal.design.feasibility.collision import Collisions
 from elastocal.design.feasibility.frames import Kinematics, Poses

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Solid
 from elastocal.errors import InputError
 
 Array = NDArray[np.float64]

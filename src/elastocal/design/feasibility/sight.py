@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Solid
 from elastocal.design.feasibility.bodies import Body
 from elastocal.design.feasibility.carriers import WORLD
 from elastocal.design.feasibility.collision import Collisions

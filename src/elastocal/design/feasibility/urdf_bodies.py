@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.cell import Cell
-from elastocal.cell_workspace import Solid
+from elastocal.cell import Cell, Solid
 from elastocal.design.feasibility.carriers import WORLD
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell_design import Motion
+from elastocal.cell import Motion
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

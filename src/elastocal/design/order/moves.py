@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell_design import Motion
+from elastocal.cell import Motion
 from elastocal.design.order.approach import approach_points, approach_signs
 from elastocal.design.order.roadmap import PathChecker, Roadmap, travel_times
 from elastocal.design.order.visits import Costs, Visits, visit_costs

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell_design import Motion
+from elastocal.cell import Motion
 from elastocal.design.order.bound import tour_bound
 from elastocal.design.order.execution import Execution
 from elastocal.design.order.moves import Moves

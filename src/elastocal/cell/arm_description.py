@@ -1,0 +1,317 @@
+"""The arm, what it carries, what measures it, and the model of it (DESIGN: cell file)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from elastocal.cell.file_keys import (
+    TUPLE,
+    File,
+    Many,
+    Rotation,
+    Spot,
+    from_table,
+    joint_values,
+    keyed,
+    keys_of,
+    record,
+)
+from elastocal.config import (
+    Array,
+    NonNegative,
+    Numbers,
+    Positive,
+    Table,
+    Text,
+    Vector3,
+    key,
+    numbers,
+    required,
+)
+from elastocal.errors import InputError, require
+from elastocal.text import is_label
+from elastocal.text import quoted
+from elastocal.units import to_si
+
+Observe = Literal["position", "deflection", "pose", "distance"]
+Convention = Literal["standard", "modified"]
+Sigma = Annotated[Array, numbers(3, above=0, one_for_all=True)]
+JointName = Annotated[str, Field(pattern=r"^joint[1-9][0-9]{0,2}$")]
+POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
+
+
+def _zeros() -> Array:
+    return np.zeros(3)
+
+
+@record
+class Robot:
+    """A URDF with the names of its first and last link, or a DH table with its convention.
+
+    `masses`: the table of link masses of a DH robot.  Files as absolute or relative paths.
+    """
+
+    urdf: File | None = keyed('the path of a URDF file, e.g. "arm.urdf"', default=None)
+    base: Text | None = keyed("the name of a link of the URDF", default=None)
+    flange: Text | None = keyed("the name of a link of the URDF", default=None)
+    dh: File | None = keyed('the path of a DH table, e.g. "nominal_dh.csv"', default=None)
+    dh_convention: Convention = keyed(default="standard")
+    masses: File | None = keyed(
+        'the path of a table of link masses, e.g. "links.csv"', default=None
+    )
+
+    def __post_init__(self) -> None:
+        both = self.urdf is not None and self.dh is not None
+        require(not both, "[robot] takes exactly one of urdf and dh; both are given")
+
+    @classmethod
+    def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
+        """Checks that one robot is stated, with the keys that belong to it."""
+        given = [name for name in ("urdf", "dh") if getattr(table, name) is not None]
+        spot.require(bool(given), "[robot] takes exactly one of urdf and dh; neither is given")
+        other = {"urdf": ("dh_convention", "masses"), "dh": ("base", "flange")}
+        for name in other[given[0]] if len(given) == 1 else ():
+            spot.require(
+                getattr(table, name) is None,
+                f"key robot.{name} has no meaning beside {given[0]}; drop it",
+            )
+        return {}
+
+    @classmethod
+    def from_urdf(
+        cls, path: str | Path, base: str | None = None, flange: str | None = None
+    ) -> Robot:
+        """Returns the arm of a URDF from link `base` to link `flange`.
+
+        Args:
+            path: the URDF file; its meshes are not needed.
+            base: name of the first link; None takes the root.
+            flange: name of the last link; None takes the last one.
+
+        Raises:
+            InputError: a value is of the wrong type.
+
+        >>> Robot.from_urdf("arm.urdf", flange="tool0").flange
+        'tool0'
+        """
+        return cls(urdf=Path(path), base=base, flange=flange)
+
+    @classmethod
+    def from_dh(
+        cls, path: str | Path, convention: Convention = "standard", masses: str | Path | None = None
+    ) -> Robot:
+        """Returns the arm of a table of Denavit-Hartenberg parameters.
+
+        Args:
+            path: the table, with columns theta0_rad, d_m or d_mm, a_m or a_mm, alpha_rad.
+            convention: "standard", or "modified" (Craig's).
+            masses: table of link masses in kg and centres of mass in m, for weights.
+
+        Raises:
+            InputError: a value is of the wrong type, or the convention is unknown.
+
+        >>> Robot.from_dh("dh.csv", convention="modified").dh_convention
+        'modified'
+        """
+        links = None if masses is None else Path(masses)
+        return cls(dh=Path(path), dh_convention=convention, masses=links)
+
+
+@record
+class Tool:
+    """`load_point` (3,) and `markers` name → (3,), in m in the flange frame."""
+
+    load_point: Vector3 = keyed(
+        "three numbers in m, in the flange frame", "load_point_m", default_factory=_zeros
+    )
+    markers: dict[str, Vector3] = keyed(
+        "three numbers in m per marker, flange frame", "markers_m", default_factory=dict
+    )
+
+    def __post_init__(self) -> None:
+        for name in self.markers:
+            require(
+                is_label(name),
+                f"marker name {quoted(name)} in [tool.markers_m] cannot stand in a table; use a "
+                "non-empty text on one line without blanks at its ends",
+            )
+
+
+@record
+class CartesianNoise:
+    """Standard deviations (3,) in m along x, y, z of the tracker frame; one number for all."""
+
+    sigma: Sigma = keyed("one positive number in µm, or three for x, y, z", "sigma_um")
+
+
+@record
+class PolarNoise:
+    """Range and transverse standard deviation: constant part in m, part per metre of range (1)."""
+
+    range: Positive = keyed("a positive number in µm", "range_um")
+    range_per_m: NonNegative = keyed("a number >= 0 in µm per m", "range_ppm")
+    transverse: Positive = keyed("a positive number in µm", "transverse_um")
+    transverse_per_m: NonNegative = keyed("a number >= 0 in µm per m", "transverse_ppm")
+
+    @classmethod
+    def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
+        """The parts per metre, which may be left out."""
+        return {
+            "range_per_m": to_si(table.range_ppm or 0.0, "ppm"),
+            "transverse_per_m": to_si(table.transverse_ppm or 0.0, "ppm"),
+        }
+
+
+@record
+class Tracker:
+    """`position` (3,) m: where the instrument stands in the frame of the data.
+
+    `anchor` (3,) m: nominal cable or ball-bar anchor for distances.
+    `rotation_sigma` rad and `distance_sigma` m: noise of pose and distance readings, if known.
+    """
+
+    position: Vector3 = keyed("three numbers in m", "position_m", default_factory=_zeros)
+    noise: CartesianNoise | PolarNoise | None = keyed(
+        keys=keys_of(CartesianNoise, PolarNoise), default=None
+    )
+    anchor: Vector3 | None = keyed("three numbers in m", "anchor_m", default=None)
+    rotation_sigma: Positive | None = keyed(
+        "a positive number in µrad", "rotation_urad", default=None
+    )
+    distance_sigma: Positive | None = keyed("a positive number in µm", "distance_um", default=None)
+
+    @classmethod
+    def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
+        """The noise, in the one style that the table has."""
+        polar = [name for name in POLAR_KEYS if getattr(table, name) is not None]
+        if table.sigma_um is not None:
+            spot.require(
+                not polar,
+                f"keys tracker.sigma_um and tracker.{''.join(polar[:1])} are two styles of noise; "
+                f"keep sigma_um, or {', '.join(POLAR_KEYS)}",
+            )
+            return {"noise": from_table(CartesianNoise, table, spot)}
+        if not polar:
+            return {"noise": None}
+        for name in ("range_um", "transverse_um"):
+            spot.require(
+                getattr(table, name) is not None,
+                f"key tracker.{name} is missing; beside tracker.{polar[0]} it takes a positive "
+                "number in µm",
+            )
+        return {"noise": from_table(PolarNoise, table, spot)}
+
+
+@record
+class EffectChoice:
+    """One entry of `effects`: "joint_compliance", or "joint_compliance:joint2" for one place."""
+
+    name: str
+    where: str | None = None
+
+    @classmethod
+    def parse(cls, entry: str) -> EffectChoice:
+        """Returns the choice that "effect" or "effect:where" states; raises InputError for others.
+
+        >>> EffectChoice.parse("joint_compliance:joint2")
+        EffectChoice(name='joint_compliance', where='joint2')
+        """
+        name, colon, where = entry.partition(":")
+        ok = name and (where or not colon) and entry == entry.strip()
+        require(bool(ok), f'takes "effect" or "effect:where"; found {quoted(entry)}')
+        return cls(name, where or None)
+
+    def __str__(self) -> str:
+        return f"{self.name}:{self.where}" if self.where else self.name
+
+
+def _choices(entries: object) -> object:
+    """Effects as they are chosen; each may be stated as a text."""
+    if not isinstance(entries, list | tuple):
+        return entries
+    choices: list[object] = []
+    for i, entry in enumerate(entries):
+        try:
+            choices.append(EffectChoice.parse(entry) if isinstance(entry, str) else entry)
+        except InputError as error:
+            raise InputError(f"key model.effects[{i}] {error}") from None
+    return tuple(choices)
+
+
+class CompensatorTable(Table):
+    """A spring between two anchor points that takes a part of a joint's load."""
+
+    joint: JointName = required('the joint the spring spans, e.g. "joint2"')
+    stiffness_N_per_m: NonNegative | None = key("a number >= 0 in N/m")
+    anchor_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = key(
+        "two numbers in m"
+    )
+    arm_m: Positive | None = key("a positive number in m")
+    free_length_m: NonNegative | None = key("a number >= 0 in m")
+
+
+@record
+class Nominal:
+    """Nominal values and start hints; compliances in rad/(N m), base rotation (3, 3).
+
+    `settings`: place → key → value of the constants that effects do not fit, in the key's unit.
+    """
+
+    joint_compliance: Annotated[tuple[NonNegative, ...], TUPLE, Field(min_length=1)] | None = keyed(
+        "one number >= 0 per joint, in rad/(N m)", default=None
+    )
+    base_position: Vector3 | None = keyed("three numbers in m", "base_position_m", default=None)
+    base_rotation: Rotation | None = keyed(
+        "three numbers in degrees: roll, pitch, yaw", "base_rpy_deg", default=None
+    )
+    gravity_compensator: dict[str, Any] | None = keyed(
+        'a table with joint = "joint2"',
+        form=CompensatorTable,
+        into=lambda table, *_: table.model_dump(exclude_none=True),
+        default=None,
+    )
+    settings: dict[str, dict[str, float]] = keyed(
+        "a table per place, as in settings.joint2 = { jump_time_s = 720.0 }", default_factory=dict
+    )
+
+
+@record
+class ModelSpec:
+    """What is observed, which effects are fitted, and what drives and settles the springs.
+
+    `effects` may be stated as texts, "effect" or "effect:where".
+    """
+
+    observe: Observe = keyed(default="position")
+    effects: Annotated[tuple[EffectChoice, ...], BeforeValidator(_choices)] = keyed(
+        'a list of "effect" or "effect:where"', form=list[Text], default=()
+    )
+    torque: Literal["computed", "measured"] = keyed(default="computed")
+    link_gravity: bool = keyed(default=False)
+    deflection_model: Literal["equilibrium", "linear"] = keyed(default="equilibrium")
+    compliance_levels: dict[str, Many[float]] = keyed(
+        "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
+        form=dict[str, Numbers],
+        into=joint_values,
+        default_factory=dict,
+    )
+    gear_ripple_orders: Many[Positive] = keyed("a list of positive numbers", default=())
+    thermal_driver: Literal["time", "temperature"] = keyed(default="time")
+    play_side: Literal["load", "load_and_approach"] = keyed(default="load")
+    nominal: Nominal = keyed("a table", default_factory=Nominal)
+
+    def __post_init__(self) -> None:
+        for i, choice in enumerate(self.effects):
+            require(
+                choice not in self.effects[:i],
+                f"key model.effects[{i}] repeats {quoted(str(choice))}; keep one",
+            )
+        for joint, levels in self.compliance_levels.items():
+            require(
+                len(set(levels)) == len(levels),
+                f"[model.compliance_levels] repeats a level of {joint}; give each once",
+            )

@@ -1,0 +1,433 @@
+"""How the classes of the cell state their keys in the cell file, and are built from it.
+
+A class of the cell is a `record`: a frozen dataclass in SI units whose fields pydantic checks.  A
+field that a cell file may state is `keyed`: its name and unit there, and what it takes.  From
+these keys come the table that a file is checked against (`table_of`), the record of a checked
+table (`from_table`), and what is said of a wrong argument in Python.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cache, wraps
+from pathlib import Path
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import numpy as np
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+    create_model,
+)
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+from pydantic_core import PydanticCustomError
+
+from elastocal.config import (
+    STRICT,
+    Array,
+    Table,
+    Text,
+    Vector3,
+    alternatives,
+    dotted,
+    numbers,
+    place,
+    shown,
+)
+from elastocal.errors import InputError, require
+from elastocal.files import check_exists
+from elastocal.text import did_you_mean
+from elastocal.text import listed
+from elastocal.units import to_si
+
+Record = TypeVar("Record")
+Member = TypeVar("Member")
+JOINT_UNITS = ("deg", "rad", "m", "mm")
+JOINT_KEY = re.compile(r"(joint[1-9][0-9]{0,2})(?:_(deg|rad|mm|m))?", re.ASCII)
+# Units that key names end with, in words, and the SI unit in its place in Python.
+UNITS = {
+    "m": ("m", "m"),
+    "si": ("rad or m", "rad or m"),
+    "um": ("µm", "m"),
+    "mm": ("mm", "m"),
+    "ppm": ("µm per m", "m per m"),
+    "deg": ("degrees", "rad"),
+    "urad": ("µrad", "rad"),
+    "deg_per_s": ("°/s", "rad/s"),
+}
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A table of the cell file `path`: the keys that lead to it."""
+
+    path: Path
+    keys: tuple[str | int, ...] = ()
+
+    def __truediv__(self, part: str | int) -> Spot:
+        return Spot(self.path, (*self.keys, part))
+
+    def key(self, name: str) -> str:
+        """The key `name` of this table as a message names it."""
+        return place(*self.keys, name)
+
+    def require(self, condition: object, sentence: str) -> None:
+        """Raises InputError with the file and `sentence` unless `condition` holds."""
+        require(bool(condition), f"{self.path}: {sentence}")
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of the cell file; `takes` completes the sentence 'key … takes …'.
+
+    `form`: the type of its value there, None where it is the field's.  `into`: makes the field's
+    value of it, its table and its name; None converts from the unit that the name ends with.
+    """
+
+    name: str
+    takes: str
+    form: Any = None
+    into: Callable[[Any, Spot, str], Any] | None = None
+    required: bool = False
+
+    @property
+    def unit(self) -> str:
+        """The unit of its value, "" where that is SI or has none."""
+        return max((u for u in UNITS if self.name.endswith("_" + u)), key=len, default="")
+
+
+@dataclass(frozen=True)
+class FromFile:
+    """In the Annotated of a type: the `form` and `into` of its keys, as of `Key`."""
+
+    form: Any
+    into: Callable[[Any, Spot, str], Any]
+
+
+def keyed(
+    takes: str = "",
+    *names: str,
+    form: Any = None,
+    into: Callable[[Any, Spot, str], Any] | None = None,
+    keys: Sequence[Key] = (),
+    required: bool = False,
+    **default: Any,
+) -> Any:
+    """A field of a record that a cell file states; `default` or `default_factory` as of `field`.
+
+    `names` of its key, which end with their unit, {} in `takes`; none is the field's own name, and
+    of several the user chooses one.  Without `takes` it is one of a Literal, or true or false.
+    `keys` in their place where several state the field together; then `from_keys` of the record
+    puts them together.  The others are as of `Key`.
+    """
+    own = [Key(name, takes, form, into, required) for name in names or ("",)]
+    return field(metadata={"keys": tuple(keys or own)}, **default)
+
+
+# --- Records -------------------------------------------------------------------------------------
+
+# Arrays in a union; each is checked by a validator of its own.
+CONFIG = STRICT | ConfigDict(arbitrary_types_allowed=True)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field, keyed))
+def record(cls: type[Record]) -> type[Record]:
+    """Make a class a frozen dataclass whose fields are checked, in SI units.
+
+    A wrong argument is an InputError that names class, field, what it takes and what was found.
+    """
+    made: Any = pydantic_dataclass(frozen=True, config=CONFIG)(cls)
+    checked_init = made.__init__
+
+    @wraps(checked_init)
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            checked_init(self, *args, **kwargs)
+        except ValidationError as error:
+            raise InputError(_wrong_argument(made, error)) from None
+
+    made.__init__ = init
+    return made
+
+
+def _wrong_argument(cls: Any, error: ValidationError) -> str:
+    """What is wrong with the arguments of a record, as a sentence."""
+    first = error.errors(include_url=False)[0]
+    kind, name, own, fields = first["type"], first["loc"][0], cls.__name__, list(fields_of(cls))
+    if kind == "unexpected_keyword_argument":
+        return f"{own} has no {name}{did_you_mean(str(name), fields)}; it takes {listed(fields)}"
+    if kind == "unexpected_positional_argument":
+        return f"{own} takes at most {len(fields)} values: {listed(fields)}"
+    if kind == "missing":
+        return f"{own}: {name} is missing; it takes {listed(fields)}"
+    name = fields[name] if isinstance(name, int) else name
+    told = first["msg"].removeprefix("Input should be ")
+    for known in fields_of(cls)[name][:1]:
+        if known.form is None and kind != "matrix" and "dataclass" not in kind:
+            told = known.takes.replace(*UNITS.get(known.unit, ("", "")))
+    words = re.findall(r'"(\w+)"', told) if kind == "literal_error" else ()
+    hint = did_you_mean(str(first["input"]), words)
+    return f"{own}: {name} takes {told}; found {shown(first['input'])}{hint}"
+
+
+def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
+    """The fields of a record by name, each with the keys that state it in a cell file."""
+    hints = get_type_hints(cls, include_extras=True)
+    found = {}
+    for name, one in cls.__dataclass_fields__.items():
+        how = next((note for note in _notes(hints[name]) if isinstance(note, FromFile)), None)
+        found[name] = tuple(
+            replace(
+                known,
+                name=known.name or name,
+                takes=known.takes.replace("{}", UNITS[known.unit][0] if known.unit else "")
+                or _choice(known.form or hints[name]),
+                into=known.into or (how and how.into),
+            )
+            for known in one.metadata.get("keys", ())
+        )
+    return found
+
+
+def _choice(hint: Any) -> str:
+    """The members of a Literal as a sentence lists them, or true or false."""
+    if get_origin(hint) is not Literal:
+        return "true or false"
+    *first, last = (f'"{name}"' for name in get_args(hint))
+    return f"{', '.join(first)} or {last}"
+
+
+fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)
+
+
+def _notes(hint: Any) -> Iterator[Any]:
+    """What stands in the Annotated of a type, or of a member of a union."""
+    yield from getattr(hint, "__metadata__", ())
+    if get_origin(hint) in (Union, UnionType):
+        for member in get_args(hint):
+            yield from _notes(member)
+
+
+# --- From the file -------------------------------------------------------------------------------
+
+
+class RecordTable(Table):
+    """A table of the cell file from which a record is built."""
+
+    record: ClassVar[Any]
+
+
+def keys_of(*records: Any, without: Sequence[str] = (), optional: bool = False) -> list[Key]:
+    """The keys that state records in a cell file, each with its type there."""
+    return [
+        replace(
+            known,
+            form=known.form or _form(get_type_hints(one, include_extras=True)[name]),
+            required=known.required and not optional,
+        )
+        for one in records
+        for name, keys in fields_of(one).items()
+        for known in keys
+        if known.name not in without
+    ]
+
+
+def _form(hint: Any) -> Any:
+    """The type that a field has in the file: there are tables in place of records."""
+    for note in _notes(hint):
+        if isinstance(note, FromFile):
+            return note.form
+    for kind in alternatives(hint):
+        if _is_record(kind):
+            return table_of(kind)
+        if get_origin(kind) is tuple and _is_record(get_args(kind)[0]):
+            return list[table_of(get_args(kind)[0])]  # type: ignore[misc]
+    return hint
+
+
+def _is_record(kind: Any) -> bool:
+    return hasattr(kind, "__dataclass_fields__")
+
+
+def _table_of(cls: Any) -> type[RecordTable]:
+    """The table of the cell file that states a record: its keys, their types, what they take."""
+    fields: dict[str, Any] = {
+        k.name: (k.form, Field(... if k.required else None, description=k.takes))
+        for k in keys_of(cls)
+    }
+    made = create_model(f"{cls.__name__}Table", __base__=RecordTable, **fields)
+    made.record = cls
+    return made
+
+
+table_of: Callable[[Any], type[RecordTable]] = cache(_table_of)
+
+
+def from_table(cls: type[Record], table: RecordTable, spot: Spot, **values: Any) -> Record:
+    """The record that a checked table states, in SI units; `values` are known otherwise.
+
+    `cls.from_keys(table, spot)`, where there is one, gives the fields that several keys state
+    together; each other field is stated by one of its keys.
+
+    Raises InputError for keys that do not go together and for files that do not exist.
+    """
+    known: Any = cls
+    if hasattr(cls, "from_keys"):
+        values |= known.from_keys(table, spot)
+    for name, keys in fields_of(known).items():
+        if name not in values and (given := stated(table, spot, keys)):
+            values[name] = given[0]
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(f"{spot.path}: {error}") from None
+
+
+def stated(table: Table, spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:
+    """The value in SI units and the name of the one of `keys` that the table states, None for none.
+
+    Raises InputError where two of them are given.
+    """
+    given = [known for known in keys if getattr(table, known.name, None) is not None]
+    names = " and ".join(spot.key(known.name) for known in given)
+    spot.require(len(given) < 2, f"{names} say the same in two units; keep one of them")
+    for known in given:
+        return _value(getattr(table, known.name), known, spot), known.name
+    return None
+
+
+def _value(found: Any, known: Key, spot: Spot) -> Any:
+    if isinstance(found, RecordTable):
+        return from_table(found.record, found, spot / known.name)
+    if isinstance(found, list) and found and isinstance(found[0], RecordTable):
+        tables = enumerate(found)
+        return tuple(from_table(t.record, t, spot / known.name / i) for i, t in tables)
+    if known.into is not None:
+        return known.into(found, spot, known.name)
+    if known.unit and isinstance(found, Mapping):
+        return {name: to_si(number, known.unit) for name, number in found.items()}
+    return to_si(found, known.unit) if known.unit else found
+
+
+def existing_file(found: str, spot: Spot, name: str) -> Path:
+    """The file that a key names relative to the cell file; raises InputError where it is none."""
+    return check_exists(spot.path.parent / found, spot.key(name), spot.path)
+
+
+def rotation_from_rpy(rpy_deg: Sequence[float] | Array, *_: object) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(np.radians(rpy_deg)), np.sin(np.radians(rpy_deg))
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    return about_z @ about_y @ about_x
+
+
+def direction(vector: Array, spot: Spot, name: str) -> Array:
+    """A vector (3,) at unit length; raises InputError that names the key where it is zero."""
+    unit = _unit_vector(np.asarray(vector, dtype=float))
+    if unit is None:
+        what = f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]"
+        raise InputError(f"{spot.path}: {what}")
+    return unit
+
+
+def joint_values(
+    table: Mapping[str, Sequence[float]], spot: Spot, name: str, others: tuple[str, ...] = ()
+) -> dict[str, tuple[float, ...]]:
+    """Values in SI units per joint name, from keys such as joint2_deg of the table `name`.
+
+    `others`: further keys of that table, which a misspelt one may have been meant for.
+
+    Raises InputError for other keys, missing units, and a joint given in two units.
+    """
+    values: dict[str, tuple[float, ...]] = {}
+    above = spot.key(name)
+    for key, stated_values in table.items():
+        match = JOINT_KEY.fullmatch(key)
+        joint, unit = match.groups() if match else (None, None)
+        if joint is None or unit is None:
+            valid = [f"joint{i}_{u}" for i in range(1, 10) for u in JOINT_UNITS] + [*others]
+            names = " or ".join(f"{joint}_{u}" for u in JOINT_UNITS)
+            hint = did_you_mean(key, valid) if joint is None else f"; missing unit: {names}"
+            raise InputError(
+                f"{spot.path}: unknown key {above}.{dotted((key,))}{hint}; [{above}] takes "
+                "keys such as joint1_deg or joint1_rad, for a prismatic joint joint3_m or joint3_mm"
+            )
+        spot.require(joint not in values, f"[{above}] gives {joint} in two units; keep one of them")
+        values[joint] = tuple(to_si(float(v), unit) for v in stated_values)
+    return values
+
+
+# --- What fields take ----------------------------------------------------------------------------
+
+
+def _tuple(value: object) -> object:
+    """A list or an array as a tuple, whose members are then checked."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    return tuple(value) if isinstance(value, list) else value
+
+
+def matrix(rows: int | None, columns: int) -> PlainValidator:
+    """The validator of an array (rows, columns) of finite numbers; None counts any but zero."""
+    one_row: Any = numbers(columns).func
+
+    def check(value: object) -> Array:
+        listing = value.tolist() if isinstance(value, np.ndarray) else value
+        if isinstance(listing, list | tuple) and len(listing) == (rows or len(listing) or 1):
+            with suppress(PydanticCustomError):
+                return np.array([one_row(row) for row in listing])
+        raise PydanticCustomError("matrix", f"an array ({rows or 'n'}, {columns})")
+
+    return PlainValidator(check)
+
+
+def _unit_vector(vector: Array) -> Array | None:
+    """`vector` at unit length, None where it is zero."""
+    largest = np.abs(vector).max()
+    if largest == 0:
+        return None
+    # First by the largest entry, whose square cannot overflow or vanish.
+    scaled = vector / largest
+    return np.asarray(scaled / np.linalg.norm(scaled))
+
+
+def _direction(value: object) -> Array:
+    check: Any = numbers(3).func
+    vector: Array = check(value)
+    unit = _unit_vector(vector)
+    if unit is None:
+        raise PydanticCustomError("zero", "a direction, as in [0, 0, 1]")
+    # What has unit length already stays as it is, digit for digit.
+    return vector if np.abs(vector - unit).max() < 1e-12 else unit
+
+
+def _path(value: object) -> object:
+    return Path(value) if isinstance(value, str) else value
+
+
+TUPLE = BeforeValidator(_tuple)
+Many = Annotated[tuple[Member, ...], TUPLE]
+File = Annotated[Path, BeforeValidator(_path), FromFile(Text, existing_file)]
+Rotation = Annotated[Array, matrix(3, 3), FromFile(Vector3, rotation_from_rpy)]
+Transform = Annotated[Array, matrix(4, 4)]
+Direction = Annotated[Array, PlainValidator(_direction), FromFile(Vector3, direction)]

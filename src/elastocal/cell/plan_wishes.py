@@ -1,0 +1,279 @@
+"""What the user asks of a plan (DESIGN: [design])."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field
+
+from elastocal.cell.file_keys import (
+    File,
+    Key,
+    Many,
+    Rotation,
+    Spot,
+    fields_of,
+    joint_values,
+    keyed,
+    matrix,
+    record,
+    stated,
+)
+from elastocal.config import (
+    Array,
+    Count,
+    NonNegative,
+    Numbers,
+    Positive,
+    Table,
+    Text,
+    Vector3,
+    header,
+    key,
+    numbers,
+)
+from elastocal.errors import require
+
+Positives = Annotated[Array, numbers(above=0)]
+
+
+SPEED_KEYS = (
+    Key(
+        "speed_deg_per_s",
+        "a positive number in °/s, or one per joint",
+        Annotated[Array, numbers(above=0, one_for_all=True)],
+    ),
+    Key("speed_si", "one positive number per joint, in rad/s or m/s", Positives),
+)
+
+
+def _force() -> Any:
+    return keyed("three numbers in N, a force in the data's frame", "load_N", default=None)
+
+
+def _point() -> Any:
+    return keyed("three numbers in m, a point in the flange frame", "point_m", default=None)
+
+
+@record
+class TargetPose:
+    """A test pose, where position must be right: joints `q` (n,) rad or m and force (3,) N.
+
+    `point` (3,) m in the flange frame; None: the markers themselves where their places are fitted,
+    else the load point if the cell states one, else the mean over the markers.  `force` None: each
+    of the design's loads that is not zero.  `degrees`: q was stated in degrees, which fits
+    revolute joints only.
+    """
+
+    q: Numbers = keyed("one number per joint, in {}", "q_deg", "q_si")
+    force: Vector3 | None = _force()
+    weight: Positive = keyed("a positive number", default=1.0)
+    point: Vector3 | None = _point()
+    degrees: bool = False
+
+    @classmethod
+    def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
+        """The joints, in one of two units."""
+        spot.require(
+            table.q_deg is not None or table.q_si is not None,
+            f"key {spot.key('q_deg')} is missing; it takes one number per joint, in degrees "
+            "(q_si: in rad or m)",
+        )
+        return {"degrees": table.q_deg is not None}
+
+
+@record
+class TargetPath:
+    """A table of poses: q1_deg … (force_x_N …), or x_mm, y_mm, z_mm (rx_deg …) of the point."""
+
+    file: File = keyed('the path of a table of poses, e.g. "path.csv"', required=True)
+    force: Vector3 | None = _force()
+    point: Vector3 | None = _point()
+
+
+@record
+class TargetBox:
+    """`count` test poses with the point inside a box (m, data's frame), sampled.
+
+    `rotation` (3, 3) of the flange in the data's frame, None for any that the arm reaches.
+    """
+
+    lower: Vector3 = keyed(
+        "three numbers in m, a corner in the data's frame", "lower_m", required=True
+    )
+    upper: Vector3 = keyed(
+        "three numbers in m, the opposite corner in the data's frame", "upper_m", required=True
+    )
+    count: Annotated[int, Field(ge=1, le=10_000)] = keyed("a whole number, 1 to 10000", default=20)
+    rotation: Rotation | None = keyed(
+        "three numbers in degrees: roll, pitch, yaw of the flange", "rpy_deg", default=None
+    )
+    force: Vector3 | None = _force()
+    point: Vector3 | None = _point()
+
+    def __post_init__(self) -> None:
+        k = int(np.argmin(self.lower < self.upper))
+        require(
+            bool((self.lower < self.upper).all()),
+            f"{header(('design', 'test_box'))} takes lower_m < upper_m in x, y and z; found "
+            f"{self.lower[k]:g} and {self.upper[k]:g} in {'xyz'[k]}; swap or correct them",
+        )
+
+
+@record
+class Motion:
+    """How the arm moves between poses: joint `speed` (n,) rad/s or m/s, (1,) where all are alike
+    (None: equal speeds), `home` (n,), `dwell` s of
+    measuring per pose, `load_change` s for hanging or taking off the load by hand,
+    `both_directions`: approach every pose from both sides (`overshoot` rad), to show backlash.
+    `degrees`: speed or home were stated in degrees, which fits revolute joints only."""
+
+    speed: Positives | None = keyed(keys=SPEED_KEYS, default=None)
+    home: Numbers | None = keyed("one number per joint, in {}", "home_deg", "home_si", default=None)
+    dwell: NonNegative = keyed("a number >= 0 in s", "dwell_s", default=30.0)
+    load_change: NonNegative = keyed("a number >= 0 in s", "load_change_s", default=600.0)
+    both_directions: bool = keyed(default=False)
+    overshoot: Positive = keyed("a positive number in degrees", "overshoot_deg", default=0.05)
+    degrees: bool = False
+
+    @classmethod
+    def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
+        """Whether speed and home are in degrees; both must be, or none."""
+        given = [stated(table, spot, fields_of(cls)[name]) for name in ("speed", "home")]
+        names = [one[1] for one in given if one is not None]
+        degrees = [not name.endswith("_si") for name in names]
+        spot.require(
+            all(degrees) or not any(degrees),
+            f"keys {' and '.join(map(spot.key, names))} mix units; give both in degrees, or both "
+            "in SI units (_si)",
+        )
+        return {"degrees": any(degrees)}
+
+
+class LevelsTable(Table):
+    """One joint's levels under a key such as joint2_deg, and how many poses each gets."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Numbers] = Field(init=False)
+    poses_per_level: Count | Annotated[list[Count], Field(min_length=1)] | None = key(
+        "a whole number >= 1, or one per level"
+    )
+
+
+@record
+class DesignSpec:
+    """`criterion`: the name of one that planning has.
+
+    `levels` joint → values and `per_level` their numbers of poses (for at most one joint);
+    `loads` (L, 3) N: forces under which poses are measured, all of them at every pose, or one of
+    them chosen per pose where `load_choice`; `repeats` readings each.  `repeatability` m: standard
+    deviation of a deviation common to a configuration's readings, per direction; `marker_sigma`
+    m per marker instead of the tracker's noise; `interest`: parameters, places or effects that
+    D, A, E and O count (default all but base and markers); `combination` name → factor for c."""
+
+    poses: Count | None = keyed("a whole number >= 1", default=None)
+    criterion: Text = keyed(
+        'the name of a planning criterion, as "test_pose" or "D"', default="test_pose"
+    )
+    levels: dict[str, Many[float]] = keyed(
+        "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
+        form=LevelsTable,
+        default_factory=dict,
+    )
+    per_level: Many[Count] = ()
+    repeats: Count = keyed("a whole number >= 1", default=1)
+    loads: Annotated[Array, matrix(None, 3)] | None = keyed(
+        "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]", "loads_N", default=None
+    )
+    load_choice: bool = keyed(default=False)
+    repeatability: NonNegative = keyed("a number >= 0 in µm", "repeatability_um", default=0.0)
+    marker_sigma: dict[str, Positive] = keyed(
+        "a positive number in µm per marker", "marker_sigma_um", default_factory=dict
+    )
+    interest: Many[Text] = keyed(
+        'a list of names, as in ["joint_compliance", "joint2"]', default=()
+    )
+    combination: dict[str, float] = keyed(
+        'factors by parameter, with names in quotes, as in { "joint2.compliance" = 1.0 }',
+        default_factory=dict,
+    )
+    prior: Literal["none", "typical"] = keyed(default="none")
+    robust: Literal["none", "average", "worst"] = keyed(default="none")
+    robust_samples: Count = keyed("a whole number >= 1", default=8)
+    candidates: Count = keyed("a whole number >= 1", default=20_000)
+    target: Positive | None = keyed("a positive number in µm", "target_um", default=None)
+    test_poses: Many[TargetPose] = keyed(
+        "tables, each headed [[design.test_pose]]", "test_pose", default=()
+    )
+    test_path: TargetPath | None = keyed("a table headed [design.test_path]", default=None)
+    test_box: TargetBox | None = keyed("a table headed [design.test_box]", default=None)
+    motion: Motion = keyed("a table headed [design.motion]", default_factory=Motion)
+
+    def __post_init__(self) -> None:
+        joints = " and ".join(self.levels)
+        require(
+            len(self.levels) < 2,
+            f"[design.levels] has levels of {joints}; only one joint can have levels: keep one, "
+            "and narrow the others in [limits]",
+        )
+        for joint, values in self.levels.items():
+            require(
+                len(set(values)) == len(values),
+                f"[design.levels] repeats a level of {joint}; give each once",
+            )
+        require(
+            self.loads is None or len(np.unique(self.loads, axis=0)) == len(self.loads),
+            "key design.loads_N repeats a load; give each once ([design] repeats says how often "
+            "each is read)",
+        )
+        require(
+            not self.combination or any(self.combination.values()),
+            "key design.combination has no factor other than zero; give the combination of "
+            "parameters that is to be known well",
+        )
+
+    @classmethod
+    def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
+        """The levels and their numbers of poses; where poses is not given, it is their sum."""
+        given = table.levels or LevelsTable()
+        levels = joint_values(given.model_extra or {}, spot, "levels", ("poses_per_level",))
+        per_level = _per_level(given.poses_per_level, levels, spot)
+        poses = table.poses
+        if per_level:
+            spot.require(
+                poses in (None, sum(per_level)),
+                f"key design.poses is {poses}, but the poses per level in [design.levels] sum to "
+                f"{sum(per_level)}; drop or correct one of them",
+            )
+            poses = sum(per_level)
+        for joint, values in levels.items():
+            spot.require(
+                poses is None or poses >= len(values),
+                f"key design.poses is {poses}, but {joint} has {len(values)} levels in "
+                "[design.levels], and each needs at least one pose; ask for more poses or fewer "
+                "levels",
+            )
+        return {"levels": levels, "per_level": per_level, "poses": poses}
+
+
+def _per_level(
+    given: int | list[int] | None, levels: dict[str, tuple[float, ...]], spot: Spot
+) -> tuple[int, ...]:
+    """The number of poses of each level of the one joint that has levels, () where not stated."""
+    if given is None or len(levels) > 1:
+        return ()
+    spot.require(
+        bool(levels),
+        "key design.levels.poses_per_level has no meaning without levels; name the joint, as in "
+        "joint2_deg = [-90, -45, 0]",
+    )
+    ((joint, values),) = levels.items()
+    if isinstance(given, int):
+        return (given,) * len(values)
+    spot.require(
+        len(given) == len(values),
+        f"key design.levels.poses_per_level has {len(given)} numbers for {len(values)} levels of "
+        f"{joint}; give one number for all, or one per level",
+    )
+    return tuple(given)

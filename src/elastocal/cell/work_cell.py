@@ -1,0 +1,149 @@
+"""The work cell: everything known about arm, tool, tracker and model before measuring."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker
+from elastocal.cell.file_keys import (
+    TUPLE,
+    File,
+    Many,
+    Spot,
+    from_table,
+    joint_values,
+    keyed,
+    record,
+    table_of,
+)
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell.workspace_rules import Workspace
+from elastocal.config import Table, Text, Vector2, checked, header, key, read_toml
+from elastocal.errors import require
+from elastocal.files import check_exists
+from elastocal.text import did_you_mean
+from elastocal.text import listed
+from elastocal.text import quoted
+
+KnownEffects = tuple[str, ...] | Callable[["Cell"], tuple[str, ...]]
+
+
+class PluginsTable(Table):
+    """Effects, criteria and noise models of the user's own."""
+
+    modules: list[Text] | None = key(
+        'a list of Python files or modules, as in ["my_effects.py", "my_package.effects"]'
+    )
+
+
+def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
+    """Files as paths that exist, modules as they are named."""
+    modules = table.modules or ()
+    for i, module in enumerate(modules):
+        if is_plugin_file(module):
+            check_exists(spot.path.parent / module, f"plugins.modules[{i}]", spot.path)
+    return tuple(str(spot.path.parent / m) if is_plugin_file(m) else m for m in modules)
+
+
+def is_plugin_file(module: str) -> bool:
+    """Whether an entry of [plugins] modules is a Python file, and no importable module."""
+    return module.endswith(".py")
+
+
+def _limits(table: Mapping[str, Any], spot: Spot, name: str) -> dict[str, tuple[float, float]]:
+    return {joint: (low, high) for joint, (low, high) in joint_values(table, spot, name).items()}
+
+
+@record
+class Cell:
+    """Everything known about arm, tool, tracker and model before measuring.
+
+    `limits` joint → (lower, upper) in rad or m, which narrow those of the robot.  `plugins`:
+    Python files, as absolute paths or relative to the working folder, and importable modules.
+    `path`: the file that it was read from.
+    """
+
+    name: str = keyed("a text", form=Text)
+    path: File | None = None
+    robot: Robot = keyed(
+        'a table with urdf = "arm.urdf" or dh = "dh.csv"', required=True, default_factory=Robot
+    )
+    tool: Tool = keyed("a table", default_factory=Tool)
+    tracker: Tracker = keyed("a table", default_factory=Tracker)
+    model: ModelSpec = keyed("a table", default_factory=ModelSpec)
+    limits: dict[str, Annotated[tuple[float, float], TUPLE]] = keyed(
+        "two numbers per joint, as in joint1_deg = [-170.0, 170.0]",
+        form=dict[str, Vector2],
+        into=_limits,
+        default_factory=dict,
+    )
+    workspace: Workspace = keyed("a table", default_factory=Workspace)
+    design: DesignSpec = keyed("a table", default_factory=DesignSpec)
+    plugins: Many[Text] = keyed("a table", form=PluginsTable, into=_modules, default=())
+
+    def __post_init__(self) -> None:
+        for joint, (low, high) in self.limits.items():
+            require(
+                low < high,
+                f"the limits of {joint} in [limits] take [lower, upper] with lower < upper; swap "
+                "or correct them",
+            )
+
+    @classmethod
+    def read(cls, path: str | Path, known_effects: KnownEffects | None = None) -> Cell:
+        """Returns the cell that a TOML file describes, in SI units.
+
+        Args:
+            path: the cell file; paths in it are relative to it, and its files must exist.
+            known_effects: as of `check`.
+
+        Raises:
+            InputError: names file, key, what the key takes and the nearest valid name.
+        """
+        path = Path(path)
+        table: Any = checked(table_of(cls), read_toml(path, "cell file"), path)
+        cell = from_table(cls, table, Spot(path), path=path, name=table.name or path.stem)
+        cell.check(known_effects)
+        return cell
+
+    def check(self, known_effects: KnownEffects | None = None) -> None:
+        """Checks that the parts of the cell fit together, which `replace` may leave otherwise.
+
+        Args:
+            known_effects: the names that `model.effects` may use, or a function of the cell that
+                returns them (and may load its plug-ins first); None leaves them unchecked.
+
+        Raises:
+            InputError: an effect or a marker is unknown, or shapes of a URDF are asked for that
+                there is none of.
+        """
+        where, sight = self.path or self.name, self.workspace.visibility
+        self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
+        self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
+        require(
+            not self.workspace.urdf_geometry or self.robot.urdf is not None,
+            f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
+            "for capsules along the links instead",
+        )
+        known = known_effects(self) if callable(known_effects) else known_effects
+        for i, choice in enumerate(self.model.effects):
+            require(
+                known is None or choice.name in known,
+                f"{where}: key model.effects[{i}] names the unknown effect {quoted(choice.name)}"
+                f"{did_you_mean(choice.name, known or ())}; known effects: {listed(known or ())}",
+            )
+
+    def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:
+        markers = tuple(self.tool.markers)
+        for name in names:
+            require(
+                name in markers,
+                f"{self.path or self.name}: {header(table)} names {quoted(name)}, which is no "
+                f"marker of the cell{did_you_mean(name, markers)}; [tool.markers_m] has "
+                f"{listed(markers) or 'none'}",
+            )
+
+
+read_cell = Cell.read
