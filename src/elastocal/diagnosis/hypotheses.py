@@ -29,7 +29,6 @@ RECORD = {
         "[model] link_gravity = true",
     ),
 }
-ALWAYS = ("payload", "link_gravity")  # loads without parameters
 
 
 @dataclass(frozen=True)
@@ -67,11 +66,7 @@ def possible(
     hypotheses: list[Hypothesis] = []
     untested: list[Untested] = []
     for name, effect in CATALOGUE.items():
-        if name in without or name in ALWAYS:
-            continue
-        if name == "marker_orientation" and cell.model.observe != "pose":
-            continue
-        if name == "distance_sensor" and cell.model.observe != "distance":
+        if name in without or not effect.may_be_missing(cell):
             continue
         places = [w for w in effect.places(chain, cell) if (name, w) not in active]
         lacking = [need for need in effect.needed(cell) if not recorded(table, need)]

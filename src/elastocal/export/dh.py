@@ -24,7 +24,7 @@ from elastocal.export.dh_rows import Row, split
 from elastocal.export.pieces import Pieces
 from elastocal.manipulator.chain import Array, Chain, Joint
 from elastocal.manipulator.dh import DH_COLUMNS, FIXED
-from elastocal.manipulator.effects.off_axis_compliance import transverse_axes
+from elastocal.manipulator.effects.compliances import transverse_axes
 from elastocal.manipulator.number_table import read_table
 
 Convention = Literal["standard", "modified"]

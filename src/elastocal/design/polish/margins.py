@@ -24,7 +24,7 @@ from elastocal.design.feasibility.shapes import few_points
 from elastocal.design.polish.covers import excess, signed_distance, smooth_min, sphere_cover
 from elastocal.manipulator import rigid
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects.link_gravity import STANDARD_GRAVITY
+from elastocal.manipulator.effects.loads import STANDARD_GRAVITY
 
 Array = NDArray[np.float64]
 
