@@ -24,7 +24,7 @@ LAYERS = (
     {"manipulator"},
     {"simulation", "identification"},
     {"design", "diagnosis", "compensation", "export", "importing"},
-    {"report"},
+    {"report", "plugins"},
     {"demo"},
     {"cli", "__main__"},
 )

@@ -111,7 +111,10 @@ class ModelSpec:
 
 @dataclass(frozen=True)
 class Cell:
-    """Everything known about arm, tool, tracker and model before measuring."""
+    """Everything known about arm, tool, tracker and model before measuring.
+
+    `plugins`: files, relative to `path`, and modules that register effects of the user's own.
+    """
 
     name: str
     path: Path | None
@@ -122,3 +125,4 @@ class Cell:
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     workspace: Workspace = field(default_factory=Workspace)
     design: DesignSpec = field(default_factory=DesignSpec)
+    plugins: tuple[str, ...] = ()

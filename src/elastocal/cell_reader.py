@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from elastocal.cell_schema import (
     CellTable,
     ModelTable,
     NominalTable,
+    PluginsTable,
     RobotTable,
     ToolTable,
     TrackerTable,
@@ -40,17 +41,19 @@ from elastocal.errors import InputError
 from elastocal.files import check_exists, read_text
 from elastocal.labels import is_label
 from elastocal.nearest import did_you_mean, listed, quoted
+from elastocal.plugin_loader import load_plugins
 from elastocal.units import to_si
 
 MAX_BYTES = 5_000_000
 POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
 
 
-def read_cell(path: str | Path, known_effects: tuple[str, ...] | None = None) -> Cell:
+def read_cell(path: str | Path, known_effects: Collection[str] | None = None) -> Cell:
     """The cell that a TOML file describes, in SI units.
 
-    Paths in it are relative to the file; the robot's files must exist.  `known_effects`: the
-    names that `[model] effects` may use; None leaves them unchecked.
+    Paths in it are relative to the file; the robot's files must exist.  The plug-ins it names are
+    run.  `known_effects`: the names that `[model] effects` may use once they are (the catalogue
+    itself, which they may add to); None leaves them unchecked.
 
     Raises InputError that names file, key, what the key takes and the nearest valid name.
     """
@@ -60,6 +63,8 @@ def read_cell(path: str | Path, known_effects: tuple[str, ...] | None = None) ->
         table = CellTable.model_validate(data)
     except ValidationError as error:
         raise complaint(path, data, error) from None
+    plugins = tuple((table.plugins or PluginsTable()).modules or ())
+    load_plugins(path, plugins)
     tool = _tool(path, table.tool or ToolTable())
     markers = tuple(tool.markers)
     workspace = read_workspace(path, table.workspace or WorkspaceTable(), markers)
@@ -78,6 +83,7 @@ def read_cell(path: str | Path, known_effects: tuple[str, ...] | None = None) ->
         limits=_limits(path, table.limits or {}),
         workspace=workspace,
         design=read_design(path, table.design or DesignTable(), markers),
+        plugins=plugins,
     )
 
 
@@ -156,7 +162,7 @@ def _tracker(path: Path, table: TrackerTable) -> Tracker:
     )
 
 
-def _model(path: Path, table: ModelTable, known_effects: tuple[str, ...] | None) -> ModelSpec:
+def _model(path: Path, table: ModelTable, known_effects: Collection[str] | None) -> ModelSpec:
     levels = joint_values(path, ("model", "compliance_levels"), table.compliance_levels or {})
     for joint, values in levels.items():
         if len(set(values)) < len(values):
@@ -189,7 +195,7 @@ def _nominal(table: NominalTable) -> Nominal:
 
 
 def _effects(
-    path: Path, entries: Sequence[str], known: tuple[str, ...] | None
+    path: Path, entries: Sequence[str], known: Collection[str] | None
 ) -> tuple[EffectChoice, ...]:
     choices: list[EffectChoice] = []
     for i, entry in enumerate(entries):

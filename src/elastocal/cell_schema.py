@@ -87,6 +87,12 @@ class ModelTable(Table):
     nominal: NominalTable | None = key("a table")
 
 
+class PluginsTable(Table):
+    modules: list[Text] | None = key(
+        'files and modules that register effects and the like, e.g. ["my_effects.py", "my_package"]'
+    )
+
+
 class CellTable(Table):
     name: Text | None = key("a text")
     robot: RobotTable = required('a table with urdf = "arm.urdf" or dh = "dh.csv"')
@@ -98,3 +104,4 @@ class CellTable(Table):
     )
     workspace: WorkspaceTable | None = key("a table")
     design: DesignTable | None = key("a table")
+    plugins: PluginsTable | None = key('a table with modules = ["my_effects.py"]')

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import VISIT_TIME, Fault, cell, measured, plan
-from support.registered import SettlingJoint, catalogue_with
+from support.registered import forgotten, write_example
 
-from elastocal.cell import Cell
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.diagnose import diagnose
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.model_set import Item, fit_set, refine
 from elastocal.diagnosis.scene import scene_of
 from elastocal.diagnosis.settings_grid import MOST_POINTS, grid_of
-from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.parameter import Setting
 from elastocal.measurements import Measurements
+from elastocal.plugin_loader import load_plugins
 
 FROM, TIME = 900.0, 400.0
 SETTLED = Fault(
@@ -30,9 +30,11 @@ SETTLED = Fault(
 
 
 @pytest.fixture(scope="module")
-def readings() -> Iterator[tuple[Model, Measurements]]:
+def readings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Model, Measurements]]:
     """A joint that gave way after 900 s, and the model that does not have it."""
-    with catalogue_with(SettlingJoint()):
+    folder = tmp_path_factory.mktemp("plugins")
+    with forgotten():
+        load_plugins(None, [str(write_example(folder, "settling_joint.py"))])
         chain, plain = kr270_chain(), cell()
         yield Model(chain, plain), measured(chain, plain, [SETTLED], plan(chain, 40, 1), 1)
 
@@ -79,24 +81,13 @@ def test_settings_that_depend_on_each_other_are_refined_together(readings) -> No
     assert at.shape == (2,) and (at != near).any()
 
 
-class ManyOrders(SettlingJoint):
-    """A product of two waves: two orders, of which each has hundreds of values."""
-
-    name = "many_orders"
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (
-            Setting("first_order", "order", None, 0.5, 1000.0),
-            Setting("second_order", "order", 121.0, 0.5, 1000.0),
-        )
-
-
 def test_a_product_too_large_is_thinned_evenly(readings) -> None:
     model, table = readings
-    effect = ManyOrders()
-    settings = effect.settings("joint1", model.chain, model.cell)
-    parameters = effect.parameters("joint1", model.chain, model.cell)
-    grid = grid_of(Hypothesis(effect, "joint1", parameters, settings), table, model.chain)
+    orders = (
+        Setting("first_order", "order", None, 0.5, 1000.0),
+        Setting("second_order", "order", 121.0, 0.5, 1000.0),
+    )
+    grid = grid_of(replace(hypothesis(model, table), settings=orders), table, model.chain)
     assert MOST_POINTS / 2 < len(grid.values) <= MOST_POINTS
     assert np.exp(grid.log_prior).sum() == pytest.approx(1.0)
     first = np.unique(grid.values[:, 0])

@@ -1,50 +1,51 @@
-"""Effects of one's own that tests register, and a catalogue that forgets them again."""
+"""Plug-ins as the pages show them, and registries that forget them again."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
-import casadi as ca
+from elastocal import plugin_loader
+from elastocal.identification.variance import structure
+from elastocal.manipulator.effects import CATALOGUE
 
-from elastocal.cell import Cell
-from elastocal.manipulator.arm import Arm
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects import CATALOGUE, register
-from elastocal.manipulator.effects.base import Effect, Symbols
-from elastocal.manipulator.effects.driven import DrivenEffect, JointMotion
-from elastocal.manipulator.parameter import ParameterSpec, Setting
+DOCS = Path(__file__).parents[2] / "docs"
 
 
-class SettlingJoint(DrivenEffect):
-    """δq = d (1 − exp(−(t − t₀)/T)) from t₀ on: a joint that gives way at once and creeps on."""
+def example(page: str, file: str) -> str:
+    """The code block of a page that stands behind the mention of its file's name."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    found = re.search(rf"`{file}`:\n+```python\n(.*?)^```", text, re.M | re.S)
+    assert found, f"{page} shows no {file}"
+    return found[1]
 
-    name = "settling_joint"
-    stage = "transmission"
-    entry = JointMotion()
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (ParameterSpec("settled", "rad", 0.0, 1e-4),)
+EXAMPLES = {
+    "three_lobes.py": "adding-an-effect.md",
+    "settling_joint.py": "adding-an-effect.md",
+    "noise_by_day.py": "adding-a-noise-model.md",
+}
 
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (
-            Setting("settling_from_s", "change_time", None, 0.0, 1e9),
-            Setting("settling_time_s", "time_constant", 600.0, 30.0, 1e6),
-        )
 
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        since = ca.fmax(arm.input("time", 1) - p["settling_from_s"], 0)
-        return p["settled"] * (1 - ca.exp(-since / p["settling_time_s"]))
+def write_example(folder: Path, file: str) -> Path:
+    """The page's file, in a folder."""
+    path = folder / file
+    path.write_text(example(EXAMPLES[file], file), encoding="utf-8")
+    return path
 
 
 @contextmanager
-def catalogue_with(*effects: Effect) -> Iterator[None]:
-    """The catalogue with these effects, as it was before when left."""
-    before = dict(CATALOGUE)
+def forgotten() -> Iterator[None]:
+    """Catalogue, noise models and files that were run are afterwards as they were before."""
+    registries = (
+        CATALOGUE, structure.STRUCTURES, structure.REGISTERED, plugin_loader._files
+    )  # fmt: skip
+    before = [dict(each) for each in registries]
     try:
-        for effect in effects:
-            register(effect)
         yield
     finally:
-        CATALOGUE.clear()
-        CATALOGUE.update(before)
+        for each, content in zip(registries, before, strict=True):
+            each.clear()  # type: ignore[attr-defined]
+            each.update(content)  # type: ignore[attr-defined]

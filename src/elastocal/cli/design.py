@@ -174,7 +174,7 @@ def _read(path: Path, asked: dict[str, Any]) -> Cell:
     from elastocal.manipulator.effects import CATALOGUE
     from elastocal.nearest import did_you_mean, listed, quoted
 
-    cell = read_cell(path, known_effects=tuple(CATALOGUE))
+    cell = read_cell(path, known_effects=CATALOGUE)
     names = get_args(CriterionName)
     name = asked["criterion"]
     if name is not None and name not in names:

@@ -14,6 +14,7 @@ from elastocal.cell import Cell
 from elastocal.cell_reader import read_cell
 from elastocal.diagnosis.result import Finding
 from elastocal.files import atomic_write_text
+from elastocal.plugin_loader import is_file
 
 # Tables of the cell file, and the keys in them whose values are paths.  A list of tables counts
 # as each of its members.
@@ -76,6 +77,9 @@ def _redirect(data: dict[str, Any], old: Path, new: Path) -> None:
 
     for table, keys in PATHS:
         _change(data, table, keys, redirected)
+    plugins = data.get("plugins", {})
+    if modules := plugins.get("modules"):
+        plugins["modules"] = [redirected(m) if is_file(m) else m for m in modules]
 
 
 def _change(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,7 @@ def grid_of(hypothesis: Hypothesis, visits: Measurements, chain: Chain) -> Grid:
         return Grid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
     if len(axes) == 1:
         return axes[0]
-    share = min(1.0, MOST_POINTS / np.prod([float(len(axis.values)) for axis in axes]))
+    share = min(1.0, MOST_POINTS / math.prod(len(axis.values) for axis in axes))
     return _product([_thinned(axis, share ** (1 / len(axes))) for axis in axes])
 
 
