@@ -209,11 +209,9 @@ class NoiseModel:
             f"{where} is {S.shape}; a number per reading, ({n},), or a matrix, "
             f"({n}, {size}, {size}), is needed",
         )
+        require(bool(np.isfinite(S).all()), f"{where} is not finite")
         full = S[:, None, None] * np.eye(size) if S.ndim == 1 else S
-        require(
-            bool(np.isfinite(full).all()) and np.allclose(full, full.transpose(0, 2, 1)),
-            f"{where} is not finite and symmetric",
-        )
+        require(np.allclose(full, full.transpose(0, 2, 1)), f"{where} is not symmetric")
         smallest, largest = np.linalg.eigvalsh(full)[:, [0, -1]].T
         require(
             bool((smallest >= -1e-9 * largest).all()),
