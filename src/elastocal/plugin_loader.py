@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import re
 import sys
-import traceback
-import zlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -94,6 +92,8 @@ def _import(name: str) -> None:
 
 
 def _run_file(path: Path, where: str) -> None:
+    import zlib
+
     path = path.resolve()
     state = path.stat()
     version = state.st_mtime_ns, state.st_size
@@ -130,6 +130,8 @@ def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
 
 def _told(error: BaseException, path: Path | None) -> str:
     """ "my_effects.py, line 3: NameError: …": the last line that is the plug-in's own."""
+    import traceback
+
     if isinstance(error, SyntaxError) and error.filename:
         file, line, text = error.filename, error.lineno, error.msg
     else:

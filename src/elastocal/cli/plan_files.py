@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from elastocal.errors import InputError, require
-from elastocal.plugin_loader import is_file
 
 if TYPE_CHECKING:
     from elastocal.cell import Array, Cell
@@ -69,6 +68,8 @@ def check_apart(written: Iterable[Path | None], read: Iterable[Path | None]) -> 
 
 def files_of(cell: Cell) -> tuple[Path | None, ...]:
     """Files that the cell names and a plan depends on."""
+    from elastocal.plugin_loader import is_file
+
     robot, path = cell.robot, cell.design.test_path
     meshes = [s.mesh for s in cell.workspace.obstacles]
     meshes += [body.solid.mesh for body in cell.workspace.bodies]
