@@ -284,17 +284,11 @@ def test_missing_robot_file_names_cell_key_and_path(refusal, path):
 
 def test_plugins_are_files_beside_the_cell_or_modules(read, folder, refusal):
     (folder / "mine.py").write_text("")
-    cell = read(ROBOT + '[plugins]\nmodules = ["mine.py", "package.effects"]')
-    assert cell.plugins == (str(folder / "mine.py"), "package.effects")
-    message = refusal(ROBOT + '[plugins]\nmodules = ["package.effects", "other.py"]')
+    cell = read(ROBOT + '[plugins]\nmodules = ["mine.py", "json"]')
+    assert cell.plugins == (str(folder / "mine.py"), "json")
+    message = refusal(ROBOT + '[plugins]\nmodules = ["json", "other.py"]')
     assert "key plugins.modules[1] names" in message
     assert "does not exist" in message
-
-
-def test_known_effects_may_depend_on_the_cell(read, refusal):
-    text = ROBOT + '[plugins]\nmodules = ["mine"]\n[model]\neffects = ["own:joint2"]'
-    assert read(text, known_effects=lambda cell: ("own", *cell.plugins)).model.effects
-    assert "known effects: mine" in refusal(text, known_effects=lambda cell: cell.plugins)
 
 
 def test_effects_are_checked_only_against_names_that_are_given(read, refusal):

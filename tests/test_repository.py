@@ -24,7 +24,7 @@ LAYERS = (
     {"manipulator"},
     {"simulation", "identification"},
     {"planning", "diagnosis", "compensation", "export", "importing"},
-    {"report"},
+    {"report", "plugins"},
     {"demo"},
     {"cli", "__main__"},
 )
@@ -244,3 +244,20 @@ def test_imports_are_recognised() -> None:
     assert {"cell", "errors", "measurements"} <= IMPORTS["manipulator.model"]
     assert rank("manipulator.model") < rank("identification.solve") < rank("cli.identify")
     assert rank("cell") == rank("measurements") == rank("errors") == rank("files") == 0
+
+
+# Effects
+
+
+def test_no_module_but_the_catalogue_names_an_effect() -> None:
+    """Others ask an effect for its traits, or take the one they mean by its class's name."""
+    from elastocal.manipulator.effects import CATALOGUE
+
+    named = [
+        f"{module}, line {node.lineno}: {node.value}"
+        for module, path in MODULES.items()
+        if not module.startswith("manipulator.effects")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and node.value in CATALOGUE
+    ]
+    assert named == []

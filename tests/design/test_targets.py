@@ -19,8 +19,8 @@ from elastocal.design.readings import load_states
 from elastocal.design.target_poses import TargetPoses
 from elastocal.design.targets import prediction_rows
 from elastocal.errors import InsufficientDataError
-from elastocal.identification import reduction
 from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.parameter import Parameter
 
@@ -142,8 +142,8 @@ def test_the_remaining_error_does_not_hang_on_which_parameters_are_kept(
     cell = plan_cell(FULL, "position", loads=BOTH, robust=robust, robust_samples=2)
     q = random_poses(CHAIN, 150, seed=1)
     usual, names = remaining(cell, q)
-    turned = (("link_geometry",), ("joint_offset",), *reduction.PREFERENCE[::-1])
-    monkeypatch.setattr(reduction, "PREFERENCE", turned)
+    for effect in CATALOGUE.values():
+        monkeypatch.setattr(type(effect), "rank", -effect.rank)
     other, others = remaining(cell, q)
     assert set(names) != set(others)
     assert len(names) == len(others)

@@ -22,7 +22,7 @@ from elastocal.identification import published
 from elastocal.identification.identify import Options, identify
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.options import METHODS, ROBUST
-from elastocal.identification.variance.choose import KINDS as NOISES
+from elastocal.identification.intervals import KINDS as NOISES
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
 from elastocal.simulation.simulate import simulate

@@ -32,7 +32,7 @@ from elastocal.cell import Array, Nominal
 from elastocal.errors import ElastocalError
 from elastocal.manipulator import equilibrium
 from elastocal.manipulator.chain import Chain, Joint, LinkMass
-from elastocal.manipulator.effects.off_axis_compliance import transverse_axes
+from elastocal.manipulator.effects.compliances import transverse_axes
 from elastocal.manipulator.model import Model
 from elastocal.simulation.mujoco_arm import MujocoArm
 

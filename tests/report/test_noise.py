@@ -16,7 +16,7 @@ from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.options import METHODS
 from elastocal.identification.residual_summary import summarise_residuals
-from elastocal.identification.variance.choose import KINDS
+from elastocal.identification.variance.structure import noise_models
 from elastocal.report.html import report_page
 from elastocal.report.method import (
     constraints_line,
@@ -156,9 +156,9 @@ def test_candidates_are_ranked_by_their_criterion() -> None:
         ("one size per axis + deviations of a configuration", "4", "0.0"),
         ("equal noise", "1", "14.2"),
     ]
-    words = [kind_in_words(kind) for kind in KINDS if kind != "auto"]
+    words = [kind_in_words(kind) for kind in noise_models() if kind != "auto"]
     assert len(set(words)) == len(words)
-    assert not set(words) & set(KINDS)
+    assert not set(words) & set(noise_models())
 
 
 def test_estimated_noise_is_judged_against_the_stated_one(case: Any) -> None:

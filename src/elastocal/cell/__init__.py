@@ -24,7 +24,7 @@ from elastocal.cell.plan_wishes import (
     TargetPath,
     TargetPose,
 )
-from elastocal.cell.work_cell import Cell, is_plugin_file, read_cell
+from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.cell.workspace_rules import (
     CarriedBody,
     HalfSpace,
@@ -40,6 +40,6 @@ __all__ = [
     "Array", "CarriedBody", "CartesianNoise", "Cell", "CompensatorTable", 
     "DesignSpec", "EffectChoice", "HalfSpace", "HangingLoad", "ModelSpec", "Motion", "Nominal",
     "Observe", "PolarNoise", "Robot", "Shape", "Solid", "TargetBox", "TargetPath", "TargetPose",
-    "Tool", "Tracker", "Visibility", "Workspace", "is_plugin_file", "read_cell",
+    "Tool", "Tracker", "Visibility", "Workspace", "read_cell",
     "rotation_from_rpy", "table_of",
 ]  # fmt: skip

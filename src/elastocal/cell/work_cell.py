@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,11 +23,12 @@ from elastocal.cell.workspace_rules import Workspace
 from elastocal.config import Table, Text, Vector2, checked, header, key, read_toml
 from elastocal.errors import require
 from elastocal.files import check_exists
+from elastocal.plugin_loader import is_plugin_file, load_plugins
 from elastocal.text import did_you_mean
 from elastocal.text import listed
 from elastocal.text import quoted
 
-KnownEffects = tuple[str, ...] | Callable[["Cell"], tuple[str, ...]]
+KnownEffects = Collection[str]
 
 
 class PluginsTable(Table):
@@ -45,11 +46,6 @@ def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
         if is_plugin_file(module):
             check_exists(spot.path.parent / module, f"plugins.modules[{i}]", spot.path)
     return tuple(str(spot.path.parent / m) if is_plugin_file(m) else m for m in modules)
-
-
-def is_plugin_file(module: str) -> bool:
-    """Whether an entry of [plugins] modules is a Python file, and no importable module."""
-    return module.endswith(".py")
 
 
 def _limits(table: Mapping[str, Any], spot: Spot, name: str) -> dict[str, tuple[float, float]]:
@@ -112,13 +108,14 @@ class Cell:
         """Checks that the parts of the cell fit together, which `replace` may leave otherwise.
 
         Args:
-            known_effects: the names that `model.effects` may use, or a function of the cell that
-                returns them (and may load its plug-ins first); None leaves them unchecked.
+            known_effects: the names that `model.effects` may use once the cell's plug-ins are run
+                (the catalogue itself, which they may add to); None leaves them unchecked.
 
         Raises:
             InputError: an effect or a marker is unknown, or shapes of a URDF are asked for that
                 there is none of.
         """
+        load_plugins(self.path or Path(self.name), self.plugins)
         where, sight = self.path or self.name, self.workspace.visibility
         self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
         self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
@@ -127,12 +124,13 @@ class Cell:
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
             "for capsules along the links instead",
         )
-        known = known_effects(self) if callable(known_effects) else known_effects
+        known = known_effects
         for i, choice in enumerate(self.model.effects):
             require(
                 known is None or choice.name in known,
                 f"{where}: key model.effects[{i}] names the unknown effect {quoted(choice.name)}"
-                f"{did_you_mean(choice.name, known or ())}; known effects: {listed(known or ())}",
+                f"{did_you_mean(choice.name, tuple(known or ()))}; known effects: "
+                f"{listed(tuple(known or ()))}",
             )
 
     def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:

@@ -193,7 +193,7 @@ def _read(path: Path, asked: dict[str, Any]) -> Cell:
     from elastocal.planning.criteria import CRITERIA
     from elastocal.text import did_you_mean, listed, quoted
 
-    cell = read_cell(path, known_effects=tuple(CATALOGUE))
+    cell = read_cell(path, known_effects=CATALOGUE)
     name = asked["criterion"]
     if name is not None and name not in CRITERIA:
         raise InputError(

@@ -71,10 +71,14 @@ def diagnose(
 
     Example: elastocal diagnose cell.toml data.csv -o diagnosis.json --report diagnosis.html
     """
+    from elastocal.cell.work_cell import read_cell
     from elastocal.diagnosis.diagnose import diagnose as run
     from elastocal.diagnosis.options import DiagnosisOptions
     from elastocal.diagnosis.published import publish
+    from elastocal.manipulator.effects import CATALOGUE
 
+    if not set(without or ()) <= set(CATALOGUE):
+        read_cell(cell)  # its plug-ins may have the effect
     # What can be wrong with the options is told before any file is read.
     options = DiagnosisOptions(seed=seed, without=tuple(without or ()))
     require(

@@ -109,15 +109,19 @@ def identify(
 
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
     """
+    from elastocal.cell.work_cell import read_cell
     from elastocal.cli.results import write_results
     from elastocal.identification.identify import identify as run
     from elastocal.identification.noise import WeightKind
     from elastocal.identification.options import Options
+    from elastocal.identification.variance.structure import noise_models
 
     if weights not in get_args(WeightKind):
         raise InputError(
             f"--weights takes one of {', '.join(get_args(WeightKind))}; found '{weights}'"
         )
+    if noise not in noise_models():
+        read_cell(cell)  # its plug-ins may have the model
     # What can be wrong with the options is told before any file is read.
     chosen = Options(
         method=method,  # type: ignore[arg-type]
@@ -163,7 +167,7 @@ def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurem
     from elastocal.manipulator.model import Model
     from elastocal.measurements import read_measurements
 
-    cell = read_cell(cell_path, known_effects=tuple(CATALOGUE))
+    cell = read_cell(cell_path, known_effects=CATALOGUE)
     chain = load_chain(cell)
     tables = [
         read_measurements(

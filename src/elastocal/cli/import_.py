@@ -113,6 +113,6 @@ def _import(paths: list[Path], read: Any, cell: Path | None, output: Path | None
         from elastocal.cell import read_cell
         from elastocal.manipulator.effects import CATALOGUE
 
-        known = read_cell(cell, known_effects=tuple(CATALOGUE))
+        known = read_cell(cell, known_effects=CATALOGUE)
         check_apart([output], files_of(known))
     return import_files(paths, read, known, str(output or "the table"))

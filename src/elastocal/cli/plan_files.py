@@ -68,10 +68,16 @@ def check_apart(written: Iterable[Path | None], read: Iterable[Path | None]) -> 
 
 def files_of(cell: Cell) -> tuple[Path | None, ...]:
     """Files that the cell names and a plan depends on."""
+    from elastocal.plugin_loader import is_file
+
     robot, path = cell.robot, cell.design.test_path
     meshes = [s.mesh for s in cell.workspace.obstacles]
     meshes += [body.solid.mesh for body in cell.workspace.bodies]
-    return (robot.urdf, robot.dh, robot.masses, None if path is None else path.file, *meshes)
+    plugins = (
+        [cell.path.parent / name for name in cell.plugins if is_file(name)] if cell.path else []
+    )
+    test_path = None if path is None else path.file
+    return (robot.urdf, robot.dh, robot.masses, test_path, *meshes, *plugins)
 
 
 def write_all(

@@ -10,12 +10,13 @@ from elastocal.compensation.targets import Targets
 from elastocal.compensation.uncertainty import Uncertainty
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.text import listed
+from elastocal.manipulator.effects import effect_of
+from elastocal.text import listed
 
 AT_LIMIT = 1e-9  # rad or m
 FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
 LARGE = np.radians(2.0)
 LEVEL_SLACK = 0.01  # rad or m
-ELASTIC = ("joint_compliance", "off_axis_compliance", "link_bending", "base_compliance")
 WORTH_TELLING = 10e-6  # m
 
 
@@ -86,7 +87,7 @@ def notices_of(
 def _without_load(cell: Cell, targets: Targets) -> list[str]:
     """A load that was forgotten: the commands are then those of the arm without it."""
     spec = cell.model
-    elastic = any(choice.name in ELASTIC for choice in spec.effects)
+    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
     if not elastic or targets.table.force.any() or spec.link_gravity or spec.torque != "computed":
         return []
     return [

@@ -12,6 +12,7 @@ from elastocal.design.information import PoseInformation
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.reduction import Reduction, reduce
 from elastocal.identification.selection import WORTH_A_COLUMN
+from elastocal.manipulator.effects import effect_of
 from elastocal.manipulator.limits import joint_index
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
@@ -23,7 +24,6 @@ IntArray = NDArray[np.int64]
 SURE = 1e3  # standard deviations that a typical deviation counts for where a prior is stated
 SAMPLE = 2000  # poses that show what is visible: more would not change a rank
 # Effects that say where things stand rather than what the arm is; D, A, E and O pass them over.
-NUISANCE = ("base_frame", "marker_position", "marker_orientation", "distance_sensor")
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def interest_of(model: Model, found: Estimable) -> IntArray:
     kept = [model.parameters[c] for c in found.columns]
     where = f"{model.cell.path or model.cell.name}: [design] interest"
     if not wanted:
-        own = [k for k, p in enumerate(kept) if p.effect not in NUISANCE]
+        own = [k for k, p in enumerate(kept) if not effect_of(p.effect).registered]
         return np.array(own or range(len(kept)), dtype=np.int64)
     chosen: set[int] = set()
     for name in wanted:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from elastocal.design.augment import Done
 from elastocal.design.information import PoseInformation
 from elastocal.design.parameters import (
-    NUISANCE,
     Estimable,
     estimable,
     interest_of,
@@ -29,6 +28,7 @@ from elastocal.design.targets import (
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.manipulator.effects import effect_of
 from elastocal.manipulator.model import Model
 from elastocal.text import listed
 from elastocal.planning.criteria import criterion_named, make_criterion
@@ -162,7 +162,7 @@ def _scenarios(model: Model, known: Known, seed: int) -> Array:
     if spec.robust == "none":
         return best[None]
     rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(SCENARIO_STREAM + 1)[-1])
-    arm = np.array([p.effect not in NUISANCE for p in model.parameters])
+    arm = np.array([not effect_of(p.effect).registered for p in model.parameters])
     draws = [values_from(model, draw_errors(model, 1.0, rng)) for _ in range(spec.robust_samples)]
     moved = [np.where(arm, best + x - model.nominal, best) for x in draws]
     return np.stack([best, *moved])

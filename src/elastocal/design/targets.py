@@ -13,6 +13,8 @@ from elastocal.design.parameters import Estimable, why
 from elastocal.design.target_poses import TargetPoses
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.reduction import Reduction
+from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.effects.placements import MarkerPosition
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
@@ -32,7 +34,7 @@ def prediction_rows(information: PoseInformation, targets: TargetPoses, x: Array
     divided by √M, as only they can be known: the sum of squares is then their mean.
     """
     model = information.model
-    fitted = any(p.effect == "marker_position" for p in model.parameters)
+    fitted = any(p.effect == MarkerPosition.name for p in model.parameters)
     by_marker = ~targets.stated & fitted
     markers = tuple(model.cell.tool.markers)
     M = len(markers) if by_marker.any() else 1
@@ -79,17 +81,18 @@ def _with_points(model: Model, points: dict[str, Array]) -> Model:
     effects = tuple(
         EffectChoice(choice.name, place)
         for choice in cell.model.effects
-        for place in _places(choice, cell.tool.markers)
+        for place in _places(choice, model)
     )
     spec = replace(cell.model, effects=effects, observe="position")
     tool = replace(cell.tool, markers=cell.tool.markers | points)
     return Model(model.chain, replace(cell, model=spec, tool=tool))
 
 
-def _places(choice: EffectChoice, markers: dict[str, Array]) -> tuple[str | None, ...]:
-    if choice.where is None and choice.name in ("marker_position", "marker_orientation"):
-        return tuple(f"marker:{name}" for name in markers)
-    return (choice.where,)
+def _places(choice: EffectChoice, model: Model) -> tuple[str, ...]:
+    """Where the effect acts on the model as it is, without the test points."""
+    if choice.where is not None:
+        return (choice.where,)
+    return CATALOGUE[choice.name].places(model.chain, model.cell)
 
 
 def on_kept(model: Model, A: Array, found: Estimable) -> Array:

@@ -21,8 +21,8 @@ from elastocal.diagnosis.noise import NoisyData
 from elastocal.diagnosis.projection import project
 from elastocal.diagnosis.result import Gap, Step
 from elastocal.diagnosis.scene import Scene
-from elastocal.identification.solve import PLACED_EFFECTS
 from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.effects.placements import BaseFrame
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, t
     together = _left_out_together(scene, chosen)
     # The nominal arm, base and markers placed, as the baseline left it.
     placed = scene.blocks.pack(scene.base.nominal.reshape(-1, scene.blocks.size, 1))[:, :, 0]
-    steps = [Step("base_frame", *rms_with_interval(scene.data, placed, rng))]
+    steps = [Step(BaseFrame.name, *rms_with_interval(scene.data, placed, rng))]
     steps += [_step(name, data, nothing, together, rng) for name, data in _fitted_steps(scene)]
     known = [k for k, item in enumerate(chosen.items) if item.known]
     for n in range(len(known)):
@@ -101,6 +101,7 @@ def _fitted_steps(scene: Scene) -> list[tuple[str, NoisyData]]:
 
 def stage_of(effect: str) -> int:
     """0 for what places base and markers, 1 for geometry, 2 for what yields under load."""
-    if effect in PLACED_EFFECTS:
+    known = CATALOGUE[effect]
+    if known.registered:
         return 0
-    return 2 if CATALOGUE[effect].stage in ("compliance", "load") else 1
+    return 2 if known.stage in ("compliance", "load") else 1

@@ -15,9 +15,10 @@ from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_cache import made_once
 from elastocal.diagnosis.tangent import tangents, with_tangents
 from elastocal.manipulator.arm import Arm
-from elastocal.manipulator.effects.driven import DrivenEffect
-from elastocal.manipulator.effects.entry import (
+from elastocal.manipulator.effects.compliances import JointCompliance
+from elastocal.manipulator.effects.driven import (
     BaseMotion,
+    DrivenEffect,
     Entry,
     JointMotion,
     LinkFrame,
@@ -83,7 +84,7 @@ class Columns:
         n = self.base.model.chain.n_joints
         tau = np.zeros((len(self.rows), n))
         for i in range(n):
-            span = self.places.get(("joint_compliance", f"joint{i + 1}"))
+            span = self.places.get((JointCompliance.name, f"joint{i + 1}"))
             if span is None:
                 continue
             by_k = self.rows[:, :, span].sum(axis=2)

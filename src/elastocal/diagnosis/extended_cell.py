@@ -10,9 +10,10 @@ from typing import Any
 
 import tomli_w
 
-from elastocal.cell import Cell, is_plugin_file, read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.diagnosis.result import Finding
 from elastocal.files import atomic_write_text
+from elastocal.plugin_loader import is_plugin_file
 
 # Tables of the cell file, and the keys in them whose values are paths.  A list of tables counts
 # as each of its members.

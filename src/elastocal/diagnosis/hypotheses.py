@@ -11,6 +11,7 @@ from elastocal.diagnosis.result import Untested
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.effects.base import Effect, Stage
+from elastocal.manipulator.effects.driven import DrivenEffect
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.parameter import ParameterSpec, Setting
 from elastocal.measurements import Measurements
@@ -29,7 +30,6 @@ RECORD = {
         "[model] link_gravity = true",
     ),
 }
-ALWAYS = ("payload", "link_gravity")  # loads without parameters
 
 
 @dataclass(frozen=True)
@@ -67,19 +67,22 @@ def possible(
     hypotheses: list[Hypothesis] = []
     untested: list[Untested] = []
     for name, effect in CATALOGUE.items():
-        if name in without or name in ALWAYS:
-            continue
-        if name == "marker_orientation" and cell.model.observe != "pose":
-            continue
-        if name == "distance_sensor" and cell.model.observe != "distance":
+        if name in without or not effect.may_be_missing(cell):
             continue
         places = [w for w in effect.places(chain, cell) if (name, w) not in active]
-        lacking = [need for need in effect.needed(cell) if not recorded(table, need)]
+        at = [_at(effect, w, chain, cell) for w in places]
+        lacking = [need for need in _needed(at, effect, cell) if not recorded(table, need)]
         if lacking:
             reason, advice = RECORD[lacking[0]]
             untested += [Untested(name, w, reason, advice) for w in places]
             continue
-        hypotheses += [_at(effect, w, chain, cell) for w in places]
+        for h in at:
+            if key := _unset(h, chain, cell):
+                reason = f"{key} is not known, and only settings of a driven effect are searched"
+                advice = f"state {key} in [model.nominal.settings.{h.where}]"
+                untested.append(Untested(name, h.where, reason, advice))
+            else:
+                hypotheses.append(h)
     return [h for h in hypotheses if h.parameters], untested
 
 
@@ -92,5 +95,23 @@ def recorded(table: Measurements, need: str) -> bool:
 
 
 def _at(effect: Effect, where: str, chain: Chain, cell: Cell) -> Hypothesis:
+    """Only a drive can be evaluated at many settings; those of other effects stay as the model
+    has them."""
     parameters = effect.parameters(where, chain, cell)
-    return Hypothesis(effect, where, parameters, effect.settings(where, chain, cell))
+    searched = isinstance(effect, DrivenEffect)
+    settings = effect.settings(where, chain, cell) if searched else ()
+    return Hypothesis(effect, where, parameters, settings)
+
+
+def _unset(h: Hypothesis, chain: Chain, cell: Cell) -> str | None:
+    """A setting that is neither searched nor stated."""
+    given = cell.model.nominal.settings.get(h.where, {})
+    held = () if h.settings else h.effect.settings(h.where, chain, cell)
+    return next((s.key for s in held if s.default is None and s.key not in given), None)
+
+
+def _needed(at: list[Hypothesis], effect: Effect, cell: Cell) -> tuple[str, ...]:
+    """What the effect needs, times included where it has settings that are times."""
+    kinds = {setting.kind for hypothesis in at for setting in hypothesis.settings}
+    timed = ("time",) if kinds & {"change_time", "time_constant"} else ()
+    return tuple(dict.fromkeys((*effect.needed(cell), *timed)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,6 +21,8 @@ from elastocal.diagnosis.projection import Projection, Weighted, project
 from elastocal.diagnosis.scene import Scene
 
 Array = NDArray[np.float64]
+
+REFINED_ROUNDS = 3  # of settings that depend on each other
 
 
 @dataclass(frozen=True)
@@ -182,33 +185,47 @@ def _mixed_scales(
 
 
 def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
-    """Item k's settings refined between the grid's points, at the set's noise."""
+    """Item k's settings refined between the grid's points, at the set's noise.
+
+    One setting after the other; where there are several, they go round REFINED_ROUNDS times.
+    """
     item = chosen.items[k]
     what = item.what
     if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
         return chosen
-    (setting,) = what.settings
     data = beside(scene, chosen, k)
     grams = Grams(scene, data, project(data, chosen.noise))
     grid = scene.grids[what.name, what.where]
-    near = grid.nearest(item.settings)
-    width, centre = float(grid.step[near, 0]), float(item.settings[0])
 
-    def best_of(trial: Array) -> float:
-        found = grams.of_hypothesis(what, trial[:, None]).evidence(item.scales)
-        return float(trial[int(np.argmax(found))])
+    def evidence(tried: Array) -> Array:
+        return grams.of_hypothesis(what, tried).evidence(item.scales)
 
-    if setting.kind == "change_time":
-        trial = scene.moments[np.abs(scene.moments - centre) <= width]
-        if len(trial) <= 1 or len(scene.moments) == len(grid.values):
-            return chosen
-        centre = best_of(trial)
-    else:
-        for _ in range(3):
-            trial = centre + np.linspace(-width, width, 21)
-            centre, width = best_of(np.clip(trial, setting.lower, setting.upper)), width / 8
-    refined = replace(item, settings=np.array([centre]))
+    settings, searched = item.settings, False
+    widths = grid.step[grid.nearest(settings)]
+    for _ in range(1 if len(settings) == 1 else REFINED_ROUNDS):
+        for s, setting in enumerate(what.settings):
+            if setting.kind == "change_time":
+                trial = scene.moments[np.abs(scene.moments - settings[s]) <= widths[s]]
+                if len(trial) <= 1 or len(scene.moments) == len(np.unique(grid.values[:, s])):
+                    continue
+                settings = _best_along(settings, s, trial, evidence)
+            else:
+                for width in widths[s] / 8.0 ** np.arange(3):
+                    trial = settings[s] + np.linspace(-width, width, 21)
+                    trial = np.clip(trial, setting.lower, setting.upper)
+                    settings = _best_along(settings, s, trial, evidence)
+            searched = True
+    if not searched:
+        return chosen
+    refined = replace(item, settings=settings)
     return fit_set(scene, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), chosen.noise)
+
+
+def _best_along(settings: Array, s: int, trial: Array, evidence: Callable[[Array], Array]) -> Array:
+    """The settings with number s at the best of the values `trial`, the others held."""
+    tried = np.repeat(settings[None], len(trial), axis=0)
+    tried[:, s] = trial
+    return np.asarray(tried[int(np.argmax(evidence(tried)))])
 
 
 def with_items(scene: Scene, items: tuple[Item, ...], scales: tuple[float, ...]) -> NoisyData:

@@ -19,11 +19,12 @@ from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
 from elastocal.diagnosis.noise import NoiseValues, NoisyData
 from elastocal.diagnosis.projection import Projection, project
 from elastocal.diagnosis.scene import Scene, scene_of
+from elastocal.manipulator.effects.play import Backlash
 from elastocal.manipulator.model import Model
 
 Array = NDArray[np.float64]
 
-EFFECT, BY_LOAD, BY_BOTH = "backlash", "load", "load_and_approach"
+EFFECT, BY_LOAD, BY_BOTH = Backlash.name, "load", "load_and_approach"
 LAWS = {BY_LOAD: BY_BOTH, BY_BOTH: BY_LOAD}
 
 

@@ -6,13 +6,15 @@ from dataclasses import replace
 
 from elastocal.diagnosis.hypotheses import recorded
 from elastocal.diagnosis.result import Diagnosis, Finding
+from elastocal.manipulator.effects.changes_in_time import ThermalExpansion
+from elastocal.manipulator.effects.play import Backlash
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
 # Key of [model], its value, the column that allows it, and the effect that it is about.
 CHOICES = (
-    ("thermal_driver", "temperature", "temperature", "thermal_expansion"),
-    ("play_side", "load_and_approach", "approach", "backlash"),
+    ("thermal_driver", "temperature", "temperature", ThermalExpansion.name),
+    ("play_side", "load_and_approach", "approach", Backlash.name),
 )
 
 

@@ -25,7 +25,8 @@ from elastocal.diagnosis.noise import NoiseValues, NoisyData
 from elastocal.diagnosis.noise_fit import fit_noise
 from elastocal.diagnosis.settings_grid import Grid, grid_of, moments_between
 from elastocal.identification.solve import is_placed
-from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.effects import CATALOGUE, effect_of
+from elastocal.manipulator.effects.loads import PayloadError
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
@@ -263,14 +264,14 @@ def away(base: Baseline) -> Array:
 
 def widths(base: Baseline) -> Array:
     """Prior standard deviation (parameters,) of each fitted parameter."""
-    compliant = [p.effect.endswith("compliance") for p in base.model.parameters]
+    compliant = [effect_of(p.effect).sized_by_value for p in base.model.parameters]
     wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
     return np.where(is_placed(base.model), PLACED, wide)
 
 
 def _load_hypothesis(base: Baseline) -> list[Hypothesis]:
     """The load's own error, whose hook point has a tolerance in any case."""
-    effect, model = CATALOGUE["payload_error"], base.model
+    effect, model = CATALOGUE[PayloadError.name], base.model
     if not recorded(base.seen.table, "load") or model.cell.model.torque == "measured":
         return []
     if any(p.effect == effect.name for p in model.parameters):

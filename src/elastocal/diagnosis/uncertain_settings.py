@@ -56,11 +56,12 @@ def between_visits(scene: Scene, chosen: ModelSet, k: int) -> Change:
     """
     what = chosen.items[k].what
     time = scene.base.seen.table.time
-    changes = isinstance(what, Hypothesis) and any(s.kind == "change_time" for s in what.settings)
-    if not changes or time is None:
+    kinds = [s.kind for s in what.settings] if isinstance(what, Hypothesis) else []
+    if "change_time" not in kinds or time is None:
         return Change()
     moments = np.unique(time)
-    later = int(np.searchsorted(moments, chosen.items[k].settings[0]))
+    changed = chosen.items[k].settings[kinds.index("change_time")]
+    later = int(np.searchsorted(moments, changed))
     if not 0 < later < len(moments):
         return Change()
     pause = float(moments[later] - moments[later - 1]) / float(np.ptp(moments))

@@ -24,8 +24,11 @@ from elastocal.export.dh_rows import Row, split
 from elastocal.export.pieces import Pieces
 from elastocal.manipulator.chain import Array, Chain, Joint
 from elastocal.manipulator.dh import FIXED, dh_number, read_dh_table
-from elastocal.manipulator.effects.off_axis_compliance import transverse_axes
+from elastocal.manipulator.effects.compliances import transverse_axes
 from elastocal.tables import csv_text
+from elastocal.manipulator.dh import DH_COLUMNS, FIXED
+from elastocal.manipulator.effects.compliances import transverse_axes
+from elastocal.tables import read_table
 
 Convention = Literal["standard", "modified"]
 CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}

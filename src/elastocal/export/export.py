@@ -27,6 +27,7 @@ from elastocal.export.yaml_text import to_yaml
 from elastocal.manipulator.calibrated import Calibrated
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.text import json_text
+from elastocal.manipulator.effects import effect_of
 
 SCHEMA = "elastocal/export/1"
 POSES_AT_REST = 20
@@ -227,9 +228,8 @@ def _dh(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Writt
 def _warnings(calibrated: Calibrated, cost: Cost) -> list[str]:
     found = []
     spec = calibrated.model.cell.model
-    elastic = {"joint_compliance", "off_axis_compliance", "link_bending", "base_compliance"}
-    active = {choice.name for choice in spec.effects}
-    if active & elastic and not cost.force.any() and not spec.link_gravity:
+    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
+    if elastic and not cost.force.any() and not spec.link_gravity:
         found.append(
             "no load is given, so compliances cost nothing here: state one with --load "
             "(N, in the tracker's axes)"

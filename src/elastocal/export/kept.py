@@ -15,26 +15,11 @@ import numpy as np
 from elastocal.cell import Array, Cell
 from elastocal.manipulator.calibrated import Calibrated
 from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.effects.base import Format
+from elastocal.manipulator.effects.compliances import JointCompliance
+from elastocal.manipulator.effects.loads import LinkGravity
 from elastocal.manipulator.model import Model
 
-GEOMETRY = frozenset(
-    {"base_frame", "joint_offset", "link_geometry", "marker_position", "marker_orientation"}
-)
-# Constant once time and temperature are: held in a file that says at which.
-FROZEN = frozenset({"thermal_expansion", "joint_drift", "encoder_jump"})
-ELASTIC = frozenset(
-    {
-        "joint_compliance",
-        "off_axis_compliance",
-        "link_bending",
-        "base_compliance",
-        "gravity_compensator",
-        "link_gravity",
-        "link_mass_error",
-        "payload",
-        "payload_error",
-    }
-)
 # What a spring in a file cannot follow, named like effects among the omissions.
 LEVELS, LINEAR, NEGATIVE = "levels of a joint", "linear deflections", "negative compliance"
 
@@ -74,7 +59,7 @@ class Valued:
         spec = self.model.cell.model
         active = {choice.name for choice in spec.effects}
         if spec.link_gravity:
-            active.add("link_gravity")
+            active.add(LinkGravity.name)
         return [name for name in CATALOGUE if name in active]
 
 
@@ -112,7 +97,7 @@ def keep(calibrated: Calibrated, elastic: bool, conditions: Conditions) -> Kept:
     """
     cell = calibrated.model.cell
     chosen = Valued(calibrated.model, calibrated.x).effects
-    instrument = tuple(name for name in chosen if _of_the_measurement(name))
+    instrument = tuple(name for name in chosen if CATALOGUE[name].of_the_measurement)
     unstated = {
         name: [need for need in CATALOGUE[name].needed(cell) if not conditions.state(need)]
         for name in chosen
@@ -120,9 +105,11 @@ def keep(calibrated: Calibrated, elastic: bool, conditions: Conditions) -> Kept:
     }
     whole = [name for name, needs in unstated.items() if not needs]
     full = _part(calibrated, whole)
-    held = GEOMETRY | FROZEN | (ELASTIC if elastic else frozenset())
+    format: Format = "elastic" if elastic else "rigid"
     dropped = _cannot_be_springs(full) if elastic else {}
-    kept_names = [name for name in whole if name in held and name not in dropped]
+    kept_names = [
+        name for name in whole if format in CATALOGUE[name].formats and name not in dropped
+    ]
     omissions = [
         Omission(name, dropped.get(name, ""), _part(calibrated, set(whole) - {name}))
         for name in whole
@@ -142,12 +129,6 @@ def keep(calibrated: Calibrated, elastic: bool, conditions: Conditions) -> Kept:
     return Kept(full, exported, conditions, tuple(omissions), instrument)
 
 
-def _of_the_measurement(name: str) -> bool:
-    # Where the base stands is the arm's; a marker that slipped did so during one campaign.
-    effect = CATALOGUE[name]
-    return (effect.stage == "tracker" and name != "base_frame") or name == "marker_slip"
-
-
 def _option(need: str) -> str:
     return {"time": "--time-s", "temperature": "--temperature-c"}[need]
 
@@ -159,7 +140,7 @@ def _part(calibrated: Calibrated, names: Collection[str]) -> Valued:
     spec = replace(
         spec,
         effects=tuple(choice for choice in spec.effects if choice.name in names),
-        link_gravity=spec.link_gravity and "link_gravity" in names,
+        link_gravity=spec.link_gravity and LinkGravity.name in names,
         observe="position",
         torque="computed",
     )
@@ -172,19 +153,12 @@ def _valued(like: Model, cell: Cell, values: dict[str, float]) -> Valued:
 
 
 def _cannot_be_springs(full: Valued) -> dict[str, str]:
-    """Effects of the elastic group whose values no physical spring or body has, with the reason."""
-    found = {}
-    values = full.values
-    stiffness = [v for name, v in values.items() if name.endswith(".compensator_stiffness")]
-    lengths = [v for name, v in values.items() if name.endswith(".compensator_free_length")]
-    if any(v < 0 for v in (*stiffness, *lengths)):
-        found["gravity_compensator"] = "negative stiffness or free length"
-    for i, own in enumerate(full.model.chain.masses, start=1):
-        error = values.get(f"link{i}.mass_error")
-        nominal = own.mass if full.model.cell.model.link_gravity else 0.0
-        if error is not None and nominal + error <= 0:
-            found["link_mass_error"] = f"the mass of link{i} would be {nominal + error:.3g} kg"
-    return found
+    """Effects whose values no physical spring or body has, with the reason."""
+    values, model = full.values, full.model
+    reasons = {
+        name: CATALOGUE[name].unphysical(values, model.chain, model.cell) for name in full.effects
+    }
+    return {name: reason for name, reason in reasons.items() if reason}
 
 
 def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tuple[str, str]]]:
@@ -196,7 +170,7 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     cell, values = part.model.cell, part.values
     changed = []
     spec = cell.model
-    if spec.compliance_levels and "joint_compliance" in part.effects and only in (None, LEVELS):
+    if spec.compliance_levels and JointCompliance.name in part.effects and only in (None, LEVELS):
         for joint, levels in spec.compliance_levels.items():
             names = [f"{joint}.compliance_level{k + 1}" for k in range(len(levels))]
             if names[0] in values:

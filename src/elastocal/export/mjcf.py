@@ -17,8 +17,8 @@ import numpy as np
 
 from elastocal.export.pieces import Pieces, SpringValue
 from elastocal.manipulator.chain import Array, LinkMass
-from elastocal.manipulator.effects.link_gravity import STANDARD_GRAVITY
-from elastocal.manipulator.effects.off_axis_compliance import transverse_axes
+from elastocal.manipulator.effects.compliances import transverse_axes
+from elastocal.manipulator.effects.loads import STANDARD_GRAVITY
 from elastocal.simulation.mjcf import NO_INERTIA, NO_MASS, numbers, placed_body
 
 # A drive without identified compliance: 5 kN m turn it by 5e-9 rad, 15 nm at 3 m.

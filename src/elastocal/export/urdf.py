@@ -22,7 +22,7 @@ from elastocal.export.pieces import Pieces
 from elastocal.export.rigid_text import origin_attributes
 from elastocal.export.urdf_edit import UrdfText, element, read_urdf_text
 from elastocal.manipulator.chain import Array
-from elastocal.manipulator.effects.link_ends import link_ends
+from elastocal.manipulator.effects.placements import link_ends
 from elastocal.manipulator.urdf_check import check_urdf
 from elastocal.manipulator.urdf_tree import Tree, UrdfJoint
 

@@ -10,7 +10,7 @@ from scipy import linalg
 from elastocal.identification.outliers import blocks
 from elastocal.identification.result import IdentificationResult, Outlier
 from elastocal.identification.solve import Solution
-from elastocal.identification.variance.choose import SHARED
+from elastocal.identification.variance.structure import SHARED
 
 FEW_DOF_PER_PARAMETER = 1.0
 ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone

@@ -14,7 +14,9 @@ from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.intervals import IntervalKind
 from elastocal.identification.noise import WeightKind
-from elastocal.identification.variance.choose import KINDS as NOISES
+from elastocal.identification.intervals import KINDS as NOISES
+from elastocal.text import did_you_mean
+from elastocal.identification.variance.structure import noise_models
 from elastocal.text import did_you_mean
 
 Method = Literal[
@@ -33,7 +35,7 @@ class Options:
     `method`: auto is reml, weights estimated by restricted likelihood, unless `weights` names
     stated ones; ols is eq. (6), wls eq. (10) with stated noise, eq14 and eq14-residual the
     published weights with σ by group or from each residual; huber, tukey (MM), l1, student-t are
-    robust.  `noise`: the model whose variances reml estimates (variance.choose.KINDS).
+    robust.  `noise`: the model whose variances reml estimates (structure.noise_models).
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
     `bounded`: keep parameters inside their physical bounds.  `constraints` and `prior`: a
@@ -59,7 +61,7 @@ class Options:
     def __post_init__(self) -> None:
         for name, value, valid in (
             ("method", self.method, METHODS),
-            ("noise model", self.noise, NOISES),
+            ("noise model", self.noise, noise_models()),
             ("kind of intervals", self.intervals, INTERVALS),
             ("way with faulty readings", self.faulty, get_args(FaultyReadings)),
         ):

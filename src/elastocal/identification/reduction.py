@@ -8,17 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from elastocal.manipulator.effects import effect_of
 from elastocal.manipulator.parameter import Parameter
 
 Array = NDArray[np.float64]
 
-# Kept first where a choice is free: what a user asks for by name; link geometry takes the rest.
-PREFERENCE = (
-    ("joint_compliance", "off_axis_compliance", "base_compliance", "gravity_compensator"),
-    ("base_frame", "distance_sensor"),
-    ("marker_position", "marker_orientation"),
-    ("joint_offset",),
-)
 # Below this share of its own length a column lies in the span of the kept ones: B is exact
 # to 1e-15, so this is a structural dependence and not rounding.
 STRUCTURAL = 1e-7
@@ -62,7 +56,7 @@ def reduce(
     length of a column off the span of the kept ones counts how many standard deviations a
     typical deviation moves the data: a parameter below `threshold` is not worth a column (at 1
     the variance it would add equals the squared bias it would remove).  Pivoted QR in the order
-    of PREFERENCE; `threshold` 0 keeps everything that is structurally independent.
+    of the effects' ranks; `threshold` 0 keeps everything that is structurally independent.
     """
     # The triangular factor has the same geometry as B at any number of rows.
     R = linalg.qr(B * sizes, mode="r")[0][: B.shape[1]] / sigma
@@ -96,7 +90,7 @@ def reduce(
 
 
 def _groups(parameters: tuple[Parameter, ...]) -> list[list[int]]:
-    named = {e for group in PREFERENCE for e in group}
-    middle = tuple({p.effect for p in parameters} - named - {"link_geometry"})
-    order = (*PREFERENCE, middle, ("link_geometry",))
-    return [[i for i, p in enumerate(parameters) if p.effect in g] for g in order]
+    """Indices of the parameters by rank: first what a user asks for by name; link geometry takes
+    the rest."""
+    ranks = [effect_of(p.effect).rank for p in parameters]
+    return [[i for i, own in enumerate(ranks) if own == rank] for rank in sorted(set(ranks))]

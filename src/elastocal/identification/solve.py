@@ -27,6 +27,7 @@ from elastocal.identification.selection import (
     residual_sigma,
 )
 from elastocal.identification.triangle import Triangle, merge
+from elastocal.manipulator.effects import effect_of
 from elastocal.manipulator.model import Model
 
 Array = NDArray[np.float64]
@@ -40,7 +41,6 @@ LOOSE, PLACED = 3.0, 0.3
 PLACING, CHOOSING = 1e-14, 1e-2
 # Observations that a large table's fit starts from.
 SAMPLE = 5000
-PLACED_EFFECTS = ("base_frame", "marker_position", "marker_orientation", "distance_sensor")
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def settle(problem: Problem, sizes: Array, progress: Progress = lambda message: 
 
 def is_placed(model: Model) -> NDArray[np.bool_]:
     """Which parameters (parameters,) registration places: base, markers, cable."""
-    return np.array([p.effect in PLACED_EFFECTS for p in model.parameters], dtype=bool)
+    return np.array([effect_of(p.effect).registered for p in model.parameters], dtype=bool)
 
 
 def sizes_and_check(problem: Problem) -> Array:

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from elastocal.identification.registration import SAMPLE, RegistrationProblem, register
+from elastocal.manipulator.effects.placements import BaseFrame, DistanceSensor, MarkerPosition
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
@@ -35,7 +36,7 @@ def start_values(
     places = {
         p.where
         for i, p in enumerate(model.parameters)
-        if i in movable and p.effect in ("base_frame", "marker_position")
+        if i in movable and p.effect in (BaseFrame.name, MarkerPosition.name)
     }
     if not places:
         return x
@@ -95,7 +96,7 @@ def _distance_start(
     """
     columns = np.array(
         [i for i, p in enumerate(model.parameters)
-         if i in movable and p.effect in ("distance_sensor", "marker_position")]
+         if i in movable and p.effect in (DistanceSensor.name, MarkerPosition.name)]
     )  # fmt: skip
     if not len(columns):
         return x

@@ -29,6 +29,7 @@ def linearised(model: Model, seen: Observations, x: Array, columns: NDArray[np.i
     return Readings(
         at.B.reshape(n, size, -1), at.residual.reshape(n, size), table.configuration[seen.lead],
         load, table.marker[seen.lead], sight, reach, _stated(model, seen),
+        table, seen.lead,
     )  # fmt: skip
 
 

@@ -50,7 +50,7 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
     Raises InputError where either file is invalid, or where the result belongs to another
     model than the cell describes; the message names the parameters that differ.
     """
-    cell = read_cell(cell_path, known_effects=tuple(CATALOGUE))
+    cell = read_cell(cell_path, known_effects=CATALOGUE)
     result = _read_result(Path(result_path))
     held = _held(result, result_path)
     # A cell that lists no markers took them from the table; their names stand in the parameters.

@@ -33,9 +33,9 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
     for an effect that has no place on this arm.
     """
     check_settings(chain, cell)
-    wanted: dict[str, list[str | None]] = {"payload": [None]}
-    if cell.model.link_gravity:
-        wanted["link_gravity"] = [None]
+    wanted: dict[str, list[str | None]] = {
+        name: [None] for name, effect in CATALOGUE.items() if effect.acts_unasked(cell)
+    }
     for choice in cell.model.effects:
         if choice.name not in CATALOGUE:
             raise InputError(_unknown("effects", "effect", choice.name, list(CATALOGUE), cell))

@@ -34,10 +34,14 @@ class Setting:
     such a constant, so a fit cannot find it; a search over `lower` to `upper` can.  The value
     comes from `[model.nominal.settings.PLACE]`, else `default`; None: there is none, and the
     model asks for it.  `key` carries the unit, as table columns do ("jump_time_s").
+
+    `kind` says which values a diagnosis tries: "order" periods in one turn of the joint,
+    "change_time" moments between two visits, "time_constant" some that the campaign can tell
+    apart, "range" values at equal distances from `lower` to `upper`, which are finite then.
     """
 
     key: str
-    kind: Literal["order", "change_time", "time_constant"]
+    kind: Literal["order", "change_time", "time_constant", "range"]
     default: float | None
     lower: float
     upper: float

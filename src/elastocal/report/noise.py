@@ -9,7 +9,7 @@ from scipy import stats
 
 from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
 from elastocal.identification.result import IdentificationResult
-from elastocal.identification.variance.choose import SHARED
+from elastocal.identification.variance.structure import REGISTERED, SHARED
 from elastocal.report.method import method_of, takes_configurations_as_a_whole
 from elastocal.report.units import length, significant
 from elastocal.report.words import printable
@@ -128,7 +128,9 @@ def candidate_rows(noise: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def kind_in_words(kind: str) -> str:
-    text = KINDS.get(kind.removesuffix(SHARED), printable(kind.removesuffix(SHARED)))
+    own = kind.removesuffix(SHARED)
+    known = KINDS | {name: model.description for name, model in REGISTERED.items()}
+    text = printable(known.get(own, own))
     return f"{text} + deviations of a configuration" if kind.endswith(SHARED) else text
 
 

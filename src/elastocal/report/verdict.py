@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from elastocal.identification.result import IdentificationResult
+from elastocal.manipulator.effects.placements import BaseFrame, MarkerPosition
 from elastocal.report.faults import MOST_TOLD, fault_lines
 from elastocal.report.method import (
     constraints_line,
@@ -100,7 +101,7 @@ def how_well_it_predicts(result: IdentificationResult) -> str:
 
 
 def nominal_arm(result: IdentificationResult) -> str:
-    placed = any(p.effect in ("base_frame", "marker_position") for p in result.model.parameters)
+    placed = any(p.effect in (BaseFrame.name, MarkerPosition.name) for p in result.model.parameters)
     return "nominal arm (base and markers placed)" if placed else "nominal arm"
 
 

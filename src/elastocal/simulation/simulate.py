@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError
+from elastocal.manipulator.effects.compliances import JointCompliance
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 from elastocal.text import did_you_mean, listed
@@ -42,7 +43,7 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
     drawn = {}
     for p in model.parameters:
         size = p.typical if p.typical is not None else 0.2 * abs(p.nominal)
-        if p.effect == "joint_compliance":
+        if p.effect == JointCompliance.name:
             size = 0.2 * abs(p.nominal)
         drawn[p.name] = p.nominal + scale * size * float(rng.normal())
     return drawn

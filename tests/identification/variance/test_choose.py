@@ -8,7 +8,8 @@ import pytest
 from identification.variance.dense import Table, readings
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.variance.choose import KINDS, estimate_noise
+from elastocal.identification.variance.choose import estimate_noise
+from elastocal.identification.variance.structure import noise_models
 
 BASE = Table(configurations=12, markers=3, repeats=4, unbalanced=False)
 
@@ -121,7 +122,7 @@ def test_an_unknown_kind_is_refused_with_the_nearest_name():
         estimate_noise(readings(BASE, 0), "axes")
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if k.endswith("+configuration")])
+@pytest.mark.parametrize("kind", [k for k in noise_models() if k.endswith("+configuration")])
 def test_shared_effects_need_something_to_share(kind):
     """One reading in each configuration: its own noise covers what it would share."""
     r = readings(Table(configurations=40, markers=1, repeats=1, unbalanced=False), 0)

@@ -8,9 +8,10 @@ import pytest
 from identification.variance.dense import Table, readings
 
 from elastocal.errors import InputError
-from elastocal.identification.variance.choose import KINDS, estimate_noise
+from elastocal.identification.variance.choose import estimate_noise
 from elastocal.identification.variance.readings import Readings
 from elastocal.identification.variance.search import settle
+from elastocal.identification.variance.structure import noise_models
 
 BASE = Table(configurations=9, markers=3, repeats=4, unbalanced=False)
 
@@ -24,7 +25,7 @@ def finite(found):
     assert np.isfinite(found.fit.log_likelihood)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", noise_models())
 def test_perfect_data(kind):
     """Residuals of exactly zero: the estimate is exact, its deviations next to nothing."""
     r = readings(BASE, 0)
@@ -35,7 +36,7 @@ def test_perfect_data(kind):
     assert found.noise.covariance.std.max() < 1e-30
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", noise_models())
 def test_residuals_of_rounding_only(kind):
     """e = B x₀ to the last bit: x₀ is found to the digits there are."""
     r = readings(BASE, 0)
@@ -45,7 +46,7 @@ def test_residuals_of_rounding_only(kind):
     np.testing.assert_allclose(found.noise.x, x0, rtol=1e-12)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", noise_models())
 def test_one_group_is_constant(kind):
     r = readings(BASE, 0)
     e = r.e.copy()
@@ -53,7 +54,7 @@ def test_one_group_is_constant(kind):
     finite(settle(r.moved(e), kind).noise)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", noise_models())
 def test_one_component_is_perfect(kind):
     r = readings(BASE, 0)
     e, B = r.e.copy(), r.B.copy()
@@ -61,7 +62,7 @@ def test_one_component_is_perfect(kind):
     finite(settle(replace(r, e=e, B=B), kind).noise)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", noise_models())
 def test_a_configuration_with_a_single_reading(kind):
     r = readings(BASE, 0)
     keep = (r.configuration != 4) | (np.cumsum(r.configuration == 4) == 1)

@@ -10,7 +10,7 @@ from support.cells import COMPLIANCE, kr270_cell, kr270_chain
 
 from elastocal.cell import Nominal
 from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.effects.link_bending import link_axes
+from elastocal.manipulator.effects.compliances import link_axes
 
 K, F, LEVER = 1e-5, 400.0, 0.5
 

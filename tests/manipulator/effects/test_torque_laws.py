@@ -11,7 +11,7 @@ from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 
 from elastocal.cell import Nominal
 from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.effects.rated_torque import rated_torque, torque_scale, weight_torque
+from elastocal.manipulator.effects.compliances import rated_torque, torque_scale, weight_torque
 from elastocal.manipulator.model import Model
 
 FORCE = 500.0  # N, downwards at the end of 1 m: far above the 1 N m of a massless stick's scale

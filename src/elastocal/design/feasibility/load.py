@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from elastocal.cell import Cell
 from elastocal.design.feasibility.frames import Poses
 from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.effects.loads import GravityCompensator
 from elastocal.manipulator.symbolic import SymbolicArm
 from elastocal.manipulator.tape import Tape
 
@@ -33,7 +34,7 @@ class StaticTorque:
     """
 
     def __init__(self, cell: Cell, chain: Chain) -> None:
-        kept = tuple(e for e in cell.model.effects if e.name == "gravity_compensator")
+        kept = tuple(e for e in cell.model.effects if e.name == GravityCompensator.name)
         markers = {"tool": np.zeros(3)}
         symbolic = SymbolicArm(
             chain,

@@ -5,31 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from elastocal.diagnosis.separate.rivals import RivalSet
-
-# What a look at something other than the arm's markers would settle, by effect.
-OTHER_MEANS = {
-    "base_drift": "monuments",
-    "frame_jump": "monuments",
-    "tracker_distortion": "scale",
-    "link_mass_error": "torque",
-    "gravity_compensator": "torque",
-    "payload_error": "weigh",
-}
-MEANS = {
-    "monuments": (
-        "measure fixed reflectors (monuments) on the floor and on the robot's foot along with the "
-        "arm: they tell the tracker's motion, the base's and a joint's apart"
-    ),
-    "scale": (
-        "measure a reference length (scale bar) or set the tracker up in a second place: that "
-        "tells its errors from the arm's"
-    ),
-    "torque": (
-        "record the joints' torques or motor currents, which a wrong weight or spring changes "
-        "and a gear error does not"
-    ),
-    "weigh": "weigh the load and measure its hook",
-}
+from elastocal.manipulator.effects import effect_of
 
 
 def inseparable_advice(group: Sequence[str], distance: float, tried: int) -> str:
@@ -44,8 +20,7 @@ def inseparable_advice(group: Sequence[str], distance: float, tried: int) -> str
 def other_means(pairs: Sequence[tuple[str, str]]) -> list[str]:
     """What else tells the rivals of inseparable pairs apart."""
     effects = [name.partition(":")[0] for pair in pairs for name in pair]
-    wanted = dict.fromkeys(OTHER_MEANS[e] for e in effects if e in OTHER_MEANS)
-    return [MEANS[key] for key in wanted]
+    return list(dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy)))
 
 
 def too_few_advice(n: int, probability: float, reachable: float) -> str:

@@ -21,6 +21,7 @@ from elastocal.diagnosis.scene import Scene
 from elastocal.diagnosis.sums import direct
 from elastocal.diagnosis.verdict import UNKNOWN_EFFECT
 from elastocal.errors import InputError, require
+from elastocal.manipulator.effects.compliances import JointCompliance
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
@@ -144,7 +145,7 @@ class Suspects:
         keys = self._rivals()
         if self.unknown:
             # Torques, which may drive what is unknown, come from the compliances' columns.
-            keys += [k for k in self._items if k[0] == "joint_compliance"]
+            keys += [k for k in self._items if k[0] == JointCompliance.name]
         whats = [self._items[k].what for k in dict.fromkeys(keys)]
         return [h for h in whats if isinstance(h, Hypothesis)]
 

@@ -25,11 +25,17 @@ from elastocal.identification.variance.shared import shared_effects
 from elastocal.identification.variance.shrinkage import prior_of_groups
 from elastocal.identification.variance.structure import STRUCTURES, Structure
 from elastocal.text import did_you_mean
+from elastocal.identification.variance.structure import (
+    REGISTERED,
+    SHARED,
+    STRUCTURES,
+    Structure,
+    noise_models,
+)
+from elastocal.text import did_you_mean
 
 Array = NDArray[np.float64]
 
-SHARED = "+configuration"
-KINDS = ("auto", *STRUCTURES, *(name + SHARED for name in STRUCTURES))
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
 SEEN = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
@@ -49,7 +55,7 @@ class NoiseFit:
     """The noise model that was chosen, the estimate under it, and what else was tried.
 
     `x` (p,) is the generalised least-squares estimate of the readings' Δx, `covariance` that of
-    Kenward and Roger; `kind` is a name of KINDS other than auto.  `fit` is in orthonormal
+    Kenward and Roger; `kind` is a name of `noise_models` other than auto.  `fit` is in orthonormal
     parameters: Δx = basis · fit.state.x, which shifts all its log-likelihoods by one constant.
     """
 
@@ -82,8 +88,8 @@ def estimate_noise(
 
     Raises InputError for an unknown kind or one that the readings do not support.
     """
-    if kind not in KINDS:
-        raise InputError(f"there is no noise model '{kind}'{did_you_mean(kind, KINDS)}")
+    if kind not in noise_models():
+        raise InputError(f"there is no noise model '{kind}'{did_you_mean(kind, noise_models())}")
     basis, T = _orthonormal(readings)
     if kind != "auto":
         near = None if like is None else like.fit
@@ -136,7 +142,7 @@ def _supported(readings: Readings) -> list[str]:
     groups = len(np.unique(np.column_stack([readings.configuration, readings.load]), axis=0))
     if 3 <= groups <= MOST_GROUPS and 3 * groups <= len(readings) - readings.n_parameters / size:
         names.append("groups")
-    return names
+    return names + [name for name, model in REGISTERED.items() if model.supports(readings)]
 
 
 def _fitted(readings: Readings, name: str, shared: bool, like: Reml | None = None) -> Reml:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import require
+from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -23,6 +24,7 @@ class Readings:
     `configuration`, `load` and `marker` (N,) are repeats.  `sight` (N, 3, 3), where the tracker's
     position is known, holds the unit vectors along and across the line of sight as rows and
     `reach` (N,) its length in m; `stated` (N, size, size), where noise is stated, its covariance.
+    `lead` (N,) are the readings' rows in the `table`.
     """
 
     B: Array
@@ -33,6 +35,8 @@ class Readings:
     sight: Array | None = None
     reach: Array | None = None
     stated: Array | None = None
+    table: Measurements | None = None
+    lead: Labels | None = None
 
     def __post_init__(self) -> None:
         n, size = self.e.shape
@@ -56,6 +60,13 @@ class Readings:
         return int(self.B.shape[2])
 
     @cached_property
+    def rows(self) -> Measurements:
+        """The rows (N,) of the table that the readings are from: joints, force, time and so on."""
+        require(self.table is not None, "these readings are not from a table")
+        assert self.table is not None and self.lead is not None
+        return self.table.take(self.lead)
+
+    @cached_property
     def cell(self) -> Labels:
         """Number (N,) of the set of repeats that a reading belongs to."""
         key = np.column_stack([self.configuration, self.load, self.marker])
@@ -68,7 +79,7 @@ class Readings:
 
     def take(self, chosen: Mask) -> Readings:
         """Only the readings where `chosen` (N,) holds."""
-        names = ("B", "e", "configuration", "load", "marker", "sight", "reach", "stated")
+        names = ("B", "e", "configuration", "load", "marker", "sight", "reach", "stated", "lead")
         parts = {name: getattr(self, name) for name in names}
         return replace(self, **{k: v[chosen] for k, v in parts.items() if v is not None})
 

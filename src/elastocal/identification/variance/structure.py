@@ -1,13 +1,19 @@
-"""How the noise of a single reading may be built: one variance, or several."""
+"""How the noise of a single reading may be built: one variance, or several.
+
+Besides the built-in structures there are those that a `NoiseModel` of the user's own describes.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import require
+from elastocal.errors import InputError, require
 from elastocal.identification.variance.readings import Cells, Labels, Readings, reduce_repeats
 
 Array = NDArray[np.float64]
@@ -136,7 +142,7 @@ def _diagonal(
     )
 
 
-STRUCTURES = {
+STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
     "independent": independent,
     "axis": by_axis,
     "marker": by_marker,
@@ -144,3 +150,113 @@ STRUCTURES = {
     "polar": polar,
     "stated": as_stated,
 }
+SHARED = "+configuration"
+
+
+class NoiseModel:
+    """A noise model of one's own: the variances that the noise of a reading is made of.
+
+    The covariance of reading i is Σ_l θ_l S_l,i with unknown variances θ_l ≥ 0, which restricted
+    likelihood finds, and what `components` says of S_l.  It is tried with and without deviations
+    that the readings of a configuration share, and taken where the information criterion is smaller
+    than those of the built-in models.
+    """
+
+    name: ClassVar[str]
+    description: ClassVar[str]
+
+    def components(self, readings: Readings) -> Mapping[str, Array]:
+        """The name of each variance → S, (N,) times the identity or (N, size, size), of N readings.
+
+        θ is in m² (rad² of rotations) where S is a plain number.  A group of readings with a
+        variance of its own has S = 1 for its members and 0 for the others.  Repeats of a reading
+        share one S, the mean of theirs.  The names are the same for any part of the readings.
+        """
+        raise NotImplementedError
+
+    def supports(self, readings: Readings) -> bool:
+        """Whether these readings have what the model needs; where not, it is not tried."""
+        return True
+
+    def structure(self, readings: Readings) -> Structure:
+        """The model for the likelihood; InputError where `components` are not as they should be."""
+        found = self.components(readings)
+        require(bool(found), f"the noise model '{self.name}' has no components")
+        whole = np.stack([self._matrices(name, S, readings) for name, S in found.items()], axis=1)
+        cells, cell = readings.cells, readings.cell
+        matrix = np.zeros((len(cells), *whole.shape[1:]))
+        np.add.at(matrix, cell, whole)
+        matrix /= cells.repeats[:, None, None, None]
+        smallest = np.linalg.eigvalsh(matrix.sum(axis=1))[:, 0]
+        require(
+            bool((smallest > 0).all()),
+            f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
+            "components add up to a singular matrix",
+        )
+        index = np.tile(np.arange(len(found)), (len(cells), 1))
+        return Structure(
+            self.name, self.description, tuple(found), cells, index, matrix,
+            matrix / cells.repeats[:, None, None, None],
+        )  # fmt: skip
+
+    def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
+        """S (N, size, size) of one component, checked."""
+        n, size = len(readings), readings.size
+        S = np.asarray(S, dtype=np.float64)
+        where = f"component '{name}' of the noise model '{self.name}'"
+        require(
+            S.shape in ((n,), (n, size, size)),
+            f"{where} is {S.shape}; a number per reading, ({n},), or a matrix, "
+            f"({n}, {size}, {size}), is needed",
+        )
+        require(bool(np.isfinite(S).all()), f"{where} is not finite")
+        full = S[:, None, None] * np.eye(size) if S.ndim == 1 else S
+        require(np.allclose(full, full.transpose(0, 2, 1)), f"{where} is not symmetric")
+        smallest, largest = np.linalg.eigvalsh(full)[:, [0, -1]].T
+        require(
+            bool((smallest >= -1e-9 * largest).all()),
+            f"{where} has a negative variance in some direction",
+        )
+        return full
+
+
+REGISTERED: dict[str, NoiseModel] = {}
+
+
+def register(model: NoiseModel) -> None:
+    """Add a noise model to STRUCTURES.
+
+    Raises InputError where it is none, says too little, or has the name of another one; the same
+    class takes the place of its former self.
+    """
+    if isinstance(model, type) and issubclass(model, NoiseModel):
+        raise InputError(f"register a noise model, {model.__name__}(), not its class")
+    if not isinstance(model, NoiseModel):
+        raise InputError(
+            "a noise model is an object of a class derived from NoiseModel; "
+            f"found {type(model).__name__}"
+        )
+    kind = type(model)
+    name, text = getattr(model, "name", None), getattr(model, "description", None)
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise InputError(
+            f"{kind.__name__}.name takes lower-case letters, digits and underscores, as in "
+            f'"by_day"; found {name!r}'
+        )
+    require(isinstance(text, str) and bool(text), f"{kind.__name__}.description takes a short text")
+    require(kind.components is not NoiseModel.components, f"{kind.__name__} lacks components")
+    known = REGISTERED.get(name)
+    same = known is not None and (type(known).__module__, type(known).__qualname__) == (
+        kind.__module__, kind.__qualname__,
+    )  # fmt: skip
+    require(
+        same or name not in (*STRUCTURES, "auto"),
+        f"there is a noise model '{name}' already; choose another name",
+    )
+    REGISTERED[name] = model
+    STRUCTURES[name] = model.structure
+
+
+def noise_models() -> tuple[str, ...]:
+    """Every name that `noise` takes: auto, the structures, and those with shared deviations."""
+    return ("auto", *STRUCTURES, *(name + SHARED for name in STRUCTURES))

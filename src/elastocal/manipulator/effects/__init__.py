@@ -1,38 +1,53 @@
-"""The catalogue of effects.  A new effect is one file here and one line below."""
+"""The catalogue of effects, built in and registered.
+
+An effect is known by its name everywhere; what else other modules must know of it they ask it: see
+the traits of `base.Effect`.  A new one is a class in the room of its stage and a line below, or a
+file of the user's own that calls `register`.
+"""
 
 from __future__ import annotations
 
-from elastocal.manipulator.effects.backlash import Backlash
-from elastocal.manipulator.effects.base import Effect
-from elastocal.manipulator.effects.base_compliance import BaseCompliance
-from elastocal.manipulator.effects.base_drift import BaseDrift
-from elastocal.manipulator.effects.base_frame import BaseFrame
-from elastocal.manipulator.effects.distance_sensor import DistanceSensor
-from elastocal.manipulator.effects.encoder_jump import EncoderJump
-from elastocal.manipulator.effects.encoder_scale import EncoderScale
-from elastocal.manipulator.effects.frame_jump import FrameJump
-from elastocal.manipulator.effects.gear_eccentricity import GearEccentricity
-from elastocal.manipulator.effects.gear_ripple import GearRipple
-from elastocal.manipulator.effects.gear_second_harmonic import GearSecondHarmonic
-from elastocal.manipulator.effects.gravity_compensator import GravityCompensator
-from elastocal.manipulator.effects.hysteresis import Hysteresis
-from elastocal.manipulator.effects.joint_compliance import JointCompliance
-from elastocal.manipulator.effects.joint_drift import JointDrift
-from elastocal.manipulator.effects.joint_hardening import JointHardening
-from elastocal.manipulator.effects.joint_offset import JointOffset
-from elastocal.manipulator.effects.link_bending import LinkBending
-from elastocal.manipulator.effects.link_geometry import LinkGeometry
-from elastocal.manipulator.effects.link_gravity import LinkGravity
-from elastocal.manipulator.effects.link_mass_error import LinkMassError
-from elastocal.manipulator.effects.marker_orientation import MarkerOrientation
-from elastocal.manipulator.effects.marker_position import MarkerPosition
-from elastocal.manipulator.effects.marker_slip import MarkerSlip
-from elastocal.manipulator.effects.off_axis_compliance import OffAxisCompliance
-from elastocal.manipulator.effects.payload import Payload
-from elastocal.manipulator.effects.payload_error import PayloadError
-from elastocal.manipulator.effects.thermal_expansion import ThermalExpansion
+from elastocal.errors import require
+from elastocal.manipulator.effects.base import Effect, check
+from elastocal.manipulator.effects.changes_in_time import (
+    BaseDrift,
+    EncoderJump,
+    FrameJump,
+    JointDrift,
+    MarkerSlip,
+    ThermalExpansion,
+)
+from elastocal.manipulator.effects.compliances import (
+    BaseCompliance,
+    JointCompliance,
+    JointHardening,
+    LinkBending,
+    OffAxisCompliance,
+)
+from elastocal.manipulator.effects.gears import (
+    EncoderScale,
+    GearEccentricity,
+    GearRipple,
+    GearSecondHarmonic,
+    JointOffset,
+    WristCoupling,
+)
+from elastocal.manipulator.effects.loads import (
+    GravityCompensator,
+    LinkGravity,
+    LinkMassError,
+    Payload,
+    PayloadError,
+)
+from elastocal.manipulator.effects.placements import (
+    BaseFrame,
+    DistanceSensor,
+    LinkGeometry,
+    MarkerOrientation,
+    MarkerPosition,
+)
+from elastocal.manipulator.effects.play import Backlash, Hysteresis
 from elastocal.manipulator.effects.tracker_distortion import TrackerDistortion
-from elastocal.manipulator.effects.wrist_coupling import WristCoupling
 
 # Hooks run in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {
@@ -70,3 +85,37 @@ CATALOGUE: dict[str, Effect] = {
         TrackerDistortion(),
     )
 }
+BUILT_IN = frozenset(CATALOGUE)
+UNKNOWN = Effect()  # what is known of an effect that the catalogue does not have
+
+
+def effect_of(name: str) -> Effect:
+    """The effect of that name for its traits; one with their defaults where there is none."""
+    return CATALOGUE.get(name, UNKNOWN)
+
+
+def register(effect: Effect) -> None:
+    """Add an effect to the catalogue, behind the last one of its stage.
+
+    Raises InputError where it is no effect, says too little, or has the name of another one; the
+    same class (in an edited notebook cell, say) takes the place of its former self.
+    """
+    check(effect)
+    known = CATALOGUE.get(effect.name)
+    if known is not None:
+        require(
+            effect.name not in BUILT_IN and _same_class(known, effect),
+            f"there is an effect '{effect.name}' already; choose another name",
+        )
+        CATALOGUE[effect.name] = effect
+        return
+    order = list(CATALOGUE.values())
+    last = max(k for k, other in enumerate(order) if other.stage == effect.stage)
+    order.insert(last + 1, effect)
+    CATALOGUE.clear()
+    CATALOGUE.update({each.name: each for each in order})
+
+
+def _same_class(known: object, new: object) -> bool:
+    a, b = type(known), type(new)
+    return (a.__module__, a.__qualname__) == (b.__module__, b.__qualname__)

@@ -8,7 +8,7 @@ from elastocal.cell import Cell
 from elastocal.manipulator import rigid
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects.base import Effect, Symbols
+from elastocal.manipulator.effects.base import MEASURE_SCALE, Effect, Symbols
 from elastocal.manipulator.parameter import ParameterSpec
 
 ENCODERS = ("azimuth_sin", "azimuth_cos", "elevation_sin", "elevation_cos")
@@ -30,6 +30,7 @@ class TrackerDistortion(Effect):
 
     name = "tracker_distortion"
     stage = "tracker"
+    remedy = MEASURE_SCALE
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return () if cell.model.observe == "distance" else ("tracker",)

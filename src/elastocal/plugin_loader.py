@@ -1,0 +1,147 @@
+"""Where code of the user's own comes from: installed packages, and files that a cell names.
+
+A plug-in is any Python code that calls `elastocal.plugins.register_effect` and its like.  It is run
+once: for an entry point of the group `elastocal.plugins` when the first cell is read, for
+`[plugins] modules` of a cell when that cell is.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import TYPE_CHECKING
+
+from elastocal.errors import InputError
+from elastocal.files import check_exists, read_text
+from elastocal.text import quoted
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+GROUP = "elastocal.plugins"
+MAX_BYTES = 5_000_000
+OURS = str(Path(__file__).parent)
+
+_installed: list[str] = []  # entry points that were run
+_files: dict[Path, tuple[int, int]] = {}  # files that were run, as they were then
+
+
+def load_plugins(cell: Path | None = None, modules: Sequence[str] = ()) -> None:
+    """Run the plug-ins of installed packages, and the `modules` that the file `cell` names.
+
+    A name that ends with .py is the path of a file; any other is a module that can be imported.  What has been run is not run again, but for a file that has changed.
+
+    Raises InputError that names the plug-in, its file and the line, where one cannot be run.
+    """
+    _load_installed()
+    for k, name in enumerate(modules):
+        key = f"plugins.modules[{k}]"
+        owner = cell or Path("plug-ins")
+        where = f"{owner}: key {key}"
+        if is_plugin_file(name):
+            _run_file(check_exists(Path(name), key, owner), where)
+        else:
+            _run(where, None, partial(_import, name))
+
+
+def is_plugin_file(module: str) -> bool:
+    """Whether an entry of `[plugins] modules` names a file, not a module to import."""
+    return module.endswith(".py")
+
+
+def _load_installed() -> None:
+    from importlib.metadata import entry_points
+
+    for point in entry_points(group=GROUP):
+        if point.value not in _installed:
+            source = f" of the package {point.dist.name}" if point.dist else ""
+            _run(f"plug-in '{point.name}'{source}", None, partial(_enter, point))
+            _installed.append(point.value)
+
+
+def _enter(point: EntryPoint) -> None:
+    """A module registers when it is imported, a function when it is called."""
+    found = point.load()
+    if not isinstance(found, ModuleType):
+        found()
+
+
+def _import(name: str) -> None:
+    import importlib
+
+    if not re.fullmatch(r"\w+(\.\w+)*", name):
+        raise InputError(
+            f'a plug-in is a file that ends with .py, as "my_effects.py", or a module, as '
+            f'"my_package.effects"; found {quoted(name)}'
+        )
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if not f"{name}.".startswith(f"{error.name}."):
+            raise
+        raise InputError(
+            f"there is no module '{error.name}'; install its package, or name a file that ends "
+            "with .py"
+        ) from None
+
+
+def _run_file(path: Path, where: str) -> None:
+    import zlib
+
+    path = path.resolve()
+    state = path.stat()
+    version = state.st_mtime_ns, state.st_size
+    if _files.get(path) == version:
+        return
+    source = read_text(path, "plug-in", MAX_BYTES)
+    # No file is written beside the user's own, as an import would.
+    module = ModuleType(f"plugin_{path.stem}_{zlib.crc32(str(path).encode()):08x}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
+
+    def run() -> None:
+        code: CodeType = compile(source, str(path), "exec")
+        exec(code, module.__dict__)
+
+    try:
+        _run(where, path, run)
+    except InputError:
+        del sys.modules[module.__name__]
+        raise
+    _send_by_value(module)
+    _files[path] = version
+
+
+def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
+    """Run a plug-in; what goes wrong in it is an InputError that says where."""
+    try:
+        run()
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except (Exception, SystemExit) as error:
+        raise InputError(f"{where}: {_told(error, path)}") from error
+
+
+def _told(error: BaseException, path: Path | None) -> str:
+    """ "my_effects.py, line 3: NameError: …": the last line that is the plug-in's own."""
+    import traceback
+
+    if isinstance(error, SyntaxError) and error.filename:
+        file, line, text = error.filename, error.lineno, error.msg
+    else:
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [f for f in frames if path is not None and f.filename == str(path)]
+        own = own or [f for f in frames if not f.filename.startswith((OURS, "<frozen"))] or frames
+        file, line, text = own[-1].filename, own[-1].lineno, str(error)
+    return f"{file}, line {line}: {type(error).__name__}: {text}; correct the plug-in"
+
+
+def _send_by_value(module: ModuleType) -> None:
+    """Worker processes, which have not run the file, are sent its classes themselves."""
+    from cloudpickle import register_pickle_by_value
+
+    register_pickle_by_value(module)

@@ -1,0 +1,142 @@
+"""Noise models of one's own: the same likelihood as a built-in one, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from identification.variance.dense import Table, readings
+from support.registered import forgotten
+
+from elastocal.errors import InputError
+from elastocal.identification.variance.choose import estimate_noise
+from elastocal.identification.variance.judge import own_noise
+from elastocal.identification.variance.readings import Readings
+from elastocal.identification.variance.structure import NoiseModel, noise_models
+from elastocal.plugins import register_noise_model
+
+UNBALANCED = readings(Table(configurations=10, markers=3, repeats=3), 4)
+
+
+class Twin(NoiseModel):
+    """Variances per axis, as the built-in "axis" has them."""
+
+    name = "twin"
+    description = "one variance per axis"
+
+    def components(self, readings: Readings) -> Mapping[str, np.ndarray]:
+        n = len(readings)
+        return {
+            a: np.tile(np.diag(row), (n, 1, 1)) for a, row in zip("xyz", np.eye(3), strict=True)
+        }
+
+
+class Markers(NoiseModel):
+    """Variances per marker, as the built-in "marker" has them, from numbers of 0 and 1."""
+
+    name = "markers"
+    description = "one variance per marker"
+
+    def components(self, readings: Readings) -> Mapping[str, np.ndarray]:
+        return {
+            f"marker {m}": (readings.marker == m).astype(float) for m in np.unique(readings.marker)
+        }
+
+
+@pytest.fixture(autouse=True)
+def _as_before() -> Iterator[None]:
+    with forgotten():
+        yield
+
+
+@pytest.mark.parametrize("shared", ["", "+configuration"])
+@pytest.mark.parametrize(("model", "built_in"), [(Twin, "axis"), (Markers, "marker")])
+def test_it_has_the_likelihood_of_a_built_in_model_that_says_the_same(
+    model: type[NoiseModel], built_in: str, shared: str
+) -> None:
+    register_noise_model(model())
+    own, other = (estimate_noise(UNBALANCED, name + shared) for name in (model.name, built_in))
+    assert own.fit.log_likelihood == pytest.approx(other.fit.log_likelihood, abs=1e-6)
+    np.testing.assert_allclose(own.fit.own, other.fit.own, rtol=1e-4)
+    np.testing.assert_allclose(own.x, other.x, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(own.covariance.matrix, other.covariance.matrix, rtol=1e-3)
+    some = UNBALANCED.take(np.arange(len(UNBALANCED)) % 2 == 0)
+    for mine, its in zip(own_noise(own.fit, some), own_noise(other.fit, some), strict=True):
+        np.testing.assert_allclose(mine, its, rtol=1e-3)
+
+
+def test_auto_tries_it_last_and_all_others_as_without_it() -> None:
+    before = estimate_noise(UNBALANCED)
+    register_noise_model(Twin())
+    after = estimate_noise(UNBALANCED)
+    # What follows the structures is the best of them without shared deviations.
+    n = len([t for t in before.trials if t.kind.partition("+")[0] != before.kind.partition("+")[0]])
+    assert before.trials[:n] == after.trials[:n]
+    assert "twin" in {t.kind.partition("+")[0] for t in after.trials}
+    assert {"twin", "twin+configuration"} <= set(noise_models())
+    assert not {"twin"} & {t.kind.partition("+")[0] for t in before.trials}
+
+
+def test_it_is_not_tried_where_the_readings_lack_what_it_needs() -> None:
+    class Never(Twin):
+        name = "never"
+
+        def supports(self, readings: Readings) -> bool:
+            return False
+
+    register_noise_model(Never())
+    assert "never" not in {t.kind.partition("+")[0] for t in estimate_noise(UNBALANCED).trials}
+
+
+def test_repeats_share_the_mean_of_what_each_says() -> None:
+    class Growing(NoiseModel):
+        name = "growing"
+        description = "a variance that grows with the number of the reading"
+
+        def components(self, readings: Readings) -> Mapping[str, np.ndarray]:
+            return {"growing": 1.0 + np.arange(len(readings))}
+
+    structure = Growing().structure(UNBALANCED)
+    cell, number = UNBALANCED.cell, 1.0 + np.arange(len(UNBALANCED))
+    for c in range(len(structure.cells)):
+        mean = number[cell == c].mean()
+        np.testing.assert_allclose(structure.matrix[c, 0], mean * np.eye(3))
+        repeats = (cell == c).sum()
+        np.testing.assert_allclose(structure.mean_matrix[c, 0], mean / repeats * np.eye(3))
+
+
+WRONG: dict[str, tuple[Callable[[int], Any], str]] = {
+    "none": (lambda n: {}, "'wrong' has no components"),
+    "shape": (lambda n: {"a": np.ones(3)}, r"component 'a' of .* is \(3,\); a number per reading"),
+    "negative": (lambda n: {"a": -np.ones(n)}, "negative variance in some direction"),
+    "infinite": (lambda n: {"a": np.full(n, np.inf)}, "is not finite"),
+    "turned": (lambda n: {"a": np.tile(np.triu(np.ones((3, 3))), (n, 1, 1))}, "symmetric"),
+    "nothing": (lambda n: {"a": np.zeros(n)}, "leaves a reading without noise"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_components_that_are_no_covariances_are_refused(case: str) -> None:
+    made, told = WRONG[case]
+
+    class Wrong(NoiseModel):
+        name = "wrong"
+        description = "wrong"
+
+        def components(self, readings: Readings) -> Mapping[str, np.ndarray]:
+            return made(len(readings))
+
+    register_noise_model(Wrong())
+    with pytest.raises(InputError, match=told):
+        estimate_noise(UNBALANCED, "wrong")
+
+
+def test_the_same_class_takes_the_place_of_its_former_self() -> None:
+    register_noise_model(Twin())
+    register_noise_model(Twin())
+    with pytest.raises(InputError, match=r"test_noise_model\.py, line \d+: register a noise model"):
+        register_noise_model(Twin)  # type: ignore[type-var]
+    with pytest.raises(InputError, match="found int"):
+        register_noise_model(3)  # type: ignore[type-var]
