@@ -9,7 +9,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -149,26 +149,22 @@ def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
 
 @dataclass(frozen=True)
 class Rows:
-    """A table under `header`: (line number, cells) each; `ignored`: line and reason."""
+    """A table under `header`: (line number, cells) each; `ignored`: line and reason.
+
+    `header_line` is 0 without a header; `split_at` names the delimiter, or the kind of program.
+    """
 
     header: tuple[str, ...]
     rows: list[tuple[int, list[str]]]
     ignored: list[tuple[int, str]]
-
-
-@dataclass(frozen=True)
-class FoundTable:
-    """`rows` with the header's line (0 without one), the delimiter's name, and the comments."""
-
-    rows: Rows
-    header_line: int
-    delimiter: str
-    comments: tuple[str, ...]
+    header_line: int = 0
+    split_at: str = ""
+    comments: tuple[str, ...] = ()
 
 
 def table_rows(
     text: Text, settings: TextTable, is_header: IsHeader | None, is_data: IsData
-) -> FoundTable:
+) -> Rows:
     """The rows of a delimited table.
 
     `is_header` recognises the header where columns are asked for by name; without it the table
@@ -214,8 +210,8 @@ def table_rows(
             rows.append((number, cells))
     if not rows:
         raise InputError(f"{text.source}: a header but no readings below it; export the points")
-    found = Rows(tuple(header), rows, ignored)
-    return FoundTable(found, header_line, delimiter, tuple(line for _, line in comments))
+    told = tuple(line for _, line in comments)
+    return Rows(tuple(header), rows, ignored, header_line, delimiter, told)
 
 
 def _sniffed(
@@ -441,7 +437,7 @@ def krl_rows(text: Text) -> Rows:
     Aggregates of FRAME, POS and E6POS (X, Y, Z) hold no joint values and are passed over, named.
     Raises InputError for a joint value that is no number and where no aggregate has any.
     """
-    found = Rows(("name", *KRL_AXES), [], [])
+    found = Rows(("name", *KRL_AXES), [], [], split_at="KRL")
     whole = "\n".join(_uncommented(line, ";") for line in text.lines)
     count = _LineCounter(whole)
     for match in _KRL.finditer(whole):
@@ -473,7 +469,7 @@ def rapid_rows(text: Text) -> Rows:
     is the position before a correction: both are passed over, named.
     Raises InputError for a value that is no number and where there is no jointtarget.
     """
-    found = Rows(("name", *RAPID_AXES), [], [])
+    found = Rows(("name", *RAPID_AXES), [], [], split_at="RAPID")
     whole = "\n".join(_uncommented(line, "!") for line in text.lines)
     count = _LineCounter(whole)
     start = 0
@@ -527,7 +523,7 @@ def _complete(text: Text, found: Rows, what: str) -> Rows:
     used = [i for i in range(len(found.header)) if any(cells[i] for _, cells in found.rows)]
     used = sorted({0, *used})
     rows = [(line, [cells[i] for i in used]) for line, cells in found.rows]
-    return Rows(tuple(found.header[i] for i in used), rows, found.ignored)
+    return replace(found, header=tuple(found.header[i] for i in used), rows=rows)
 
 
 def _passed_over(found: Rows) -> str:

@@ -20,8 +20,8 @@ from elastocal.importing.export_columns import (
 from elastocal.importing.foreign_text import (
     SAMPLE,
     Clock,
-    FoundTable,
     NumberCells,
+    Rows,
     Text,
     compiled,
     krl_rows,
@@ -81,11 +81,6 @@ class Records:
         """File and line of a row, as messages begin."""
         return f"{self.source}, line {self.line[i]}"
 
-    def name(self, i: int) -> str:
-        """The row's name in the file, or its line."""
-        named = self.texts.get("name")
-        return named[i] if named and named[i] else f"line {self.line[i]}"
-
 
 def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable) -> Records:
     """The rows of `path` as `source` of the mapping `where` describes them.
@@ -97,27 +92,26 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     asked = wanted(where, source.columns or {}, source.optional or {})
     text = read_lines(path, settings.encoding or "auto")
     table = _table(text, settings, asked)
-    rows = table.rows
-    if len(rows.rows) > MAX_ROWS:
+    if len(table.rows) > MAX_ROWS:
         raise InputError(f"{text.source}: more than {MAX_ROWS:,} rows; thin the export out")
     hint = unit_in_comments(where, settings.unit_comment, table.comments)
-    width = len(rows.rows[0][1])
-    columns = resolve(text.source, asked, rows.header, width, units, hint)
+    width = len(table.rows[0][1])
+    columns = resolve(text.source, asked, table.header, width, units, hint)
     numeric = [c for c in columns if not c.target.is_text]
     cells = NumberCells(
         settings.decimal or "auto",
         settings.thousands or "none",
         settings.missing or (),
-        (row[c.index[0]] for _, row in rows.rows[:DECIMAL_SAMPLE]
+        (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
          for c in numeric if c.index[0] < len(row)),
     )  # fmt: skip
     reader = _Reader(text.source, columns, cells, _formats(source))
-    for number, row in rows.rows:
+    for number, row in table.rows:
         reader.add(number, row)
     if not reader.line:
         number, reason = reader.ignored[0]
         raise InputError(
-            f"{text.source}: none of its {len(rows.rows)} rows is complete (line {number}: "
+            f"{text.source}: none of its {len(table.rows)} rows is complete (line {number}: "
             f"{reason}); correct the places in [source.columns]"
         )
     used = {i for c in columns for i in c.index}
@@ -126,23 +120,22 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         preset=source.preset,
         role=source.role or "both",
         encoding=text.encoding,
-        layout=_layout(settings, table),
+        layout=_layout(table),
         decimal=cells.decimal,
         columns=tuple((c.header, _filled(c), c.unit) for c in columns),
         unused=tuple(
-            name or f"column {i + 1}" for i, name in enumerate(rows.header) if i not in used
+            name or f"column {i + 1}" for i, name in enumerate(table.header) if i not in used
         ),
         rows=len(reader.line),
-        ignored=tuple(sorted([*rows.ignored, *reader.ignored])),
+        ignored=tuple(sorted([*table.ignored, *reader.ignored])),
     )
     return reader.records(understood, source)
 
 
-def _table(text: Text, settings: TextTable, asked: Wanted) -> FoundTable:
+def _table(text: Text, settings: TextTable, asked: Wanted) -> Rows:
     kind = settings.format or "table"
     if kind != "table":
-        rows = (krl_rows if kind == "krl" else rapid_rows)(text)
-        return FoundTable(rows, 0, kind, ())
+        return (krl_rows if kind == "krl" else rapid_rows)(text)
     guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
     places = [at for t, at in asked.required if not t.is_text and isinstance(at, int)]
 
@@ -154,15 +147,15 @@ def _table(text: Text, settings: TextTable, asked: Wanted) -> FoundTable:
 
     table = table_rows(text, settings, is_header if asked.by_name else None, is_data)
     if asked.by_name and not table.header_line:
-        raise no_header(text.source, asked, table.rows.rows[:SAMPLE])
+        raise no_header(text.source, asked, table.rows[:SAMPLE])
     return table
 
 
-def _layout(settings: TextTable, table: FoundTable) -> str:
-    if (settings.format or "table") != "table":
-        return {"krl": "KRL", "rapid": "RAPID"}[table.delimiter]
+def _layout(table: Rows) -> str:
+    if table.split_at in ("KRL", "RAPID"):
+        return table.split_at
     head = f"header in line {table.header_line}" if table.header_line else "no header"
-    mark = {"tab": "tabs", "space": "blanks"}.get(table.delimiter, f"{table.delimiter!r}")
+    mark = {"tab": "tabs", "space": "blanks"}.get(table.split_at, f"{table.split_at!r}")
     return f"columns split at {mark}, {head}"
 
 
