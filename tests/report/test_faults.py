@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from elastocal.identification.outlier import Outlier
-from elastocal.identification.robust.report import Finding, OutlierReport
+from elastocal.identification.robust.report import FaultyGroup, OutlierReport
 from elastocal.report.faults import MOST_TOLD, fault_lines
 from elastocal.report.html import report_page
 from elastocal.report.tables import summary_lines
 
-BLOCK = Finding(
+BLOCK = FaultyGroup(
     "block", "142 to 507", "common", tuple(range(366)), tuple(range(142, 508)), 366, 8.8, 8.8,
     1e-12, 23.0, 0,
 )  # fmt: skip
@@ -24,7 +24,7 @@ def outliers(lines: range, residual: float = 4.5e-3) -> tuple[Outlier, ...]:
     return tuple(Outlier(line, "7", "M1", residual, 9.0) for line in lines)
 
 
-def with_findings(result: Any, *findings: Finding, named: bool = True, **to: Any) -> Any:
+def with_findings(result: Any, *findings: FaultyGroup, named: bool = True, **to: Any) -> Any:
     n = len(result.determined)
     good = np.ones(len(result.observations.lead), dtype=bool)
     names = tuple(result.determined) if named else ()

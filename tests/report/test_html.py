@@ -91,7 +91,7 @@ def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:
         observations=observe(seen.table.take(rows), seen.kind),
         residual=np.tile(case.result.residual, times),
         held_out=np.tile(case.result.held_out, times),
-        noise={**case.result.noise, "kind": "none"},
+        noise=replace(case.result.noise, kind="none"),
     )
     write_report(long, tmp_path / "r.html")
     assert (tmp_path / "r.html").stat().st_size < 6e6

@@ -24,7 +24,7 @@ from elastocal.report.tables import (
     print_result,
     summary_lines,
 )
-from elastocal.report.trust import SECTIONS, judgement, without_sections
+from elastocal.report.trust import SECTIONS, judgement
 from elastocal.report.words import (
     combination_truth,
     inside,
@@ -139,8 +139,14 @@ def test_the_terminal_ends_with_the_verdict_of_the_page_and_what_to_do(case: Any
     assert f"Verdict: {judged.headline}" in words
     assert judged.steps
     assert words.count("Next: ") == len(judged.steps)
-    assert all(without_sections(step) in words for step in judged.steps)
-    assert not any(section in words for section in SECTIONS)
+    assert all(step in words for step in judged.steps)
+    assert not any(f"({section})" in words for _, section in SECTIONS.values())
+
+
+def test_steps_name_the_sections_of_the_page_only_where_there_is_one(case: Any) -> None:
+    found = judgement(case.result, sections=True)
+    assert any("(What is not determined)" in step for step in found.steps)
+    assert len(found.steps) == len(judgement(case.result).steps)
 
 
 def test_summary_in_words(case: Any) -> None:

@@ -12,7 +12,7 @@ import tomli_w
 
 from elastocal.cell import Cell
 from elastocal.cell_reader import read_cell
-from elastocal.diagnosis.result import Finding
+from elastocal.diagnosis.result import FoundEffect
 from elastocal.files import atomic_write_text
 
 # Tables of the cell file, and the keys in them whose values are paths.  A list of tables counts
@@ -29,7 +29,7 @@ PATHS = (
 def write_extended_cell(
     source: str | Path,
     target: str | Path,
-    found: Sequence[Finding],
+    found: Sequence[FoundEffect],
     model_keys: Mapping[str, str] | None = None,
 ) -> Cell:
     """Write the cell file `source` to `target` with the effects `found` switched on; read it back.
@@ -54,7 +54,7 @@ def write_extended_cell(
     return read_cell(target)
 
 
-def _switch_on(model: dict[str, Any], found: Sequence[Finding]) -> None:
+def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
     effects = model.setdefault("effects", [])
     for f in found:
         if (entry := f"{f.effect}:{f.where}") not in effects:

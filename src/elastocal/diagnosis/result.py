@@ -7,6 +7,7 @@ from typing import Literal
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.separate.result import ExtraPlan
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.manipulator.effects.base import Stage
 from elastocal.notebook import ForNotebooks
 
@@ -33,7 +34,7 @@ class FittedParameter:
 
 
 @dataclass(frozen=True)
-class Finding:
+class FoundEffect:
     """An effect held to be real (or, where the verdict is ambiguous, the likeliest of a set).
 
     `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
@@ -77,15 +78,6 @@ class Untested:
     where: str
     reason: str
     advice: str
-
-
-@dataclass(frozen=True)
-class Step:
-    """A step of the gap budget: 3-D rms error (m) on configurations left out of the fit."""
-
-    step: str
-    heldout_rms: float
-    ci95: Interval
 
 
 @dataclass(frozen=True)
@@ -179,8 +171,8 @@ class Diagnosis(ForNotebooks):
 
     verdict: Verdict
     gap: Gap
-    budget: tuple[Step, ...]
-    effects: tuple[Finding, ...]
+    budget: tuple[BudgetStep, ...]
+    effects: tuple[FoundEffect, ...]
     candidates: tuple[Candidate, ...]
     indistinguishable: tuple[tuple[EffectAt, ...], ...]
     location: Location | None

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from elastocal.identification.advice import warnings_for
 from elastocal.identification.faulty_report import report_faulty
+from elastocal.identification.findings import judged, of_solution, warning_sentences
 from elastocal.identification.heldout import rms_3d
 from elastocal.identification.intervals import Intervals
 from elastocal.identification.methods import Found, is_exact
-from elastocal.identification.noise_summary import noise_summary
+from elastocal.identification.noise_summary import noise_of
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
 from elastocal.identification.result import (
     Combination,
@@ -49,7 +49,7 @@ def summarise(
     result = IdentificationResult(
         model=model,
         method=found.method,
-        noise=noise_summary(found, sigma),
+        noise=noise_of(found, sigma),
         estimates=estimates,
         combinations=combinations,
         x=final.x,
@@ -76,8 +76,8 @@ def summarise(
         active=found.active,
         prior_share=found.prior_share,
     )
-    result = warnings_for(result, solution)
-    return replace(result, warnings=found.warnings + result.warnings)
+    result = judged(result, of_solution(result, solution))
+    return replace(result, warnings=found.warnings + warning_sentences(result))
 
 
 def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSummary | None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from elastocal.identification.checks import check_rows, check_table, fixed_and_free
 from elastocal.identification.chunked import residual_at
 from elastocal.identification.estimates import summarise
+from elastocal.identification.findings import judged
 from elastocal.identification.heldout import rms_3d
 from elastocal.identification.methods import is_exact, run_method
 from elastocal.identification.noise import Weights, scaled_by_component, weights_for
@@ -72,7 +73,9 @@ def identify(
     progress("intervals and held-out residuals")
     beyond = describe(whole, found.solution, ~found.good)
     result = summarise(model, whole, clean, found, beyond)
-    return result if test is None else replace(result, test=_test_errors(model, result.x, test))
+    if test is None:
+        return result
+    return judged(replace(result, test=_test_errors(model, result.x, test)))
 
 
 def _silent(message: str) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from elastocal.diagnosis.result import Diagnosis, Finding, Interval, Step
+from elastocal.diagnosis.result import Diagnosis, FoundEffect, Interval
 from elastocal.diagnosis.separate.result import ExtraPlan
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.report.diagnosis_verdict import hidden_below
 from elastocal.report.diagnosis_words import (
     driver_name,
@@ -32,7 +33,7 @@ Rows = list[tuple[str, ...]]
 HALF_WIDTHS = 1.959964  # standard deviations in half a 95 % interval
 
 
-def error_steps(d: Diagnosis) -> tuple[Step, ...]:
+def error_steps(d: Diagnosis) -> tuple[BudgetStep, ...]:
     """The steps of the gap budget that are models; the noise floor is none."""
     return tuple(step for step in d.budget if step.step != "noise_floor")
 
@@ -72,7 +73,7 @@ def candidate_rows(d: Diagnosis, most: int) -> Rows:
     ]
 
 
-def parameter_rows(findings: Sequence[Finding]) -> Rows:
+def parameter_rows(findings: Sequence[FoundEffect]) -> Rows:
     """Fitted parameters of the effects found, with 95 % half widths, and their settings."""
     rows: Rows = []
     for f in findings:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from elastocal.diagnosis.result import Curve, Diagnosis, Finding, Location
+from elastocal.diagnosis.result import Curve, Diagnosis, FoundEffect, Location
 from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.report.diagnosis_words import (
     STAGES,
@@ -107,7 +107,7 @@ def _error_lines(d: Diagnosis) -> list[str]:
     return [f"{text} Of the noise-free error of fresh poses {together(each)}."]
 
 
-def _finding_line(d: Diagnosis, f: Finding) -> tuple[str, str]:
+def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:
     """An effect beside the open question, or the likeliest answer to it."""
     open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
     label = "Likeliest" if (f.effect, f.where) in open_sets else "Besides"

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from elastocal.diagnosis.result import Candidate, EffectAt, Finding, NoiseFloor
+from elastocal.diagnosis.result import Candidate, EffectAt, FoundEffect, NoiseFloor
 from elastocal.report.units import length, significant
 from elastocal.report.words import printable
 
@@ -37,7 +37,7 @@ def place(where: str) -> str:
     return re.sub(r"^([a-z]+)([0-9]+)$", r"\1 \2", printable(where))
 
 
-def effect_at(e: EffectAt | Finding | Candidate) -> str:
+def effect_at(e: EffectAt | FoundEffect | Candidate) -> str:
     """ "gear eccentricity at joint 2", "base drift", "marker slip of marker M1"."""
     name = plain_name(e.effect)
     if e.where in SINGLE:
@@ -93,7 +93,7 @@ def percent(fraction: float) -> str:
     return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
 
 
-def reduction(f: Finding) -> str:
+def reduction(f: FoundEffect) -> str:
     """ "75 % (63 to 84 %)"."""
     low, high = f.gap_reduction_ci95
     if not (math.isfinite(low) and math.isfinite(high)):

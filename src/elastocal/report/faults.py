@@ -6,7 +6,7 @@ import math
 from statistics import median
 
 from elastocal.identification.result import IdentificationResult
-from elastocal.identification.robust.report import Finding
+from elastocal.identification.robust.report import FaultyGroup
 from elastocal.report.method import method_of
 from elastocal.report.units import length, significant
 from elastocal.report.words import printable
@@ -38,7 +38,7 @@ def false_alarm_line(result: IdentificationResult) -> str | None:
     return f"Of tables in which nothing is wrong, at most {share:g} % would yield any finding."
 
 
-def _sentence(result: IdentificationResult, finding: Finding) -> str:
+def _sentence(result: IdentificationResult, finding: FaultyGroup) -> str:
     n, beyond = len(finding.lines), finding.beyond
     how = "err in common by" if finding.pattern == "common" else "scatter by"
     size, noise = _metres(result, finding), f"{significant(finding.sigmas, 2)} times the noise"
@@ -49,7 +49,7 @@ def _sentence(result: IdentificationResult, finding: Finding) -> str:
     return f"{text}{_influence(result, finding)}."
 
 
-def _metres(result: IdentificationResult, finding: Finding) -> float | None:
+def _metres(result: IdentificationResult, finding: FaultyGroup) -> float | None:
     """Typical error in m, None where most of the readings are not listed one by one.
 
     The median where they err in common, which those that do not leave alone; else the rms.  Where
@@ -67,7 +67,7 @@ def _metres(result: IdentificationResult, finding: Finding) -> float | None:
     return math.sqrt(sum(r * r for r in listed) / len(listed))
 
 
-def _influence(result: IdentificationResult, finding: Finding) -> str:
+def _influence(result: IdentificationResult, finding: FaultyGroup) -> str:
     """What they do, or would do if fitted along, to the parameter that they move most."""
     names = () if result.faulty_report is None else result.faulty_report.names
     name = printable(names[finding.column]) if names else "a parameter"
@@ -78,7 +78,7 @@ def _influence(result: IdentificationResult, finding: Finding) -> str:
     return f"; {how} {name} by {count} standard deviation{'' if count == '1.0' else 's'}"
 
 
-def _bends(result: IdentificationResult, finding: Finding) -> bool:
+def _bends(result: IdentificationResult, finding: FaultyGroup) -> bool:
     """Whether the readings have their full weight in the fit."""
     apart = {o.line for o in result.excluded} & set(finding.lines)
     return method_of(result) in FULL_WEIGHT and not apart

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from elastocal.files import atomic_write_text
+from elastocal.identification.error_budget import ErrorBudget, gap_budget
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.result import IdentificationResult, Outlier
 from elastocal.report import identification_figures
 from elastocal.report.faults import false_alarm_line, fault_lines
-from elastocal.report.gap_budget import Budget, gap_budget
 from elastocal.report.method import intervals_line, method_and_weights
 from elastocal.report.noise import (
     candidate_rows,
@@ -101,7 +101,7 @@ def _contents(
         verdict.append(("Truth", coverage_line(result, truth)))
     figures = identification_figures.drawn_for(result, residuals, summary, budget, space)
     return {
-        "judgement": judgement(result),
+        "judgement": judgement(result, sections=True),
         "compared": truth is not None,
         "published": bool(published),
         "lopsided": any_lopsided((*result.estimates, *result.combinations)),
@@ -113,7 +113,7 @@ def _contents(
         **_noise(result, summary),
         "error_line": _sentence(error_line(result)),
         "warnings": [printable(w) for w in result.warnings],
-        "budget": None if budget is None else budget_table(budget),
+        "budget": None if budget is None else budget_table(result, budget),
         "floor": _floor(budget),
         "parameters": parameter_rows(result, truth, published),
         "combinations": combination_rows(result, truth),
@@ -135,7 +135,7 @@ def _contents(
     }
 
 
-def _floor(budget: Budget | None) -> str:
+def _floor(budget: ErrorBudget | None) -> str:
     if budget is None or budget.floor is None:
         return "Nothing says how large the noise alone is."
     return f"The dashed line is what noise alone gives ({budget.floor_name})."

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.result import IdentificationResult
-from elastocal.report.gap_budget import Budget
 from elastocal.report.residuals import Residuals
 from elastocal.report.space import Space
 
@@ -13,12 +13,13 @@ def drawn_for(
     result: IdentificationResult,
     residuals: Residuals,
     summary: ResidualSummary | None,
-    budget: Budget | None,
+    budget: ErrorBudget | None,
     space: Space,
 ) -> dict[str, str]:
     """Name → SVG."""
     from elastocal.report import figures, noise_figures, place_figures
     from elastocal.report.residual_space import marker_positions
+    from elastocal.report.rows import budget_steps
     from elastocal.report.space_picture import space_picture
     from elastocal.report.waterfall import waterfall
 
@@ -29,11 +30,10 @@ def drawn_for(
         "histograms": noise_figures.histograms_by_group(summary),
     }  # fmt: skip
     positions = marker_positions(result.model, result.observations, result.x)
-    steps = () if budget is None else budget.steps
     return {
         **distribution,
         "waterfall": "" if budget is None else waterfall(
-            [(step.name, step.rms, step.ci95) for step in steps], budget.floor, budget.floor_name
+            budget_steps(result, budget), budget.floor, budget.floor_name
         ),
         "errors": figures.errors(result),
         "held_out": figures.held_out(result, residuals),

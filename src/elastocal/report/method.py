@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.result import IdentificationResult
 from elastocal.report.units import display, plain
@@ -112,9 +110,9 @@ def method_and_weights(result: IdentificationResult) -> str:
     if method == "constrained":
         return _constrained(result)
     text = METHODS.get(method, printable(method))
-    if method in SAID or noise["kind"] == "none":
+    if method in SAID or noise.kind == "none":
         return text
-    return f"{text}, {printable(str(noise['description']))}"
+    return f"{text}, {printable(noise.description)}"
 
 
 def _constrained(result: IdentificationResult) -> str:
@@ -123,21 +121,14 @@ def _constrained(result: IdentificationResult) -> str:
     text = "fit with a prior" if prior else "fit under constraints"
     text += " and under constraints" if prior and active else ""
     noise = result.noise
-    if noise["kind"] == "none":
+    if noise.kind == "none":
         return f"{text}, all readings weighted alike"
-    how = "weights estimated by restricted likelihood (REML): " if noise.get("variances") else ""
-    return f"{text}, {how}{printable(str(noise['description']))}"
+    how = "weights estimated by restricted likelihood (REML): " if noise.estimated else ""
+    return f"{text}, {how}{printable(noise.description)}"
 
 
 def interval_kind(result: IdentificationResult) -> str:
-    found: dict[str, Any] = result.noise.get("intervals") or {"kind": "classical"}
-    return str(found["kind"]).lower()
-
-
-def takes_configurations_as_a_whole(result: IdentificationResult) -> bool:
-    """Whether the intervals hold where the readings of a configuration are correlated."""
-    kind = interval_kind(result)
-    return kind in ("wild", "clustered") or kind.startswith("cr")
+    return result.noise.interval_kind.lower()
 
 
 def intervals_line(result: IdentificationResult) -> str:
@@ -150,7 +141,7 @@ def intervals_line(result: IdentificationResult) -> str:
         return f"{text} and {LARGE[kind]}" if kind in LARGE else text
     if kind in ("h1", "h2", "h3"):
         return ROBUST.format(kind.upper())
-    description = result.noise["intervals"].get("description", "")
+    description = result.noise.interval_description
     return printable(f"{kind}: {description}" if description else kind)
 
 

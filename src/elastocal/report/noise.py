@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from scipy import stats
 
+from elastocal.identification.findings import shape_of
+from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
 from elastocal.identification.result import IdentificationResult
 from elastocal.identification.variance.choose import SHARED
-from elastocal.report.method import method_of, takes_configurations_as_a_whole
+from elastocal.report.method import method_of
 from elastocal.report.units import length, significant
 from elastocal.report.words import printable
 from elastocal.tracker_noise import available_noise
 
 FEW = 6  # sizes that are named one by one; of more, the range and the extremes
 MOST_GROUPS = 4
-LACK_OF_FIT = 0.01
-NOT_NORMAL = 0.01
 TURNED = ("rx", "ry", "rz", "rotation", "angular")  # sizes in rad
 
 KINDS = {
@@ -29,31 +26,45 @@ KINDS = {
     "polar": "range and transverse sizes of the tracker",
     "stated": "stated noise × factor",
 }
+COMPARED = (
+    "residual_above_stated_noise",
+    "residual_agrees_with_stated_noise",
+    "residual_below_stated_noise",
+)
+SHAPES = {
+    "residuals_skew": "errors lean to one side, as an effect that the model lacks would make them.",
+    "residuals_heavy_tailed": (
+        "far readings are more frequent. A robust method (huber, tukey, student-t) shows "
+        "whether the estimates depend on them."
+    ),
+    "residuals_light_tailed": "far readings are rarer, as with rounded or selected readings.",
+}
 
 
 def does_noise_explain_it(result: IdentificationResult) -> str:
-    """Residual against stated noise, judged by the χ² distribution of its mean square."""
-    ratio = result.noise.get("ratio_to_stated")
-    if ratio is None:
-        sigma, method = result.noise.get("sigma_um"), method_of(result)
+    """Residual against stated noise, as the finding has it."""
+    f = result.finding(*COMPARED)
+    if f is None:
+        sigma, method = result.noise.sigma, method_of(result)
         size = ""
         if sigma is not None and method == "ols":
-            size = f"; the residual amounts to {length(sigma * 1e-6)} per coordinate"
+            size = f"; the residual amounts to {length(sigma)} per coordinate"
         elif _is_estimated(result):
             size = "; the size of the noise was estimated from the readings"
         return f"{_why_not_judged(result)}{size}."
-    low, high = np.sqrt(stats.chi2.ppf([0.025, 0.975], result.dof) / result.dof)
-    band = f"chance alone gives {low:.2f} to {high:.2f}"
-    size = f"{significant(ratio)} times the stated noise; {band}"
-    if ratio > high:
+    size = (
+        f"{significant(f.number('ratio'))} times the stated noise; chance alone gives "
+        f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
+    )
+    if f.kind == "residual_agrees_with_stated_noise":
+        return f"The residual agrees with the stated noise ({size})."
+    if f.kind == "residual_above_stated_noise":
         text = (
             f"The residual is larger than the stated noise explains ({size}): something is "
             "unmodelled, or the noise is larger than stated."
         )
-    elif ratio < low:
-        text = f"The residual is smaller than the stated noise ({size}): it was stated too large."
     else:
-        return f"The residual agrees with the stated noise ({size})."
+        text = f"The residual is smaller than the stated noise ({size}): it was stated too large."
     if _is_estimated(result):
         text += " Weights and intervals follow the noise that the readings show."
     return text
@@ -61,7 +72,7 @@ def does_noise_explain_it(result: IdentificationResult) -> str:
 
 def _is_estimated(result: IdentificationResult) -> bool:
     """Whether the weights come from a noise model with estimated variances."""
-    return method_of(result) in ("reml", "constrained") and bool(result.noise.get("variances"))
+    return method_of(result) in ("reml", "constrained") and result.noise.estimated
 
 
 def _why_not_judged(result: IdentificationResult) -> str:
@@ -74,7 +85,7 @@ def _why_not_judged(result: IdentificationResult) -> str:
     if seen.kind == "pose" and stated != (tracker.rotation_sigma is not None):
         which = "positions" if stated else "rotations"
         return f"Noise was stated for {which} only, {nothing_says}"
-    if stated or result.noise["kind"] == "covariance":
+    if stated or result.noise.kind == "covariance":
         return "The residual was not compared with the stated noise"
     return f"No noise was stated, {nothing_says}"
 
@@ -82,10 +93,10 @@ def _why_not_judged(result: IdentificationResult) -> str:
 def noise_model_line(result: IdentificationResult) -> str | None:
     """The estimated noise model with its sizes, and why it was chosen."""
     noise = result.noise
-    sizes, reason = size_rows(noise), noise.get("reason")
+    sizes, reason = size_rows(noise), noise.reason
     if not sizes and not reason:
         return None
-    text = printable(str(noise["description"]))
+    text = printable(noise.description)
     text = text[:1].upper() + text[1:]
     if sizes:
         text += ": " + "; ".join(f"{name} {size}" for name, size in sizes)
@@ -94,34 +105,34 @@ def noise_model_line(result: IdentificationResult) -> str | None:
         second, _, gap = candidates[1]
         n = len(candidates)
         reason = f"smallest information criterion of {n} models, next {second} (+{gap})"
-    return f"{text}. Chosen: {printable(str(reason))}." if reason else f"{text}."
+    return f"{text}. Chosen: {printable(reason)}." if reason else f"{text}."
 
 
-def size_rows(noise: dict[str, Any]) -> list[tuple[str, str]]:
+def size_rows(noise: Noise) -> list[tuple[str, str]]:
     """Name and standard deviation of every noise component; of many, the two extremes."""
-    sizes = noise.get("variances") or []
-    shared = [s for s in sizes if str(s["name"]).startswith("common to each")]
-    own = [s for s in sizes if s not in shared]
+    sizes = noise.sizes or ()
+    shared = [s for s in sizes if s.shared]
+    own = [s for s in sizes if not s.shared]
     if len(own) <= FEW:
-        return [(printable(str(s["name"])), _size(s)) for s in [*own, *shared]]
+        return [(printable(s.name), _size(s)) for s in [*own, *shared]]
     ordered = sorted(own, key=_number)
     middle = ordered[len(ordered) // 2]
     named = [("smallest", ordered[0]), ("largest", ordered[-1])]
     return [
         (f"median of {len(own)}", _size(middle)),
-        *((f"{which} ({printable(str(s['name']))})", _size(s)) for which, s in named),
-        *((printable(str(s["name"])), _size(s)) for s in shared),
+        *((f"{which} ({printable(s.name)})", _size(s)) for which, s in named),
+        *((printable(s.name), _size(s)) for s in shared),
     ]
 
 
-def candidate_rows(noise: dict[str, Any]) -> list[tuple[str, str, str]]:
+def candidate_rows(noise: Noise) -> list[tuple[str, str, str]]:
     """Noise models that were tried, best first: words, variances, criterion above the best."""
-    tried = sorted(noise.get("tried") or [], key=lambda t: t["criterion"])
+    tried = sorted(noise.tried or (), key=lambda t: t.criterion)
     return [
         (
-            kind_in_words(str(t["kind"])),
-            str(t["variances"]),
-            f"{t['criterion'] - tried[0]['criterion']:.1f}",
+            kind_in_words(t.kind),
+            str(t.n_variances),
+            f"{t.criterion - tried[0].criterion:.1f}",
         )
         for t in tried
     ]
@@ -134,24 +145,29 @@ def kind_in_words(kind: str) -> str:
 
 def repeats_line(result: IdentificationResult) -> str | None:
     """The lack-of-fit test, and what follows from it for the intervals; None without repeats."""
-    found = result.noise.get("lack_of_fit")
-    if found is None:
+    f = result.finding("lack_of_fit", "repeats_agree")
+    if f is None:
         return None
     numbers = (
-        f"lack of fit: F = {found['F']:.2f} on {found['dof_between']} and {found['dof_pure']} "
-        f"degrees of freedom, {_p(found['p'])}"
+        f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
+        f"{f.numbers['dof_pure']} degrees of freedom, {_p(f.number('p'))}"
     )
-    included = str(result.noise["kind"]).endswith(SHARED)
-    if found["p"] >= LACK_OF_FIT:
+    counted = f.numbers["counted_by"]
+    if f.kind == "repeats_agree":
         text = f"Repeats agree with the scatter between configurations ({numbers})"
+        if counted == "the noise model":
+            return (
+                f"{text}: the test shows no common deviation. The noise model, chosen by its "
+                "criterion, has one; the intervals include it."
+            )
         return f"{text}: readings of one configuration bear no common deviation worth counting."
     text = (
         f"Configurations scatter more than repeats of one explain ({numbers}): the arm does not "
         "come back to the same place, or an effect is missing."
     )
-    if included:
+    if counted == "the noise model":
         return f"{text} The noise model has this common deviation; the intervals include it."
-    if takes_configurations_as_a_whole(result):
+    if counted == "the intervals":
         return f"{text} The intervals take each configuration as a whole and include it."
     return (
         f"{text} The intervals do not include it and are too narrow: use the default method, whose "
@@ -161,15 +177,18 @@ def repeats_line(result: IdentificationResult) -> str | None:
 
 def shape_line(summary: ResidualSummary) -> str:
     """Are the standardised residuals normal, and does any group scatter unlike the model?"""
-    whole = summary.whole
-    numbers = f"skewness {whole.skewness:+.2f}, excess kurtosis {whole.excess_kurtosis:+.2f}"
-    p = whole.normality_p
-    if p is None:
+    f = shape_of(summary)
+    numbers = (
+        f"skewness {f.number('skewness'):+.2f}, excess kurtosis {f.number('excess_kurtosis'):+.2f}"
+    )
+    if f.kind == "residuals_too_few":
         text = f"Too few values to judge whether residuals are normal ({numbers})."
-    elif p >= NOT_NORMAL:
-        text = f"Standardised residuals agree with a normal distribution ({numbers}, {_p(p)})."
+    elif f.kind == "residuals_normal":
+        numbers += f", {_p(f.number('p'))}"
+        text = f"Standardised residuals agree with a normal distribution ({numbers})."
     else:
-        text = f"Standardised residuals are not normal ({numbers}, {_p(p)})" + _consequence(whole)
+        numbers += f", {_p(f.number('p'))}"
+        text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
     found = sum(g.n_deviating for g in summary.groupings)
     if not found:
         return f"{text} No group of readings scatters more or less than the noise model says."
@@ -188,29 +207,16 @@ def ratio(group: GroupSummary) -> str:
     return significant(float(np.sqrt(group.mean_square)), 2)
 
 
-def _consequence(whole: GroupSummary) -> str:
-    # Of a normal sample, kurtosis has twice the standard deviation of skewness.
-    if abs(whole.skewness) > abs(whole.excess_kurtosis) / 2:
-        return ": errors lean to one side, as an effect that the model lacks would make them."
-    if whole.excess_kurtosis > 0:
-        return (
-            ": far readings are more frequent. A robust method (huber, tukey, student-t) shows "
-            "whether the estimates depend on them."
-        )
-    return ": far readings are rarer, as with rounded or selected readings."
+def _size(s: NoiseSize) -> str:
+    if s.sigma is None:
+        return significant(_number(s))
+    if s.name in TURNED or s.name.endswith("(rotation)"):
+        return f"{significant(s.sigma * 1e6)} µrad"
+    return length(s.sigma)
 
 
-def _size(s: dict[str, Any]) -> str:
-    if s.get("sigma_um") is None:
-        return significant(float(s["factor"]))
-    name = str(s["name"])
-    if name in TURNED or name.endswith("(rotation)"):
-        return f"{significant(float(s['sigma_um']))} µrad"
-    return length(float(s["sigma_um"]) * 1e-6)
-
-
-def _number(s: dict[str, Any]) -> float:
-    return float(s["factor"] if s.get("sigma_um") is None else s["sigma_um"])
+def _number(s: NoiseSize) -> float:
+    return (s.factor or 0.0) if s.sigma is None else s.sigma
 
 
 def _p(p: float) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.noise import weights_for
+from elastocal.identification.noise import WeightKind, weights_for
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
 from elastocal.identification.result import IdentificationResult
 from elastocal.manipulator.observation import COMPONENTS, Observations
@@ -74,18 +75,18 @@ def residuals_by(seen: Observations, residual: Array) -> Residuals:
 
 def summary_of(result: IdentificationResult) -> ResidualSummary | None:
     """The result's own summary of its whitened residuals, else one of the standardised ones."""
-    own: ResidualSummary | None = getattr(result, "residual_summary", None)
-    if own is not None:
-        return own
+    if result.residual_summary is not None:
+        return result.residual_summary
     return summarise_residuals(result.observations, standardised(result), absolute=False)
 
 
 def standardised(result: IdentificationResult) -> Array:
     """Weighted residuals (rows,) over their standard deviation; unweighted where the result does
     not hold the weights: those of a given matrix or of an estimated noise."""
-    seen, kind = result.observations, result.noise["kind"]
+    seen, kind = result.observations, result.noise.kind
     if result.method == "wls" and kind in ("rows", "axis", "polar"):
-        whitened = weights_for(seen, result.model.cell.tracker, kind).apply(result.residual)
+        weights = weights_for(seen, result.model.cell.tracker, cast(WeightKind, kind))
+        whitened = weights.apply(result.residual)
         return np.asarray(whitened) / result.sigma
     parts = result.residual.reshape(-1, seen.size)
     spread = np.sqrt((parts**2).mean(axis=0))

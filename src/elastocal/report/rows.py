@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.result import (
     LOPSIDED,
     Combination,
     Estimate,
     IdentificationResult,
 )
-from elastocal.report.gap_budget import Budget
 from elastocal.report.page import Table
 from elastocal.report.units import (
     display,
@@ -23,6 +23,7 @@ from elastocal.report.units import (
     rounded_alike,
     with_ends,
 )
+from elastocal.report.verdict import nominal_arm_held_out
 from elastocal.report.words import (
     Truth,
     combination_truth,
@@ -107,14 +108,22 @@ def _published(found: tuple[float, float] | None, unit: str) -> str:
     return f"{minus(value)} ± {half}"
 
 
-def budget_table(budget: Budget) -> Table:
+def budget_steps(
+    result: IdentificationResult, budget: ErrorBudget
+) -> list[tuple[str, float, tuple[float, float]]]:
+    """Name, held-out rms (m) and its 95 % interval of every step."""
+    named = {"nominal_arm": nominal_arm_held_out(result)}
+    return [(named.get(s.step, s.step), s.heldout_rms, s.ci95) for s in budget.steps]
+
+
+def budget_table(result: IdentificationResult, budget: ErrorBudget) -> Table:
     """The steps with their intervals and what each changes; noise alone last."""
     rows: list[tuple[str, ...]] = []
     before: float | None = None
-    for step in budget.steps:
-        change = "" if before is None else signed_change(step.rms - before)
-        rows.append((step.name, length(step.rms), " to ".join(map(length, step.ci95)), change))
-        before = step.rms
+    for name, rms, ci95 in budget_steps(result, budget):
+        change = "" if before is None else signed_change(rms - before)
+        rows.append((name, length(rms), " to ".join(map(length, ci95)), change))
+        before = rms
     if budget.floor is not None:
         rows.append((budget.floor_name, length(budget.floor), "", ""))
     return Table(("model", "held-out rms", "95 %", "change"), rows)

@@ -10,7 +10,7 @@ from elastocal.identification.result import Combination, Estimate, Identificatio
 from elastocal.report.console_table import titled
 from elastocal.report.noise import candidate_rows, size_rows
 from elastocal.report.rows import any_lopsided, half_head, signed_half, texts
-from elastocal.report.trust import judgement, without_sections
+from elastocal.report.trust import judgement
 from elastocal.report.units import display, plain
 from elastocal.report.verdict import summary_lines
 from elastocal.report.words import (
@@ -134,7 +134,7 @@ def print_result(
     judged = judgement(result)
     console.print(Text.assemble(("Verdict: ", "bold"), printable(judged.headline)))
     for step in judged.steps:
-        console.print(Text.assemble(("Next: ", "bold"), printable(without_sections(step))))
+        console.print(Text.assemble(("Next: ", "bold"), printable(step)))
 
 
 def _table(title: str, first: str, truth: Truth | None, brief: bool, lopsided: bool) -> Table:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from elastocal.identification.error_budget import stage_of
 from elastocal.identification.result import IdentificationResult
 from elastocal.report.faults import MOST_TOLD, fault_lines
 from elastocal.report.method import (
@@ -33,8 +34,6 @@ from elastocal.report.words import (
 )
 
 MOST_CORRELATIONS = 8
-# Held-out errors this much above the fitted ones mean that the fit flatters itself.
-FLATTERS = 1.2
 READINGS = {
     "position": "position readings",
     "deflection": "deflections (loaded minus unloaded readings)",
@@ -80,7 +79,7 @@ def how_well_it_predicts(result: IdentificationResult) -> str:
         elif math.isfinite(nominal):
             text += f", no better than the nominal arm ({length(nominal)})"
         text += "."
-        if held > FLATTERS * result.residual_rms:
+        if result.finding("fit_flatters") is not None:
             text += (
                 f" The fitted poses look better ({length(result.residual_rms)}) than unseen ones: "
                 "more poses would help."
@@ -100,8 +99,17 @@ def how_well_it_predicts(result: IdentificationResult) -> str:
 
 
 def nominal_arm(result: IdentificationResult) -> str:
-    placed = any(p.effect in ("base_frame", "marker_position") for p in result.model.parameters)
-    return "nominal arm (base and markers placed)" if placed else "nominal arm"
+    """The nominal arm as `nominal_rms` has it: placed by all readings."""
+    return "nominal arm (base and markers placed)" if _placed(result) else "nominal arm"
+
+
+def nominal_arm_held_out(result: IdentificationResult) -> str:
+    """The nominal arm as the gap budget has it: each configuration under the others' placing."""
+    return "nominal arm (base and markers by other poses)" if _placed(result) else "nominal arm"
+
+
+def _placed(result: IdentificationResult) -> bool:
+    return any(stage_of(p.effect) == 0 for p in result.model.parameters)
 
 
 def rms_by_kind(result: IdentificationResult) -> list[tuple[str, float]]:
@@ -158,7 +166,7 @@ def coverage_line(result: IdentificationResult, truth: Truth) -> str:
 
 def noise_lines(result: IdentificationResult) -> list[tuple[str, str]]:
     """Label and sentence: estimated noise model, repeats, shape of the residuals."""
-    summary = getattr(result, "residual_summary", None)
+    summary = result.residual_summary
     found = [
         ("Noise model", noise_model_line(result)),
         ("Repeats", repeats_line(result)),

@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+from elastocal.identification.findings import (
+    ABSORBED,
+    ALONE,
+    COMBINED,
+    FIXED,
+    INVISIBLE,
+    standings,
+)
 from elastocal.identification.result import (
     Combination,
     Estimate,
@@ -10,8 +18,7 @@ from elastocal.identification.result import (
 )
 from elastocal.report.units import significant
 
-# How a parameter stands, in the order in which they are told.
-ALONE, COMBINED, ABSORBED, INVISIBLE, FIXED = "alone", "combined", "absorbed", "invisible", "fixed"
+__all__ = ["ABSORBED", "ALONE", "COMBINED", "FIXED", "INVISIBLE", "standings"]
 LARGEST_TERMS = 4
 
 Truth = dict[str, float]
@@ -26,22 +33,6 @@ def short_name(name: str, most: int = 12) -> str:
     """A printable name that fits a figure's axis."""
     text = printable(name)
     return text if len(text) <= most else text[: most - 1] + "…"
-
-
-def standings(result: IdentificationResult) -> dict[str, str]:
-    """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, INVISIBLE or FIXED."""
-    first = {next(iter(c.terms)) for c in result.combinations}
-
-    def standing(e: Estimate) -> str:
-        if e.identifiable:
-            return ALONE
-        if e.name in first:
-            return COMBINED
-        if e.combined_with:
-            return ABSORBED
-        return FIXED if e.note.startswith("fixed") else INVISIBLE
-
-    return {e.name: standing(e) for e in result.estimates}
 
 
 def names_of(result: IdentificationResult, standing: str) -> list[str]:
