@@ -29,8 +29,8 @@ from elastocal.diagnosis.result import EffectAt, NoiseFloor
 from elastocal.report.diagnosis_rows import budget_rows, candidate_rows, untested_rows
 from elastocal.report.diagnosis_verdict import (
     headline,
-    hidden_below,
     next_steps,
+    seen_from,
     sensitivity,
     verdict_lines,
 )
@@ -74,7 +74,7 @@ def test_an_ambiguous_verdict_names_the_whole_set_and_the_way_out():
     )
     assert "explain" not in text
     assert "Gear eccentricity at joint 2 (probability" not in headline(AMBIGUOUS)
-    assert "--plan" in text
+    assert "(plan)" in text
 
 
 def test_an_effect_that_is_certain_beside_an_open_set_is_told_apart_from_it():
@@ -103,14 +103,15 @@ def test_an_unknown_effect_has_a_place_a_driver_and_a_chance_but_no_name():
     # Tests that the whole family explains by chance are not told as findings.
     assert "joint 3 torque" not in text and "load (p" not in text
     assert not any(effect_at(c) in text for c in UNKNOWN.candidates)
-    assert "--plan" in text
+    assert "(plan)" in text
 
 
 def test_what_is_named_beside_something_unknown_has_to_prove_itself():
     beside = replace(UNKNOWN, effects=EXPLAINED.effects)
-    (step,) = [line for line in next_steps(beside) if "--cell-out" in line]
-    assert all(effect_at(f) in step for f in EXPLAINED.effects) and "--test" in step
-    assert not any("--cell-out" in line for line in next_steps(UNKNOWN))
+    (step,) = [line for line in next_steps(beside) if "(cell_out)" in line]
+    assert "effects named" in step and "(test)" in step
+    assert all(effect_at(f) in headline(beside).lower() for f in EXPLAINED.effects)
+    assert not any("(cell_out)" in line for line in next_steps(UNKNOWN))
 
 
 def test_an_unknown_effect_without_a_place_says_so():
@@ -131,7 +132,7 @@ def test_the_smallest_effect_that_shows_has_distance_five():
     ("d", "text"), [(50.0, "0.10"), (5.0, "1.0"), (0.1, "50"), (0.01, "> 100"), (0.0, "–")]
 )
 def test_a_size_that_no_arm_has_is_not_given_as_a_number(d: float, text: str):
-    assert hidden_below(d) == text
+    assert seen_from(replace(CANDIDATES[0], detectable=d)) == text
 
 
 def test_nothing_says_what_hides_in_the_noise_and_what_does_not():
@@ -146,7 +147,7 @@ def test_nothing_says_what_hides_in_the_noise_and_what_does_not():
 def test_extra_poses_promise_or_say_that_none_helps():
     promise = " ".join(next_steps(replace(AMBIGUOUS, extra=EXTRA)))
     assert "2 more poses" in promise and "from 0.69 to > 0.99" in promise and "0.85" in promise
-    assert "--plan" not in promise
+    assert "(plan)" not in promise
     assert "count as one" not in promise
     grouped = replace(EXTRA, inseparable=(("backlash:joint2", "encoder_scale:joint2"),))
     lines = next_steps(replace(AMBIGUOUS, extra=grouped))

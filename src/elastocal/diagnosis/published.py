@@ -60,6 +60,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "extra_plan": None if d.extra is None else _extra(d.extra),
         "model_keys": d.model_keys,
         "warnings": list(d.warnings),
+        "findings": [f.to_json() for f in d.findings],
         "backend": model.backend_report(),
         "n_readings": d.n_readings,
         "n_configurations": d.n_configurations,

@@ -99,7 +99,7 @@ def _contents(d: Diagnosis, model: Model) -> dict[str, Any]:
     alike = [together([effect_at(e) for e in rivals]) for rivals in d.indistinguishable]
     return {
         "headline": headline(d),
-        "tone": "good" if d.verdict in ("explained", "nothing_significant") else "care",
+        "tone": d.findings[0].severity,
         "verdict": lines,
         "steps": next_steps(d),
         "warnings": [capital(printable(w)) for w in d.warnings],

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from elastocal.diagnosis.result import Diagnosis, FoundEffect, Interval
 from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.identification.error_budget import BudgetStep
-from elastocal.report.diagnosis_verdict import hidden_below
+from elastocal.report.diagnosis_verdict import seen_from
 from elastocal.report.diagnosis_words import (
     driver_name,
     effect_at,
@@ -61,7 +61,7 @@ def candidate_rows(d: Diagnosis, most: int) -> Rows:
             probability(c.probability),
             f"{c.score:+.1f}",
             significant(c.detectable, 2),
-            hidden_below(c.detectable),
+            seen_from(c),
             settings_text(c.settings),
         )
         for c in d.candidates[:most]

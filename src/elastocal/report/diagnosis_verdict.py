@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from elastocal.diagnosis.result import Curve, Diagnosis, FoundEffect, Location
+from elastocal.diagnosis.result import Candidate, Curve, Diagnosis, FoundEffect, Location
 from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.report.diagnosis_words import (
     STAGES,
@@ -23,11 +23,7 @@ from elastocal.report.diagnosis_words import (
 from elastocal.report.units import display, length, significant
 from elastocal.report.words import printable
 
-# A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
-# Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
-SEEN, FAINTEST = 5.0, 3.0
 ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
-STRUCTURE = 0.05  # family-wise p-value from which on a driver is told
 MOST_NAMED = 6
 
 
@@ -79,7 +75,7 @@ def verdict_lines(d: Diagnosis) -> list[tuple[str, str]]:
     if d.verdict == "unknown_effect":
         lines += [("Depends on", text) for text in _dependence(d)]
         lines += [("Shape", _shape(curve)) for curve in d.curves]
-    if d.verdict in ("ambiguous", "unknown_effect"):
+    if d.open:
         lines += [_finding_line(d, f) for f in d.effects]
     if d.verdict == "nothing_significant":
         lines += [("Sensitivity", text) for text in sensitivity(d)]
@@ -117,11 +113,11 @@ def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:
 
 def _dependence(d: Diagnosis) -> list[str]:
     """The drivers that the residual depends on, the strongest first."""
-    found = sorted((t for t in d.structure if t.p_family <= STRUCTURE), key=lambda t: t.p_family)
-    if not found:
+    if not d.dependences:
         return ["no single driver that was tested shows it; see the curves for its shape."]
-    named = [f"{driver_name(t.driver)} ({size_of(t.p_family)})" for t in found[:MOST_NAMED]]
-    more = len(found) - len(named)
+    told = d.dependences[:MOST_NAMED]
+    named = [f"{driver_name(t.driver)} ({size_of(t.p_family)})" for t in told]
+    more = len(d.dependences) - len(named)
     return [together(named) + (f" and {more} more" if more else "") + "."]
 
 
@@ -148,17 +144,14 @@ def sensitivity(d: Diagnosis) -> list[str]:
     if not d.candidates:
         return []
     lines = []
-    # d² = Σ |δ|² / σ² per axis, with a configuration as one reading of the noise floor: more
-    # readings and loads per configuration only make smaller effects visible.
-    independent = 3 * d.n_configurations
-    seen = SEEN * d.gap.noise_floor / math.sqrt(independent) if independent else math.nan
-    if math.isfinite(seen):
+    if math.isfinite(d.smallest_seen):
         lines.append(
-            f"effects that move the markers by more than about {significant(seen * 1e6, 2)} µm "
-            "rms, in a way that the fitted parameters cannot follow, would have been seen."
+            f"effects that move the markers by more than about "
+            f"{significant(d.smallest_seen * 1e6, 2)} µm rms, in a way that the fitted parameters "
+            "cannot follow, would have been seen."
         )
-    visible = [c for c in d.candidates if c.detectable >= SEEN]
-    faint = [c for c in d.candidates if c.detectable < FAINTEST]
+    visible = [c for c in d.candidates if c.visible]
+    faint = [c for c in d.candidates if c.hidden]
     text = f"of {len(d.candidates)} candidates {len(visible)} would have shown at typical size"
     if faint:
         by_effect = dict.fromkeys(plain_name(c.effect) for c in faint)
@@ -169,43 +162,16 @@ def sensitivity(d: Diagnosis) -> list[str]:
     return [*lines, f"{text}."]
 
 
-def hidden_below(detectable: float) -> str:
+def seen_from(c: Candidate) -> str:
     """The size from which an effect would be seen, in typical sizes: "0.4"."""
-    if detectable <= 0:
+    if not math.isfinite(c.seen_from):
         return "–"
-    if detectable * ABSURD < SEEN:
-        return f"> {ABSURD:.0f}"
-    return significant(SEEN / detectable, 2)
+    return f"> {ABSURD:.0f}" if c.seen_from > ABSURD else significant(c.seen_from, 2)
 
 
 def next_steps(d: Diagnosis) -> list[str]:
-    """What to do now."""
-    steps: list[str] = []
-    if d.verdict == "explained":
-        steps.append(
-            "Identify with the cell that --cell-out writes, and check the promise on poses that "
-            "were never fitted (identify --test)."
-        )
-    elif d.verdict == "ambiguous":
-        steps.append(
-            "Compensating with the likeliest of the set serves poses and loads like those "
-            "measured; beyond them the rivals may predict differently."
-        )
-    elif d.verdict == "unknown_effect":
-        steps.append(
-            "Look for a physical cause where the evidence points, and measure more where the "
-            "curve is steep; compensate nothing by a name that the data do not support."
-        )
-        if d.effects:
-            names = together([effect_at(f) for f in d.effects], "and")
-            steps.append(
-                f"The cell that --cell-out writes has {names} added, and nothing for what has no "
-                "name: keep it only where it does better on poses kept back (identify --test)."
-            )
-    else:
-        steps.append("Nothing calls for another effect in the model.")
-    if d.verdict in ("ambiguous", "unknown_effect") and d.extra is None:
-        steps.append("--plan extra.csv designs the poses that tell the rivals apart.")
+    """What to do now: the remedies of the findings, what extra poses promise, what to record."""
+    steps = [f.remedy for f in d.findings if f.remedy]
     if d.extra is not None:
         steps += extra_lines(d.extra)
     # One piece of advice serves many effects.
