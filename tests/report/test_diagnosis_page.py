@@ -16,7 +16,7 @@ from elastocal.diagnosis.result import FaultyReading
 from elastocal.errors import InputError
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.manipulator.model import Model
-from elastocal.report.diagnosis_page import diagnosis_page, write_diagnosis_report
+from elastocal.report.page import diagnosis_page, write_diagnosis_report
 
 
 @pytest.fixture(scope="module")

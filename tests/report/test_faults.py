@@ -10,9 +10,9 @@ import pytest
 
 from elastocal.identification.outlier import Outlier
 from elastocal.identification.robust.report import FaultyGroup, OutlierReport
-from elastocal.report.faults import MOST_TOLD, fault_lines
-from elastocal.report.html import report_page
-from elastocal.report.tables import summary_lines
+from elastocal.report.identification_view import summary_lines
+from elastocal.report.method_and_noise import MOST_TOLD, fault_lines
+from elastocal.report.page import identification_page
 
 BLOCK = FaultyGroup(
     "block", "142 to 507", "common", tuple(range(366)), tuple(range(142, 508)), 366, 8.8, 8.8,
@@ -87,7 +87,9 @@ def test_terminal_names_few_and_counts_the_rest(case: Any) -> None:
 
 def test_page_lists_every_group_beside_the_single_readings(case: Any, no_figures: None) -> None:
     groups = [replace(BLOCK, level="configuration", name=f"<b>{k}\x1b") for k in range(9)]
-    page = report_page(with_findings(case.result, *groups, excluded=outliers(range(142, 508))))
+    page = identification_page(
+        with_findings(case.result, *groups, excluded=outliers(range(142, 508)))
+    )
     section = page[page.index("<h2>Faulty readings") : page.index("<h2>To repeat")]
     assert section.count("<li>") == 9
     assert "at most 1 %" in section
@@ -100,7 +102,7 @@ def test_page_lists_every_group_beside_the_single_readings(case: Any, no_figures
 def test_group_without_a_reading_beyond_the_noise(case: Any, level: Any, no_figures: None) -> None:
     result = with_findings(case.result, replace(BLOCK, level=level, beyond=0))
     assert ", none of them beyond the noise alone" in fault_lines(result)[0]
-    page = report_page(result)
+    page = identification_page(result)
     assert "No single reading lies beyond" in page
 
 

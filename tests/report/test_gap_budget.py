@@ -11,9 +11,8 @@ from support.pages import Page
 
 from elastocal.identification import error_budget as module
 from elastocal.identification.error_budget import gap_budget
-from elastocal.report.rows import budget_steps, budget_table
-from elastocal.report.verdict import rms_by_kind
-from elastocal.report.waterfall import waterfall
+from elastocal.report.figures import waterfall_of_steps
+from elastocal.report.identification_view import budget_steps, budget_table, rms_by_kind
 
 SIGMA = 3e-5  # m, of the readings of `case`
 
@@ -73,6 +72,6 @@ def test_table_and_figure_tell_the_same(case: Any) -> None:
     rows = budget_table(case.result, budget).rows
     steps = budget_steps(case.result, budget)
     assert [row[0] for row in rows] == [*(name for name, *_ in steps), budget.floor_name]
-    text = Page(waterfall(steps, budget.floor, budget.floor_name)).text
+    text = Page(waterfall_of_steps(steps, budget.floor, budget.floor_name)).text
     for row in rows:
         assert row[1] in text

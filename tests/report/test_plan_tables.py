@@ -14,8 +14,8 @@ from elastocal.cell_design import DesignSpec
 from elastocal.design.design import design
 from elastocal.design.options import DesignOptions
 from elastocal.design.plan import Certificate, SizePoint
-from elastocal.report.plan_rows import served
-from elastocal.report.plan_tables import plan_lines, print_plan
+from elastocal.report.plan_view import plan_lines, served
+from elastocal.report.terminal import print_plan
 from elastocal.tracker_noise import CartesianNoise
 
 LOADS = np.array([[0, 0, 0], [0, 0, -2600.0]])

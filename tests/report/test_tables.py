@@ -10,27 +10,22 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
+from elastocal.identification.findings import standings
 from elastocal.identification.result import Combination
-from elastocal.report.rows import (
+from elastocal.report.identification_view import (
     HALF_LENGTH,
     MIDDLE,
+    SECTIONS,
     bar_from_nominal,
-    parameter_rows,
-    texts,
-)
-from elastocal.report.tables import (
-    combination_table,
-    parameter_table,
-    print_result,
-    summary_lines,
-)
-from elastocal.report.trust import SECTIONS, judgement
-from elastocal.report.words import (
     combination_truth,
     inside,
+    judgement,
+    parameter_rows,
     shortened,
-    standings,
+    summary_lines,
+    texts,
 )
+from elastocal.report.terminal import combination_table, parameter_table, print_result
 
 
 def cells(table: Table) -> list[dict[str, str]]:

@@ -10,14 +10,14 @@ import pytest
 from elastocal.identification.findings import judged
 from elastocal.identification.lack_of_fit import LackOfFit
 from elastocal.identification.result import TestErrors
-from elastocal.report import trust
+from elastocal.report import identification_view
 
 MISFIT = LackOfFit(9.0, 1e-5, 30, 200)
 
 
-def judgement(result: Any) -> trust.Judgement:
+def judgement(result: Any) -> identification_view.Judgement:
     """What is said of a result whose fields were changed, judged anew."""
-    return trust.judgement(judged(result))
+    return identification_view.judgement(judged(result))
 
 
 @pytest.fixture(scope="module")

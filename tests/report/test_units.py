@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.report.units import (
+from elastocal.report.formatting import (
     display,
     estimate,
     length,

@@ -194,13 +194,13 @@ def print_summaries(screen: Console, content: dict[str, Any]) -> None:
 
 
 def _length(um: float) -> str:
-    from elastocal.report.units import length
+    from elastocal.report.formatting import length
 
     return "< 0.01 µm" if um < 0.01 else length(um * 1e-6)
 
 
 def _print_spreads(screen: Console, title: str, rows: dict[str, dict[str, Any]]) -> None:
-    from elastocal.report.console_table import titled
+    from elastocal.report.terminal import titled
 
     shown = titled(title)
     shown.add_column("")

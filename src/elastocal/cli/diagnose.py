@@ -94,7 +94,7 @@ def diagnose(
     if as_json:
         typer.echo(json_text(content))
         return
-    from elastocal.report.diagnosis_tables import print_diagnosis
+    from elastocal.report.terminal import print_diagnosis
 
     print_diagnosis(console(), found, model.chain.kinds)
     for line in told:

@@ -13,9 +13,8 @@ from elastocal.cli.import_words import left_out
 from elastocal.importing.import_files import Imported
 from elastocal.importing.records import Understood
 from elastocal.nearest import listed
-from elastocal.report.console_table import titled
-from elastocal.report.verdict import counted
-from elastocal.report.words import printable
+from elastocal.report.formatting import counted, printable
+from elastocal.report.terminal import titled
 
 FIRST_ROWS = 5
 MOST_COLUMNS = 14  # of the first rows, on a wide terminal

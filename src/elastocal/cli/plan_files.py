@@ -101,7 +101,7 @@ def write_all(
 
 def write_page(plan: Plan, path: Path, read: list[Path]) -> None:
     """The report of a plan; `read` are the files it depends on."""
-    from elastocal.report.plan_page import write_plan_report
+    from elastocal.report.page import write_plan_report
 
     command = shlex.join(["elastocal", *sys.argv[1:]])
     write_plan_report(plan, path, command=command, inputs=list(dict.fromkeys(read)))

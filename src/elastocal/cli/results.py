@@ -14,7 +14,7 @@ from elastocal.identification.result import IdentificationResult
 from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
-    from elastocal.report.html import Published
+    from elastocal.report.page import Published
 
 
 def write_results(
@@ -42,10 +42,10 @@ def write_results(
         writer.writerows(rows)
         atomic_write_text(residuals, text.getvalue())
     if report is not None:
-        from elastocal.report.html import write_report
+        from elastocal.report.page import write_identification_report
 
         command = shlex.join(["elastocal", *sys.argv[1:]])
-        write_report(
+        write_identification_report(
             result, report, truth=truth, command=command, inputs=inputs, seed=seed,
             published=published,
         )  # fmt: skip
