@@ -11,7 +11,7 @@ from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_
 from elastocal.cell import CartesianNoise, Tracker
 from elastocal.identification.identify import Options, identify
 from elastocal.identification.options import Method
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.model import Model
 from elastocal.report import page as report_pages
 from elastocal.simulation.simulate import simulate, values_from
@@ -26,7 +26,7 @@ SIGMA = 3e-5
 class Case:
     """A result and the true values behind it."""
 
-    result: IdentificationResult
+    result: Calibration
     truth: dict[str, float]
 
 

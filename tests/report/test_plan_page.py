@@ -103,7 +103,7 @@ def test_the_verdict_says_how_far_from_the_best(
     told = replace(plan, certificate=certificate, warnings=warnings)
     assert text in plan_headline(told)
     assert plan_tone(told) == tone
-    advised = any("--effort thorough" in step for step in plan_steps(told))
+    advised = any("effort='thorough'" in step for step in plan_steps(told))
     assert advised == (continuum == 0.7)
 
 

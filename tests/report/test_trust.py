@@ -37,10 +37,10 @@ def test_what_nothing_speaks_against_can_be_trusted(fine: Any) -> None:
     found = judgement(fine)
     assert found.tone == "good"
     assert found.headline.startswith("This calibration can be trusted: positions in poses that")
-    assert any("as test data" in step for step in found.steps)
+    assert any("give them with `test`" in step for step in found.steps)
     assert not any("diagnose" in step for step in found.steps)
     tested = replace(fine, test=TestErrors(fine.heldout_rms, 0.0, 0.0, 9))
-    assert not any("as test data" in step for step in judgement(tested).steps)
+    assert not any("give them with `test`" in step for step in judgement(tested).steps)
 
 
 def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:

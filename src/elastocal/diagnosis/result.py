@@ -9,6 +9,7 @@ from typing import Literal
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.separate.result import ExtraPlan
+from elastocal.errors import option
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.result import Finding, Number
 from elastocal.manipulator.effects.base import Stage
@@ -188,7 +189,7 @@ class NoiseFloor:
     faulty: tuple[FaultyReading, ...] = ()
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Diagnosis(ForNotebooks):
     """The whole answer.  `p_value`: of what was found, against the whole family of hypotheses.
 
@@ -217,13 +218,6 @@ class Diagnosis(ForNotebooks):
     model_keys: dict[str, str] = field(default_factory=dict)
     # The arm as it was fitted before any effect was added, and its residuals.
     calibrated: Baseline | None = field(default=None, repr=False, compare=False)
-
-    def __repr__(self) -> str:
-        named = ", ".join(f"{f.effect}:{f.where}" for f in self.effects)
-        return (
-            f"<Diagnosis {self.verdict}{': ' + named if named else ''} from {self.n_readings} "
-            f"readings of {self.n_configurations} configurations>"
-        )
 
     @property
     def open(self) -> bool:
@@ -260,12 +254,18 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         "probability_unknown": d.probability_unknown,
     }
     settled = d.verdict in ("explained", "nothing_significant")
-    yield Finding(d.verdict, "good" if settled else "care", numbers, VERDICT_REMEDY[d.verdict])
+    yield Finding(d.verdict, "good" if settled else "care", numbers, _remedy(d.verdict))
     if d.verdict == "unknown_effect" and d.effects:
         names = {"effects": numbers["effects"]}
-        yield Finding("named_beside_unknown", "care", names, TRY_NAMED)
+        yield Finding(
+            "named_beside_unknown", "care", names,
+            f"The cell of {option('cell_out')} has the effects named added, and nothing for what "
+            "has no name: keep it only where it does better on poses kept back (identify with "
+            f"{option('test')}).",
+        )  # fmt: skip
     if d.open and d.extra is None:
-        yield Finding("rivals_open", "note", {}, PLAN)
+        remedy = f"Plan the poses that tell the rivals apart ({option('plan')}), and measure them."
+        yield Finding("rivals_open", "note", {}, remedy)
     if d.dependences:
         yield Finding(
             "depends_on", "note",
@@ -289,23 +289,21 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         )
 
 
-VERDICT_REMEDY = {
-    "explained": (
-        "Identify with the cell that has these effects added (cell_out), and check the promise on "
-        "poses that were never fitted (test)."
-    ),
-    "ambiguous": (
-        "Compensating with the likeliest of the set serves poses and loads like those measured; "
-        "beyond them the rivals may predict differently."
-    ),
-    "unknown_effect": (
-        "Look for a physical cause where the evidence points, and measure more where the curve is "
-        "steep; compensate nothing by a name that the data do not support."
-    ),
-    "nothing_significant": "Nothing calls for another effect in the model.",
-}
-TRY_NAMED = (
-    "The extended cell (cell_out) has the effects named added, and nothing for what has no name: "
-    "keep it only where it does better on poses kept back (test)."
-)
-PLAN = "Plan the poses that tell the rivals apart (plan), and measure them."
+def _remedy(verdict: Verdict) -> str:
+    """What to do after a verdict."""
+    if verdict == "explained":
+        return (
+            f"Identify with the cell of {option('cell_out')}, which has these effects added, and "
+            f"check the promise on poses that were never fitted (identify with {option('test')})."
+        )
+    if verdict == "ambiguous":
+        return (
+            "Compensating with the likeliest of the set serves poses and loads like those "
+            "measured; beyond them the rivals may predict differently."
+        )
+    if verdict == "unknown_effect":
+        return (
+            "Look for a physical cause where the evidence points, and measure more where the curve "
+            "is steep; compensate nothing by a name that the data do not support."
+        )
+    return "Nothing calls for another effect in the model."

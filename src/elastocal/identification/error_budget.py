@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from elastocal.errors import ElastocalError
 from elastocal.identification.heldout import held_out_residual
 from elastocal.identification.noise import weights_for
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.identification.solve import PLACED_EFFECTS
 from elastocal.manipulator.effects import CATALOGUE
 
@@ -42,7 +42,7 @@ class ErrorBudget:
     floor_name: str
 
 
-def gap_budget(result: IdentificationResult) -> ErrorBudget | None:
+def gap_budget(result: Calibration) -> ErrorBudget | None:
     """Held-out 3-D errors as the model gains base and markers, geometry, compliance.
 
     Each step fits the parameters of its stages that the whole fit determined, the later ones held
@@ -73,7 +73,7 @@ def gap_budget(result: IdentificationResult) -> ErrorBudget | None:
 
 
 def _fitted(
-    result: IdentificationResult, columns: NDArray[np.int64], held: NDArray[np.bool_]
+    result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
 ) -> Array | None:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
     model, seen = result.model, result.observations
@@ -102,9 +102,7 @@ def _fitted(
     return found if np.isfinite(found).all() else None
 
 
-def _step(
-    name: str, result: IdentificationResult, residual: Array, rng: np.random.Generator
-) -> BudgetStep:
+def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
     seen = result.observations
     squared = (residual.reshape(-1, seen.size)[:, :3] ** 2).sum(axis=1)
     _, code = np.unique(seen.configuration, return_inverse=True)
@@ -112,7 +110,7 @@ def _step(
     return BudgetStep(name, rms, ci95)
 
 
-def _floor(result: IdentificationResult) -> tuple[float | None, str]:
+def _floor(result: Calibration) -> tuple[float | None, str]:
     """What repeats scatter, else what the stated noise gives."""
     seen = result.observations
     force = np.round(seen.table.force[seen.lead], 3)

@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg, stats
 
+from elastocal.errors import option
 from elastocal.identification.outliers import blocks
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.result import (
+    Calibration,
     Estimate,
     Finding,
-    IdentificationResult,
     Number,
     Outlier,
     Severity,
@@ -49,12 +50,10 @@ STATE_NOISE = (
     "it does the residual say whether the model lacks something. elastocal diagnose looks for "
     "that either way."
 )
-MORE_POSES = "Measure more poses: elastocal design plans what these data lack (augment)."
 COMPARE = (
     "Compare the test poses with those fitted: where they lie elsewhere (joints, load), fit some "
     "like them; where they do not, the arm or the tracker has changed in between."
 )
-PROVE = "Prove it: measure some poses that take no part in the fit, and give them as test data."
 USE = (
     "Use it (elastocal compensate, elastocal export) where poses and loads are like those measured."
 )
@@ -62,9 +61,7 @@ USE = (
 OF_SOLUTION = ("ill_conditioned", "at_bound", "beyond_bound")
 
 
-def judged(
-    result: IdentificationResult, of_solution: tuple[Finding, ...] | None = None
-) -> IdentificationResult:
+def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) -> Calibration:
     """The same result with its findings, the overall one ("trust") first.
 
     `of_solution` are those that only the solver can tell; by default the result's own are kept.
@@ -101,7 +98,7 @@ def _um(metres: float) -> float:
     return float(metres) * 1e6
 
 
-def _spoilt(result: IdentificationResult) -> Iterator[Finding]:
+def _spoilt(result: Calibration) -> Iterator[Finding]:
     """What makes the result worthless."""
     if not result.converged:
         yield Finding(
@@ -114,7 +111,7 @@ def _spoilt(result: IdentificationResult) -> Iterator[Finding]:
         yield Finding("no_better_than_nominal", "poor", numbers)
 
 
-def _few_poses(result: IdentificationResult) -> Iterator[Finding]:
+def _few_poses(result: Calibration) -> Iterator[Finding]:
     n = len(result.determined)
     if result.dof < FEW_DOF_PER_PARAMETER * n:
         yield Finding(
@@ -124,10 +121,16 @@ def _few_poses(result: IdentificationResult) -> Iterator[Finding]:
     if not math.isfinite(result.heldout_rms):
         # Test data tell what held-out poses cannot.
         severity: Severity = "care" if result.test is None else "note"
-        yield Finding("not_held_out", severity, {}, MORE_POSES)
+        yield Finding("not_held_out", severity, {}, _more_poses())
 
 
-def _against_stated_noise(result: IdentificationResult) -> Iterator[Finding]:
+def _more_poses() -> str:
+    return (
+        f"Measure more poses: elastocal design with {option('augment')} plans what these data lack."
+    )
+
+
+def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     """The residual's mean square against the stated noise, by its χ² distribution."""
     ratio = result.noise.ratio_to_stated
     if ratio is None:
@@ -147,12 +150,12 @@ def _against_stated_noise(result: IdentificationResult) -> Iterator[Finding]:
         yield Finding("residual_agrees_with_stated_noise", "good", numbers)
 
 
-def _lacks_fit(result: IdentificationResult) -> bool:
+def _lacks_fit(result: Calibration) -> bool:
     found = result.noise.lack_of_fit
     return found is not None and found.p < LACK_OF_FIT
 
 
-def _repeats(result: IdentificationResult) -> Iterator[Finding]:
+def _repeats(result: Calibration) -> Iterator[Finding]:
     """Do configurations scatter more than their repeats, and does anything count with it?"""
     noise, test = result.noise, result.noise.lack_of_fit
     if test is not None:
@@ -176,17 +179,17 @@ def _repeats(result: IdentificationResult) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _prediction(result: IdentificationResult) -> Iterator[Finding]:
+def _prediction(result: Calibration) -> Iterator[Finding]:
     held, fitted, nominal = result.heldout_rms, result.residual_rms, result.nominal_rms
     if math.isfinite(held) and held > FLATTERS * fitted:
         numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "residual_rms_um": _um(fitted)}
-        yield Finding("fit_flatters", "care", numbers, MORE_POSES)
+        yield Finding("fit_flatters", "care", numbers, _more_poses())
     if held < nominal < LITTLE * held < math.inf:
         numbers = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
         yield Finding("little_gain", "care", numbers)
 
 
-def _faulty(result: IdentificationResult) -> Iterator[Finding]:
+def _faulty(result: Calibration) -> Iterator[Finding]:
     n, fitted = len(result.faulty), len(result.observations.lead)
     if n:
         verb = "1 reading that lies" if n == 1 else f"{n} readings that lie"
@@ -202,7 +205,7 @@ def _faulty(result: IdentificationResult) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _undetermined(result: IdentificationResult) -> Iterator[Finding]:
+def _undetermined(result: Calibration) -> Iterator[Finding]:
     found = list(standings(result).values())
     if n := found.count(INVISIBLE) + found.count(ABSORBED):
         yield Finding(
@@ -212,7 +215,7 @@ def _undetermined(result: IdentificationResult) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def standings(result: IdentificationResult) -> dict[str, str]:
+def standings(result: Calibration) -> dict[str, str]:
     """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, INVISIBLE or FIXED."""
     first = {next(iter(c.terms)) for c in result.combinations}
 
@@ -228,7 +231,7 @@ def standings(result: IdentificationResult) -> dict[str, str]:
     return {e.name: standing(e) for e in result.estimates}
 
 
-def _shape(result: IdentificationResult) -> Iterator[Finding]:
+def _shape(result: Calibration) -> Iterator[Finding]:
     if result.residual_summary is not None:
         yield shape_of(result.residual_summary)
         n = sum(g.n_deviating for g in result.residual_summary.groupings)
@@ -254,12 +257,16 @@ def shape_of(summary: ResidualSummary) -> Finding:
     return Finding(kind, "note", numbers)
 
 
-def _test(result: IdentificationResult) -> Iterator[Finding]:
+def _test(result: Calibration) -> Iterator[Finding]:
     """Test data against held-out poses, by an F-test of the two mean squares; the components of a
     reading count as one."""
     test, held = result.test, result.heldout_rms
     if test is None:
-        yield Finding("untested", "note", {}, PROVE)
+        yield Finding(
+            "untested", "note", {},
+            "Prove it: measure some poses that take no part in the fit, and give them with "
+            f"{option('test')}.",
+        )  # fmt: skip
     elif math.isfinite(held):
         allowed = math.sqrt(stats.f.ppf(1 - CHANCE, test.n, result.dof))
         if test.rms > max(WORSE, allowed) * held:
@@ -270,12 +277,12 @@ def _test(result: IdentificationResult) -> Iterator[Finding]:
 # What only the solver can tell.
 
 
-def of_solution(result: IdentificationResult, solution: Solution) -> tuple[Finding, ...]:
+def of_solution(result: Calibration, solution: Solution) -> tuple[Finding, ...]:
     """Conditioning of the fit, and parameters at or beyond their physical bounds."""
     return (*_conditioning(result, solution), *_bounds(result, solution))
 
 
-def _conditioning(result: IdentificationResult, solution: Solution) -> Iterator[Finding]:
+def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
     kept = solution.reduction.kept
     # Unit columns: what is judged is how far they are from parallel, not their units.
     scaled = solution.fit.triangle.R
@@ -294,7 +301,7 @@ def _conditioning(result: IdentificationResult, solution: Solution) -> Iterator[
     )  # fmt: skip
 
 
-def _bounds(result: IdentificationResult, solution: Solution) -> Iterator[Finding]:
+def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
     at_bound = {result.model.names[c] for c in solution.reduction.at_bound}
     for e, p in zip(result.estimates, result.model.parameters, strict=True):
         if p.lower < e.held < p.upper or not (np.isfinite(p.lower) or np.isfinite(p.upper)):
@@ -317,31 +324,31 @@ def _bounds(result: IdentificationResult, solution: Solution) -> Iterator[Findin
 # Sentences.
 
 
-def warning_sentences(result: IdentificationResult) -> tuple[str, ...]:
+def warning_sentences(result: Calibration) -> tuple[str, ...]:
     """The findings that call for attention as sentences that name the remedy."""
     found = [text for f in result.findings if f.kind in _TOLD for text in _TOLD[f.kind](result, f)]
     return tuple(found)
 
 
-def _not_converged(_: IdentificationResult, f: Finding) -> list[str]:
+def _not_converged(_: Calibration, f: Finding) -> list[str]:
     return [f"The fit did not converge: {f.numbers['reason']}. {f.remedy}"]
 
 
-def _few_degrees(_: IdentificationResult, f: Finding) -> list[str]:
+def _few_degrees(_: Calibration, f: Finding) -> list[str]:
     return [
         f"Only {f.numbers['dof']} degrees of freedom for {f.numbers['parameters']} determined "
         f"parameters: intervals are wide and the residual flatters the model. {f.remedy}"
     ]
 
 
-def _not_held_out(_: IdentificationResult, f: Finding) -> list[str]:
+def _not_held_out(_: Calibration, f: Finding) -> list[str]:
     return [
         "Some configuration alone determines a parameter, so there is no held-out error for "
         "it. Measure more configurations."
     ]
 
 
-def _ill_conditioned(_: IdentificationResult, f: Finding) -> list[str]:
+def _ill_conditioned(_: Calibration, f: Finding) -> list[str]:
     names = f.numbers["parameters"]
     assert isinstance(names, tuple)
     return [
@@ -350,7 +357,7 @@ def _ill_conditioned(_: IdentificationResult, f: Finding) -> list[str]:
     ]
 
 
-def _above_stated(_: IdentificationResult, f: Finding) -> list[str]:
+def _above_stated(_: Calibration, f: Finding) -> list[str]:
     return [
         f"The residual is {f.number('ratio'):.1f} times the stated noise: something is unmodelled "
         "or the stated noise is too small. The intervals use the residual, not the stated noise; "
@@ -358,7 +365,7 @@ def _above_stated(_: IdentificationResult, f: Finding) -> list[str]:
     ]
 
 
-def _not_fitting(_: IdentificationResult, f: Finding) -> list[str]:
+def _not_fitting(_: Calibration, f: Finding) -> list[str]:
     if f.numbers["counted_by"] != "nothing":
         return []
     return [
@@ -371,14 +378,14 @@ def _not_fitting(_: IdentificationResult, f: Finding) -> list[str]:
     ]
 
 
-def _at_bound(_: IdentificationResult, f: Finding) -> list[str]:
+def _at_bound(_: Calibration, f: Finding) -> list[str]:
     return [
         f"{f.numbers['parameter']} stands at its bound {f.number('bound'):g} {f.numbers['unit']}; "
         f"it is held there and has no interval. {f.remedy}"
     ]
 
 
-def _beyond_bound(_: IdentificationResult, f: Finding) -> list[str]:
+def _beyond_bound(_: Calibration, f: Finding) -> list[str]:
     return [
         f"{f.numbers['parameter']} = {f.number('value'):.3g} ± {f.number('std'):.2g} "
         f"{f.numbers['unit']} lies beyond its physical bound {f.number('bound'):g}: "
@@ -386,24 +393,24 @@ def _beyond_bound(_: IdentificationResult, f: Finding) -> list[str]:
     ]
 
 
-def _faulty_readings(result: IdentificationResult, _: Finding) -> list[str]:
+def _faulty_readings(result: Calibration, _: Finding) -> list[str]:
     found = []
     if result.outliers:
         found.append(
             f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains "
-            f"({_lines(result.outliers)}) and had a part in the fit. Check them; outliers = 'drop' "
-            "leaves them out."
+            f"({_lines(result.outliers)}) and had a part in the fit. Check them; "
+            f"{option('outliers', 'drop')} leaves them out."
         )
     if result.excluded:
         found.append(
             f"{_count(result.excluded, 'was', 'were')} left out as faulty "
             f"({_lines(result.excluded)}): the noise does not explain them. All are listed in the "
-            "result under 'excluded'; outliers = 'keep' fits them too."
+            f"result under 'excluded'; {option('outliers', 'keep')} fits them too."
         )
     return found
 
 
-def _many_faulty(_: IdentificationResult, f: Finding) -> list[str]:
+def _many_faulty(_: Calibration, f: Finding) -> list[str]:
     return [
         "That is too large a share for reading errors: a shifted block of readings, or an effect "
         f"that the model lacks in some load state, marker or region. {f.remedy}"
@@ -422,7 +429,7 @@ def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
     return f"1 reading {one}" if n == 1 else f"{n} readings {many}"
 
 
-_TOLD: dict[str, Callable[[IdentificationResult, Finding], list[str]]] = {
+_TOLD: dict[str, Callable[[Calibration, Finding], list[str]]] = {
     "not_converged": _not_converged,
     "few_degrees_of_freedom": _few_degrees,
     "not_held_out": _not_held_out,
@@ -441,7 +448,7 @@ SAID_IN_WARNING = (
 )  # fmt: skip
 
 
-def next_steps(result: IdentificationResult) -> list[Finding]:
+def next_steps(result: Calibration) -> list[Finding]:
     """Findings whose remedy is still to be told, each remedy once."""
     steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in SAID_IN_WARNING}
     order = [f for f in result.findings if f.remedy and steps.get(f.remedy) is f]

@@ -132,8 +132,8 @@ class Finding:
         }  # fmt: skip
 
 
-@dataclass(frozen=True, repr=False)
-class IdentificationResult(ForNotebooks):
+@dataclass(frozen=True)
+class Calibration(ForNotebooks):
     """What `identify` found.
 
     `x` (parameters,) are the values the model uses; `covariance` (determined, determined) goes
@@ -198,13 +198,6 @@ class IdentificationResult(ForNotebooks):
     def finding(self, *kinds: str) -> Finding | None:
         """The first finding of one of these kinds; None where there is none."""
         return next((f for f in self.findings if f.kind in kinds), None)
-
-    def __repr__(self) -> str:
-        known = sum(e.identifiable for e in self.estimates)
-        return (
-            f"<IdentificationResult {self.model.chain.name!r}: {known} of {len(self.estimates)} "
-            f"parameters by {self.method} from {len(self.observations.lead)} readings>"
-        )
 
     def residual_table(self) -> list[dict[str, Any]]:
         """One row per observation: line, configuration, repeat, marker, residuals in µm (µrad)."""

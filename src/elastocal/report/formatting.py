@@ -99,9 +99,9 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def length(metres: float) -> str:
-    """A position error: µm below 1 mm, mm below 1 m, "none" where there is no number."""
+    """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
     if not math.isfinite(metres):
-        return "none"
+        return "not available"
     if abs(metres) < 0.9995e-3:
         return f"{significant(metres * 1e6)} µm"
     if abs(metres) < 0.9995:

@@ -20,10 +20,10 @@ from elastocal.identification.findings import (
 )
 from elastocal.identification.result import (
     LOPSIDED,
+    Calibration,
     Combination,
     Estimate,
     Finding,
-    IdentificationResult,
     deviation,
 )
 from elastocal.report.formatting import (
@@ -59,7 +59,7 @@ LARGEST_TERMS = 4
 Truth = dict[str, float]
 
 
-def names_of(result: IdentificationResult, standing: str) -> list[str]:
+def names_of(result: Calibration, standing: str) -> list[str]:
     return [printable(name) for name, s in standings(result).items() if s == standing]
 
 
@@ -77,7 +77,7 @@ def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     return f"{text} + {more} more" if more else text
 
 
-def short_note(result: IdentificationResult, e: Estimate) -> str:
+def short_note(result: Calibration, e: Estimate) -> str:
     """Why a parameter has no number of its own, in a few words; empty where it has one."""
     standing = standings(result)[e.name]
     if standing == COMBINED:
@@ -91,16 +91,14 @@ def short_note(result: IdentificationResult, e: Estimate) -> str:
     return "fixed by the user" if standing == FIXED else printable(e.note)
 
 
-def held_where(result: IdentificationResult, names: list[str]) -> str:
+def held_where(result: Calibration, names: list[str]) -> str:
     """Where all of `names` are held: at nominal, or at a start value that is none."""
     chosen = [e for e in result.estimates if printable(e.name) in names]
     at_nominal = all(e.held == e.nominal and nominal_known(result, e.name) for e in chosen)
     return "held at nominal" if at_nominal else "held at the start value"
 
 
-def combination_truth(
-    result: IdentificationResult, combination: Combination, truth: Truth
-) -> float | None:
+def combination_truth(result: Calibration, combination: Combination, truth: Truth) -> float | None:
     """True value X_k + Σ f·(X_d − held_d), None where a member's true value is not known."""
     (first, _), *rest = combination.terms.items()
     if any(name not in truth for name in combination.terms):
@@ -116,20 +114,20 @@ def inside(value: float | None, ci95: tuple[float, float] | None) -> str:
     return "inside" if ci95[0] <= value <= ci95[1] else "outside"
 
 
-def coverage(result: IdentificationResult, truth: Truth) -> tuple[int, int]:
+def coverage(result: Calibration, truth: Truth) -> tuple[int, int]:
     """How many 95 % intervals hold the true value, of how many that could be compared."""
     found = [inside(truth.get(e.name), e.ci95) for e in result.estimates]
     found += [inside(combination_truth(result, c, truth), c.ci95) for c in result.combinations]
     return found.count("inside"), len(found) - found.count("")
 
 
-def nominal_known(result: IdentificationResult, name: str) -> bool:
+def nominal_known(result: Calibration, name: str) -> bool:
     """False for a zero that only stands for "no nominal value stated", as of a compliance."""
     parameter = result.model.parameters[result.model.names.index(name)]
     return parameter.nominal != 0 or parameter.typical is not None
 
 
-def undetermined_lines(result: IdentificationResult) -> list[str]:
+def undetermined_lines(result: Calibration) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason."""
     lines = []
     if names := names_of(result, INVISIBLE):
@@ -152,7 +150,7 @@ READINGS = {
 }
 
 
-def what_was_identified(result: IdentificationResult) -> str:
+def what_was_identified(result: Calibration) -> str:
     alone, n = len(names_of(result, ALONE)), len(result.combinations)
     text = f"{alone} of {counted(len(result.estimates), 'parameter')} known on their own"
     if n:
@@ -168,7 +166,7 @@ def what_was_identified(result: IdentificationResult) -> str:
     return text + "."
 
 
-def how_well_it_predicts(result: IdentificationResult) -> str:
+def how_well_it_predicts(result: Calibration) -> str:
     """Held-out error beside the nominal one, and the error on test data."""
     what = {"deflection": "deflection", "distance": "distance"}.get(
         result.observations.kind, "position"
@@ -203,21 +201,21 @@ def how_well_it_predicts(result: IdentificationResult) -> str:
     return text
 
 
-def nominal_arm(result: IdentificationResult) -> str:
+def nominal_arm(result: Calibration) -> str:
     """The nominal arm as `nominal_rms` has it: placed by all readings."""
     return "nominal arm (base and markers placed)" if _placed(result) else "nominal arm"
 
 
-def nominal_arm_held_out(result: IdentificationResult) -> str:
+def nominal_arm_held_out(result: Calibration) -> str:
     """The nominal arm as the gap budget has it: each configuration under the others' placing."""
     return "nominal arm (base and markers by other poses)" if _placed(result) else "nominal arm"
 
 
-def _placed(result: IdentificationResult) -> bool:
+def _placed(result: Calibration) -> bool:
     return any(stage_of(p.effect) == 0 for p in result.model.parameters)
 
 
-def rms_by_kind(result: IdentificationResult) -> list[tuple[str, float]]:
+def rms_by_kind(result: Calibration) -> list[tuple[str, float]]:
     """What the errors are with the nominal arm, fitted, held out and on test data (3-D rms, m)."""
     rows = [
         (nominal_arm(result), result.nominal_rms),
@@ -227,7 +225,7 @@ def rms_by_kind(result: IdentificationResult) -> list[tuple[str, float]]:
     return rows if result.test is None else [*rows, ("test data", result.test.rms)]
 
 
-def rotation_rms(result: IdentificationResult) -> tuple[float, float] | None:
+def rotation_rms(result: Calibration) -> tuple[float, float] | None:
     """Fitted and held-out rms length of the rotation error in rad; None where none was read."""
     if result.observations.kind != "pose":
         return None
@@ -236,16 +234,18 @@ def rotation_rms(result: IdentificationResult) -> tuple[float, float] | None:
     return fitted, held
 
 
-def error_line(result: IdentificationResult) -> str:
+def error_line(result: Calibration) -> str:
     """All rms errors in one line."""
     text = ", ".join(f"{name} {length(value)}" for name, value in rms_by_kind(result))
     if (turns := rotation_rms(result)) is not None:
-        fitted, held = (significant(v * 1e6) if math.isfinite(v) else "none" for v in turns)
+        fitted, held = (
+            significant(v * 1e6) if math.isfinite(v) else "not available" for v in turns
+        )
         text += f"; rotations {fitted} µrad fitted, {held} µrad held out"
     return text
 
 
-def readings(result: IdentificationResult) -> str:
+def readings(result: Calibration) -> str:
     seen = result.observations
     poses = len(np.unique(seen.configuration))
     markers = len(np.unique(seen.table.marker[seen.lead]))
@@ -255,7 +255,7 @@ def readings(result: IdentificationResult) -> str:
     )
 
 
-def correlation_lines(result: IdentificationResult, most: int = MOST_CORRELATIONS) -> list[str]:
+def correlation_lines(result: Calibration, most: int = MOST_CORRELATIONS) -> list[str]:
     lines = []
     for a, b, r in result.correlations[:most]:
         number = f"{r:+.3f}" if abs(r) < 0.9995 else f"{r:+.6f}"
@@ -264,12 +264,12 @@ def correlation_lines(result: IdentificationResult, most: int = MOST_CORRELATION
     return [*lines, f"and {more} more"] if more else lines
 
 
-def coverage_line(result: IdentificationResult, truth: Truth) -> str:
+def coverage_line(result: Calibration, truth: Truth) -> str:
     hit, n = coverage(result, truth)
     return f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
 
 
-def noise_lines(result: IdentificationResult) -> list[tuple[str, str]]:
+def noise_lines(result: Calibration) -> list[tuple[str, str]]:
     """Label and sentence: estimated noise model, repeats, shape of the residuals."""
     summary = result.residual_summary
     found = [
@@ -280,13 +280,13 @@ def noise_lines(result: IdentificationResult) -> list[tuple[str, str]]:
     return [(label, text) for label, text in found if text is not None]
 
 
-def held_lines(result: IdentificationResult) -> list[tuple[str, str]]:
+def held_lines(result: Calibration) -> list[tuple[str, str]]:
     """Label and sentence: what constraints and prior put into the estimates."""
     found = [("Constraints", constraints_line(result)), ("Prior", prior_line(result))]
     return [(label, text) for label, text in found if text is not None]
 
 
-def summary_lines(result: IdentificationResult, truth: Truth | None = None) -> list[str]:
+def summary_lines(result: Calibration, truth: Truth | None = None) -> list[str]:
     """The result in words, one statement per line, warnings last."""
     lines = [
         f"Readings: {readings(result)}",
@@ -348,7 +348,7 @@ class Row:
 
 
 def parameter_rows(
-    result: IdentificationResult,
+    result: Calibration,
     truth: Truth | None,
     published: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[Row]:
@@ -383,14 +383,14 @@ def _published(found: tuple[float, float] | None, unit: str) -> str:
 
 
 def budget_steps(
-    result: IdentificationResult, budget: ErrorBudget
+    result: Calibration, budget: ErrorBudget
 ) -> list[tuple[str, float, tuple[float, float]]]:
     """Name, held-out rms (m) and its 95 % interval of every step."""
     named = {"nominal_arm": nominal_arm_held_out(result)}
     return [(named.get(s.step, s.step), s.heldout_rms, s.ci95) for s in budget.steps]
 
 
-def budget_table(result: IdentificationResult, budget: ErrorBudget) -> TextTable:
+def budget_table(result: Calibration, budget: ErrorBudget) -> TextTable:
     """The steps with their intervals and what each changes; noise alone last."""
     rows: list[tuple[str, ...]] = []
     before: float | None = None
@@ -403,7 +403,7 @@ def budget_table(result: IdentificationResult, budget: ErrorBudget) -> TextTable
     return TextTable(("model", "held-out rms", "95 %", "change"), rows)
 
 
-def combination_rows(result: IdentificationResult, truth: Truth | None) -> list[Row]:
+def combination_rows(result: Calibration, truth: Truth | None) -> list[Row]:
     rows = []
     for c in result.combinations:
         true = None if truth is None else combination_truth(result, c, truth)
@@ -519,7 +519,7 @@ class Judgement:
     steps: tuple[str, ...]
 
 
-def judgement(result: IdentificationResult, sections: bool = False) -> Judgement:
+def judgement(result: Calibration, sections: bool = False) -> Judgement:
     """How good the calibration is and what follows from it, as the result's findings say.
 
     `sections`: the steps name the sections of the page.
@@ -580,7 +580,7 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
 }
 
 
-def _accuracy(result: IdentificationResult) -> str:
+def _accuracy(result: Calibration) -> str:
     what = {"deflection": "deflections", "distance": "distances"}.get(
         result.observations.kind, "positions"
     )

@@ -11,7 +11,7 @@ from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.findings import shape_of
 from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.identification.robust.report import FaultyGroup
 from elastocal.identification.variance.choose import SHARED
 from elastocal.report.formatting import display, length, plain, printable, significant
@@ -108,11 +108,11 @@ HELD = {
 ROBUST = "asymptotic covariance of the robust estimate ({}); assumes independent readings"
 
 
-def method_of(result: IdentificationResult) -> str:
+def method_of(result: Calibration) -> str:
     return str(result.method).replace("_", "-")
 
 
-def method_and_weights(result: IdentificationResult) -> str:
+def method_and_weights(result: Calibration) -> str:
     """The method, and the weights where the method does not say them."""
     method, noise = method_of(result), result.noise
     if method == "constrained":
@@ -123,7 +123,7 @@ def method_and_weights(result: IdentificationResult) -> str:
     return f"{text}, {printable(noise.description)}"
 
 
-def _constrained(result: IdentificationResult) -> str:
+def _constrained(result: Calibration) -> str:
     """What was known besides the readings, and the weights that the method before it gave these."""
     prior, active = bool(result.prior_share), bool(result.active)
     text = "fit with a prior" if prior else "fit under constraints"
@@ -135,11 +135,11 @@ def _constrained(result: IdentificationResult) -> str:
     return f"{text}, {how}{printable(noise.description)}"
 
 
-def interval_kind(result: IdentificationResult) -> str:
+def interval_kind(result: Calibration) -> str:
     return result.noise.interval_kind.lower()
 
 
-def intervals_line(result: IdentificationResult) -> str:
+def intervals_line(result: Calibration) -> str:
     """Which kind of interval, and what it assumes."""
     kind = interval_kind(result)
     if kind in INTERVALS:
@@ -153,7 +153,7 @@ def intervals_line(result: IdentificationResult) -> str:
     return printable(f"{kind}: {description}" if description else kind)
 
 
-def constraints_line(result: IdentificationResult) -> str | None:
+def constraints_line(result: Calibration) -> str | None:
     """Which constraints hold with equality, and what the intervals make of them."""
     active = result.active
     if not active:
@@ -180,7 +180,7 @@ def _in_words(a: ActiveConstraint, units: dict[str, str]) -> str:
     return f"{printable(a.names[0])} {SIGNS[a.kind]} {plain(value)} {unit}"
 
 
-def prior_line(result: IdentificationResult) -> str | None:
+def prior_line(result: Calibration) -> str | None:
     """Parameters that owe more than half of their information to the prior."""
     shares = result.prior_share
     if not shares:
@@ -228,7 +228,7 @@ SHAPES = {
 }
 
 
-def does_noise_explain_it(result: IdentificationResult) -> str:
+def does_noise_explain_it(result: Calibration) -> str:
     """Residual against stated noise, as the finding has it."""
     f = result.finding(*COMPARED)
     if f is None:
@@ -257,12 +257,12 @@ def does_noise_explain_it(result: IdentificationResult) -> str:
     return text
 
 
-def _is_estimated(result: IdentificationResult) -> bool:
+def _is_estimated(result: Calibration) -> bool:
     """Whether the weights come from a noise model with estimated variances."""
     return method_of(result) in ("reml", "constrained") and result.noise.estimated
 
 
-def _why_not_judged(result: IdentificationResult) -> str:
+def _why_not_judged(result: Calibration) -> str:
     """What is missing for a comparison of the residual with stated noise."""
     seen, tracker = result.observations, result.model.cell.tracker
     stated = available_noise(seen.table, tracker) != "none"
@@ -277,7 +277,7 @@ def _why_not_judged(result: IdentificationResult) -> str:
     return f"No noise was stated, {nothing_says}"
 
 
-def noise_model_line(result: IdentificationResult) -> str | None:
+def noise_model_line(result: Calibration) -> str | None:
     """The estimated noise model with its sizes, and why it was chosen."""
     noise = result.noise
     sizes, reason = size_rows(noise), noise.reason
@@ -330,7 +330,7 @@ def kind_in_words(kind: str) -> str:
     return f"{text} + deviations of a configuration" if kind.endswith(SHARED) else text
 
 
-def repeats_line(result: IdentificationResult) -> str | None:
+def repeats_line(result: Calibration) -> str | None:
     """The lack-of-fit test, and what follows from it for the intervals; None without repeats."""
     f = result.finding("lack_of_fit", "repeats_agree")
     if f is None:
@@ -419,7 +419,7 @@ PLACE = {
 }
 
 
-def fault_lines(result: IdentificationResult, most: int | None = None) -> list[str]:
+def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
     """A sentence per group of readings beyond the noise, the largest first; of more, how many."""
     report = result.faulty_report
     groups = [] if report is None else [f for f in report.findings if f.level != "reading"]
@@ -428,7 +428,7 @@ def fault_lines(result: IdentificationResult, most: int | None = None) -> list[s
     return [*lines, f"And {more} more."] if more else lines
 
 
-def false_alarm_line(result: IdentificationResult) -> str | None:
+def false_alarm_line(result: Calibration) -> str | None:
     """How often the search would accuse readings of a table in which nothing is wrong."""
     report = result.faulty_report
     if report is None or not fault_lines(result):
@@ -437,7 +437,7 @@ def false_alarm_line(result: IdentificationResult) -> str | None:
     return f"Of tables in which nothing is wrong, at most {share:g} % would yield any finding."
 
 
-def _sentence(result: IdentificationResult, finding: FaultyGroup) -> str:
+def _sentence(result: Calibration, finding: FaultyGroup) -> str:
     n, beyond = len(finding.lines), finding.beyond
     how = "err in common by" if finding.pattern == "common" else "scatter by"
     size, noise = _metres(result, finding), f"{significant(finding.sigmas, 2)} times the noise"
@@ -448,7 +448,7 @@ def _sentence(result: IdentificationResult, finding: FaultyGroup) -> str:
     return f"{text}{_influence(result, finding)}."
 
 
-def _metres(result: IdentificationResult, finding: FaultyGroup) -> float | None:
+def _metres(result: Calibration, finding: FaultyGroup) -> float | None:
     """Typical error in m, None where most of the readings are not listed one by one.
 
     The median where they err in common, which those that do not leave alone; else the rms.  Where
@@ -466,7 +466,7 @@ def _metres(result: IdentificationResult, finding: FaultyGroup) -> float | None:
     return math.sqrt(sum(r * r for r in listed) / len(listed))
 
 
-def _influence(result: IdentificationResult, finding: FaultyGroup) -> str:
+def _influence(result: Calibration, finding: FaultyGroup) -> str:
     """What they do, or would do if fitted along, to the parameter that they move most."""
     names = () if result.faulty_report is None else result.faulty_report.names
     name = printable(names[finding.column]) if names else "a parameter"
@@ -477,7 +477,7 @@ def _influence(result: IdentificationResult, finding: FaultyGroup) -> str:
     return f"; {how} {name} by {count} standard deviation{'' if count == '1.0' else 's'}"
 
 
-def _bends(result: IdentificationResult, finding: FaultyGroup) -> bool:
+def _bends(result: Calibration, finding: FaultyGroup) -> bool:
     """Whether the readings have their full weight in the fit."""
     apart = {o.line for o in result.excluded} & set(finding.lines)
     return method_of(result) in FULL_WEIGHT and not apart

@@ -18,7 +18,7 @@ from elastocal.compensation.compensate import Compensation
 from elastocal.design.plan import Plan
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.errors import InputError
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.nearest import did_you_mean, listed, quoted
 from elastocal.report.diagnosis_view import (
     BUDGET_HEADS,
@@ -35,6 +35,12 @@ from elastocal.report.identification_view import combination_rows, parameter_row
 from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
 from elastocal.report.plan_view import plan_lines
 from elastocal.report.residual_view import residuals_of
+from elastocal.report.terminal import (
+    compensation_text,
+    diagnosis_text,
+    identification_text,
+    plan_text,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,7 +60,7 @@ class Bars:
     axis: str
 
 
-def residuals(result: IdentificationResult, interactive: bool) -> Any:
+def residuals(result: Calibration, interactive: bool) -> Any:
     """Residual of every reading (at most 5000) over its configuration, one panel a component."""
     found = residuals_of(result)
     panels = [f"{c} in {u}" for c, u in zip(found.components, found.units, strict=True)]
@@ -101,7 +107,7 @@ def residuals(result: IdentificationResult, interactive: bool) -> Any:
     return _figure(draw, (9.0, 0.8 + 1.5 * len(panels)))
 
 
-def parameters(result: IdentificationResult, interactive: bool) -> Any:
+def parameters(result: Calibration, interactive: bool) -> Any:
     """Deviation of each identified parameter from nominal in units of its 95 % half width."""
     kept = [e for e in result.estimates if e.value is not None and e.ci95 is not None]
     kept = [e for e in kept if np.isfinite(e.ci95).all()][:MOST_BARS]  # type: ignore[arg-type]
@@ -284,6 +290,7 @@ Drawn = Callable[[Any, bool], Any]
 class View:
     """How one kind of result shows itself; `figures` by kind, the first is the default."""
 
+    text: Callable[[Any], str]
     html: Callable[[Any], str]
     frame: Callable[[Any], pd.DataFrame]
     figures: Mapping[str, Drawn]
@@ -307,7 +314,7 @@ def view_of(result: object) -> View:
     raise TypeError(type(result).__name__)
 
 
-def _identification_html(result: IdentificationResult) -> str:
+def _identification_html(result: Calibration) -> str:
     known = [row for row in parameter_rows(result, None) if row.determined]
     rows = [(r.name, r.value, r.interval, r.unit, r.nominal) for r in known]
     rows += [(r.name, r.value, r.interval, r.unit, "") for r in combination_rows(result, None)]
@@ -377,7 +384,7 @@ def _lines(lines: Sequence[tuple[str, str]]) -> str:
     return "".join(f"<p><b>{escape(label)}:</b> {escape(text)}</p>" for label, text in lines)
 
 
-def _estimates(result: IdentificationResult) -> pd.DataFrame:
+def _estimates(result: Calibration) -> pd.DataFrame:
     """One row per parameter, SI units: NaN where the data do not determine it alone."""
     import pandas as pd
 
@@ -451,16 +458,20 @@ def _commands(c: Compensation) -> pd.DataFrame:
 
 
 VIEWS: dict[type, View] = {
-    IdentificationResult: View(
+    Calibration: View(
+        identification_text,
         _identification_html,
         _estimates,
         {"residuals": residuals, "parameters": parameters},
     ),
-    Plan: View(_plan_html, _plan_frame, {"poses": poses, "intervals": intervals}),
+    Plan: View(plan_text, _plan_html, _plan_frame, {"poses": poses, "intervals": intervals}),
     Compensation: View(
+        compensation_text,
         _compensation_html,
         _commands,
         {"errors": errors, "uncertainty": uncertainties},
     ),
-    Diagnosis: View(_diagnosis_html, _candidates, {"budget": budget, "candidates": candidates}),
+    Diagnosis: View(
+        diagnosis_text, _diagnosis_html, _candidates, {"budget": budget, "candidates": candidates}
+    ),
 }

@@ -19,7 +19,7 @@ from elastocal.diagnosis.result import Diagnosis
 from elastocal.files import atomic_write_text, open_input
 from elastocal.identification.error_budget import ErrorBudget, gap_budget
 from elastocal.identification.residual_summary import ResidualSummary
-from elastocal.identification.result import IdentificationResult, Outlier
+from elastocal.identification.result import Calibration, Outlier
 from elastocal.manipulator.model import Model
 from elastocal.report.arm_view import (
     Space,
@@ -242,7 +242,7 @@ Published = Mapping[str, tuple[float, float]]
 
 
 def write_identification_report(
-    result: IdentificationResult,
+    result: Calibration,
     path: str | Path,
     truth: Truth | None = None,
     command: str | None = None,
@@ -262,7 +262,7 @@ def write_identification_report(
 
 
 def identification_page(
-    result: IdentificationResult,
+    result: Calibration,
     truth: Truth | None = None,
     command: str | None = None,
     inputs: Inputs = None,
@@ -279,7 +279,7 @@ def identification_page(
 
 
 def _identification_contents(
-    result: IdentificationResult, truth: Truth | None, published: Published
+    result: Calibration, truth: Truth | None, published: Published
 ) -> dict[str, Any]:
     from markupsafe import Markup
 
@@ -335,14 +335,14 @@ def _floor(budget: ErrorBudget | None) -> str:
     return f"The dashed line is what noise alone gives ({budget.floor_name})."
 
 
-def _endless(result: IdentificationResult) -> str:
+def _endless(result: Calibration) -> str:
     """A sentence for bars that run off, empty where every interval has two ends."""
     intervals = [e.ci95 for e in result.estimates] + [c.ci95 for c in result.combinations]
     endless = any(math.isinf(end) for ci95 in intervals for end in ci95 or ())
     return " An interval without an end runs to the edge." if endless else ""
 
 
-def _noise(result: IdentificationResult, summary: ResidualSummary | None) -> dict[str, Any]:
+def _noise(result: Calibration, summary: ResidualSummary | None) -> dict[str, Any]:
     """Sentences and rows of the section on noise."""
     sentences = [text for label, text in noise_lines(result) if label != "Residuals"]
     deviating = () if summary is None else summary.deviating
@@ -364,7 +364,7 @@ def _held_out_scatter(summary: ResidualSummary | None) -> str:
     return f"In held-out configurations the scatter is {size} times that of the noise model."
 
 
-def _thinning(result: IdentificationResult, residuals: Residuals) -> dict[str, str]:
+def _thinning(result: Calibration, residuals: Residuals) -> dict[str, str]:
     """Sentences on how many readings the scatter plots show, empty where it is all."""
     from elastocal.report.residual_figures import MOST_IN_MATRIX, MOST_JOINT_DOTS
 

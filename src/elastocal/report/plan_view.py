@@ -8,6 +8,7 @@ import numpy as np
 
 from elastocal.design.plan import Plan
 from elastocal.design.reasons import Predicted, Reason
+from elastocal.errors import option
 from elastocal.report.formatting import TextTable, Tone, counted, display, printable, significant
 
 TOLD = 2  # parameters that a pose serves, in the table
@@ -170,13 +171,13 @@ def plan_steps(plan: Plan) -> list[str]:
     steps = ["Measure the poses in the order given: it is short, and every move was checked."]
     if plan.criterion == "test_pose":
         steps.append(
-            "If ρ₀ is not small enough: --target finds the fewest poses that reach a value, "
-            "--curve compares numbers of poses."
+            f"If ρ₀ is not small enough: {option('target')} finds the fewest poses that reach a "
+            f"value, {option('curve')} compares numbers of poses."
         )
     if _beyond(plan) is not None:
         steps.append(
-            "For a better plan: more --candidates, or --effort thorough, which polishes poses "
-            "between them."
+            f"For a better plan: more {option('candidates')}, or {option('effort', 'thorough')}, "
+            "which polishes poses between them."
         )
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:

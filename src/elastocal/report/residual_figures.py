@@ -11,7 +11,7 @@ from scipy import stats
 
 from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.observation import Observations
 from elastocal.report.arm_view import Space
 from elastocal.report.figures import FAINT, INK, SERIES, dots, drawn
@@ -103,7 +103,7 @@ def against_joints(kinds: Sequence[str], residuals: Residuals) -> str:
     return drawn(draw, WIDTH, 0.4 + 2.0 * rows, "Residuals against joint positions")
 
 
-def errors(result: IdentificationResult) -> str:
+def errors(result: Calibration) -> str:
     """Nominal, fitted, held-out and test rms on one axis, logarithmic where they differ much."""
     rows = [(name, v) for name, v in rms_by_kind(result) if np.isfinite(v) and v > 0]
 
@@ -130,7 +130,7 @@ def errors(result: IdentificationResult) -> str:
     return drawn(draw, WIDTH / 2, 2.9, "Nominal, fitted, held-out and test error")
 
 
-def held_out(result: IdentificationResult, residuals: Residuals) -> str:
+def held_out(result: Calibration, residuals: Residuals) -> str:
     """Held-out against fitted rms of every configuration: far above the line, few others help."""
     fitted, held = rms_by_pose(result, residuals)
     finite = np.isfinite(held)
@@ -365,7 +365,7 @@ def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
     axes.set_aspect("equal")
 
 
-def correlation_matrix(result: IdentificationResult) -> str:
+def correlation_matrix(result: Calibration) -> str:
     """Correlations of the parameters that the data determine; empty where there are fewer than two.
 
     Size by the shade, sign by hatching or number, so that no colour has to be told apart.
@@ -403,7 +403,7 @@ def correlation_matrix(result: IdentificationResult) -> str:
     return drawn(draw, size, 0.92 * size, "Correlations between the parameters")
 
 
-def correlations(result: IdentificationResult) -> tuple[list[str], Array]:
+def correlations(result: Calibration) -> tuple[list[str], Array]:
     """Names and correlations (n, n) of the determined parameters with a finite variance; of many,
     those that correlate most."""
     variance = np.diag(result.covariance)
@@ -419,7 +419,7 @@ def correlations(result: IdentificationResult) -> tuple[list[str], Array]:
 
 
 def drawn_for(
-    result: IdentificationResult,
+    result: Calibration,
     residuals: Residuals,
     summary: ResidualSummary | None,
     budget: ErrorBudget | None,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from elastocal.identification.noise import WeightKind, weights_for
 from elastocal.identification.residual_groups import groupings
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.observation import COMPONENTS, Observations
 from elastocal.report.formatting import TextTable, printable, significant
 
@@ -44,7 +44,7 @@ class Residuals:
         return self.units.count("µm")
 
 
-def residuals_of(result: IdentificationResult) -> Residuals:
+def residuals_of(result: Calibration) -> Residuals:
     return residuals_by(result.observations, result.residual)
 
 
@@ -74,14 +74,14 @@ def residuals_by(seen: Observations, residual: Array) -> Residuals:
     )
 
 
-def summary_of(result: IdentificationResult) -> ResidualSummary | None:
+def summary_of(result: Calibration) -> ResidualSummary | None:
     """The result's own summary of its whitened residuals, else one of the standardised ones."""
     if result.residual_summary is not None:
         return result.residual_summary
     return summarise_residuals(result.observations, standardised(result), absolute=False)
 
 
-def standardised(result: IdentificationResult) -> Array:
+def standardised(result: Calibration) -> Array:
     """Weighted residuals (rows,) over their standard deviation; unweighted where the result does
     not hold the weights: those of a given matrix or of an estimated noise."""
     seen, kind = result.observations, result.noise.kind
@@ -96,7 +96,7 @@ def standardised(result: IdentificationResult) -> Array:
     return (parts / np.where(spread > 0, spread, 1.0)).ravel()
 
 
-def rms_by_pose(result: IdentificationResult, residuals: Residuals) -> tuple[Array, Array]:
+def rms_by_pose(result: Calibration, residuals: Residuals) -> tuple[Array, Array]:
     """Fitted and held-out 3-D rms (configurations,) in µm; infinite where nothing is held out."""
     size = result.observations.size
     count = np.bincount(residuals.pose)

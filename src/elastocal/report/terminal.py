@@ -1,19 +1,22 @@
-"""Results for the terminal: tables and lines."""
+"""Results as plain text and for the terminal: tables and lines."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from io import StringIO
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
-from rich.table import Table as RichTable
 from rich.text import Text
 
+from elastocal.compensation.commands_file import summary
+from elastocal.compensation.compensate import Compensation
 from elastocal.design.plan import Plan
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.identification.findings import ALONE
-from elastocal.identification.result import Combination, Estimate, IdentificationResult
+from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.report.diagnosis_view import (
     BUDGET_HEADS,
     CANDIDATE_HEADS,
@@ -31,7 +34,15 @@ from elastocal.report.diagnosis_view import (
     pair_rows,
     untested_rows,
 )
-from elastocal.report.formatting import TextTable, capital, display, plain, printable, together
+from elastocal.report.formatting import (
+    TextTable,
+    capital,
+    display,
+    length,
+    plain,
+    printable,
+    together,
+)
 from elastocal.report.identification_view import (
     Truth,
     any_lopsided,
@@ -50,6 +61,40 @@ from elastocal.report.identification_view import (
 )
 from elastocal.report.method_and_noise import candidate_rows, size_rows
 from elastocal.report.plan_view import curve_rows, interval_rows, plan_lines, pose_rows, reason_rows
+
+PRINTED_WIDTH = 100  # columns of a result as plain text
+
+
+def identification_text(result: Calibration) -> str:
+    """What `print` shows of an identification: parameters with their intervals, and what holds."""
+    return _plain_text(lambda console: print_result(console, result))
+
+
+def plan_text(plan: Plan) -> str:
+    """What `print` shows of a plan: its poses, what it promises, how far from the best it is."""
+    return _plain_text(lambda console: print_plan(console, plan))
+
+
+def diagnosis_text(d: Diagnosis) -> str:
+    """What `print` shows of a diagnosis: the verdict, the gap budget, the candidates."""
+    base = d.calibrated
+    joints = len(d.noise.repeatability)
+    kinds = ("revolute",) * joints if base is None else base.model.chain.kinds
+    return _plain_text(lambda console: print_diagnosis(console, d, kinds))
+
+
+def compensation_text(c: Compensation) -> str:
+    """What `print` shows of commands: errors before and after, and what could not be reached."""
+    content = {"commands": summary(c, c.chain.kinds, commands=False)}
+    return _plain_text(lambda console: print_compensation(console, content))
+
+
+def _plain_text(printed: Callable[[Console], None]) -> str:
+    """What is printed, without colours and trailing blanks."""
+    console = Console(file=StringIO(), width=PRINTED_WIDTH, color_system=None, highlight=False)
+    with console.capture() as capture:
+        printed(console)
+    return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
 
 
 def titled(title: str) -> Table:
@@ -71,7 +116,7 @@ STYLE = {"inside": "green", "outside": "bold red"}
 
 
 def parameter_table(
-    result: IdentificationResult,
+    result: Calibration,
     truth: Truth | None = None,
     undetermined: bool = True,
     brief: bool = False,
@@ -107,7 +152,7 @@ def parameter_table(
 
 
 def combination_table(
-    result: IdentificationResult, truth: Truth | None = None, brief: bool = False
+    result: Calibration, truth: Truth | None = None, brief: bool = False
 ) -> Table:
     """Sums of parameters that the data determine although their members they do not."""
     lopsided = any_lopsided(result.combinations)
@@ -119,7 +164,7 @@ def combination_table(
     return table
 
 
-def noise_tables(result: IdentificationResult) -> list[Table]:
+def noise_tables(result: Calibration) -> list[Table]:
     """Sizes of the estimated noise, and the noise models tried with their criterion over the best.
 
     A table that would have a single row is left out: the summary says it.
@@ -141,9 +186,7 @@ def noise_tables(result: IdentificationResult) -> list[Table]:
     return tables
 
 
-def print_result(
-    console: Console, result: IdentificationResult, truth: Truth | None = None
-) -> None:
+def print_result(console: Console, result: Calibration, truth: Truth | None = None) -> None:
     """Single estimates, combinations, what is not determined, and the summary in words."""
     brief = console.width < NARROW
     alone = len(names_of(result, ALONE))
@@ -223,7 +266,7 @@ def print_plan(console: Console, plan: Plan) -> None:
         console.print(Text.assemble((f"{label}: ", style), text))
 
 
-def _narrow_poses(console: Console, plan: Plan) -> RichTable:
+def _narrow_poses(console: Console, plan: Plan) -> Table:
     """The poses with as many decimals as there is room for; plan.csv has all of them."""
     room = console.options.update(max_width=WIDE_FOR_REASONS)
     for decimals in (2, 1):
@@ -233,27 +276,27 @@ def _narrow_poses(console: Console, plan: Plan) -> RichTable:
     return pose_table(plan, reasons=False, decimals=0)
 
 
-def pose_table(plan: Plan, reasons: bool = True, decimals: int = 2) -> RichTable:
+def pose_table(plan: Plan, reasons: bool = True, decimals: int = 2) -> Table:
     """Joint values, load, place in the order of execution, and what the pose is there for."""
     return _printed("Poses", pose_rows(plan, reasons, decimals))
 
 
-def reason_table(plan: Plan) -> RichTable:
+def reason_table(plan: Plan) -> Table:
     """What each pose is there for."""
     return _printed("Why each pose", reason_rows(plan))
 
 
-def interval_table(plan: Plan) -> RichTable:
+def interval_table(plan: Plan) -> Table:
     """Predicted half widths of the 95 % intervals."""
     return _printed("Predicted intervals", interval_rows(plan))
 
 
-def curve_table(plan: Plan) -> RichTable:
+def curve_table(plan: Plan) -> Table:
     """The criterion against the number of poses."""
     return _printed("Number of poses", curve_rows(plan))
 
 
-def _printed(title: str, table: TextTable) -> RichTable:
+def _printed(title: str, table: TextTable) -> Table:
     """For the terminal: joints and words may wrap, other numbers may not."""
     shown = titled(title)
     for k, head in enumerate(table.heads):
@@ -327,3 +370,51 @@ def _rows_table(title: str, heads: Sequence[str], rows: Rows) -> Table:
     for row in rows:
         table.add_row(*map(Text, row[: len(heads)]))
     return table
+
+
+def print_compensation(console: Console, content: dict[str, Any]) -> None:
+    """Errors before and after, uncertainty and warnings.
+
+    `content`: the summary of the `commands`, that of the correction `table`, or both.
+    """
+    commands, table = content.get("commands"), content.get("table")
+    if commands is not None:
+        rows = {
+            "nominal command": commands["error_before_um"],
+            "new command": commands["error_after_um"],
+            "standard uncertainty": commands["std_um"],
+        }
+        _print_spreads(console, "Position of the tool, predicted", rows)
+        for k, command in enumerate(commands.get("commands", ())):
+            joints = ", ".join(f"{n} {v:.6f}" for n, v in command.items() if n != "status")
+            console.print(f"target {k + 1}: {joints or command['status']}")
+        console.print(
+            f"{commands['reached']} of {commands['n']} targets reached by the {commands['point']}; "
+            f"targets in the {commands['frame']} frame.",
+            markup=False,  # a marker may be called [red]
+        )
+        for told in commands["warnings"]:
+            console.print(f"Warning: {told}", markup=False)
+    if table is not None:
+        rows = {"without the table": table["error_without_um"]}
+        rows["with it, interpolated"] = table["error_with_um"]
+        title = f"Position of the tool at {table['checked_between']} points between the grid's"
+        _print_spreads(console, title, rows)
+        console.print(
+            f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
+            "first order (beside singular postures or limits)."
+        )
+
+
+def _fine_length(um: float) -> str:
+    return "< 0.01 µm" if um < 0.01 else length(um * 1e-6)
+
+
+def _print_spreads(console: Console, title: str, rows: dict[str, dict[str, Any]]) -> None:
+    shown = titled(title)
+    shown.add_column("")
+    for head in ("rms", "95 %", "max"):
+        shown.add_column(head, justify="right")
+    for name, values in rows.items():
+        shown.add_row(name, *("–" if v is None else _fine_length(v) for v in values.values()))
+    console.print(shown)
