@@ -25,7 +25,7 @@ import numpy as np
 from elastocal.cell import read_cell
 from elastocal.identification import partition
 from elastocal.identification.identify import identify
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
@@ -148,7 +148,7 @@ def compared(cell_path: Path, data: Path) -> None:
     """The same table whole and in parts: seconds, and the largest differences."""
     model, table = load(cell_path, data)
 
-    def run(large: int) -> tuple[IdentificationResult, float]:
+    def run(large: int) -> tuple[Calibration, float]:
         partition.LARGE = large
         start = time.perf_counter()
         return identify(model, table), time.perf_counter() - start

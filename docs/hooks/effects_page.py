@@ -14,7 +14,7 @@ from elastocal.manipulator.choice import load_chain
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.effects.base import Effect
 from elastocal.manipulator.parameter import ParameterSpec, Setting
-from elastocal.report.units import display
+from elastocal.report.formatting import display
 
 STAGES = {
     "transmission": "Transmission: what the gears make of the commanded joints",

@@ -11,7 +11,7 @@ from prepare import HERE, prepare
 from elastocal.cell import read_cell
 from elastocal.identification.identify import Options, identify
 from elastocal.identification.outliers import blocks
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
 from elastocal.measurements import Measurements, read_measurements
@@ -19,7 +19,7 @@ from elastocal.measurements import Measurements, read_measurements
 SPLITS, TEST_SHARE = 5, 0.2
 
 
-def rmse(model: Model, result: IdentificationResult, rows: Measurements) -> float:
+def rmse(model: Model, result: Calibration, rows: Measurements) -> float:
     """Root mean square error in mm of the predicted cable length."""
     error = observe(rows, model.observe).value - model.predict(rows, result.x)
     return float(np.sqrt(np.mean(error**2))) * 1e3

@@ -23,10 +23,7 @@ from pydantic_core import PydanticCustomError
 
 from elastocal.errors import InputError
 from elastocal.files import read_text
-from elastocal.text import did_you_mean
-from elastocal.text import listed
-from elastocal.text import nearest
-from elastocal.text import quoted
+from elastocal.text import did_you_mean, listed, nearest, quoted
 
 MAX_BYTES = 5_000_000
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)

@@ -17,7 +17,11 @@ VIEWS = "elastocal.report.notebook"
 
 
 class ForNotebooks:
-    """Gives a result `_repr_html_`, `plot` and `to_dataframe`."""
+    """Gives a result `__str__`, `_repr_html_`, `plot` and `to_dataframe`."""
+
+    def __str__(self) -> str:
+        """The result as the command line prints it: tables and sentences."""
+        return str(_view(self).text(self))
 
     def _repr_html_(self) -> str:
         """The result as HTML, which notebooks show of themselves; text of the user is escaped."""

@@ -33,7 +33,8 @@ _files: dict[Path, tuple[int, int]] = {}  # files that were run, as they were th
 def load_plugins(cell: Path | None = None, modules: Sequence[str] = ()) -> None:
     """Run the plug-ins of installed packages, and the `modules` that the file `cell` names.
 
-    A name that ends with .py is the path of a file; any other is a module that can be imported.  What has been run is not run again, but for a file that has changed.
+    A name that ends with .py is the path of a file; any other is a module that can be imported.
+    What has been run is not run again, but for a file that has changed.
 
     Raises InputError that names the plug-in, its file and the line, where one cannot be run.
     """
@@ -142,6 +143,8 @@ def _told(error: BaseException, path: Path | None) -> str:
 
 def _send_by_value(module: ModuleType) -> None:
     """Worker processes, which have not run the file, are sent its classes themselves."""
-    from cloudpickle import register_pickle_by_value
-
+    try:
+        from cloudpickle import register_pickle_by_value
+    except ImportError:  # joblib before 1.6 carries its own
+        from joblib.externals.cloudpickle import register_pickle_by_value
     register_pickle_by_value(module)

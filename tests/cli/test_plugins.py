@@ -25,8 +25,7 @@ from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
-from elastocal.measurements import write_measurements
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, write_measurements
 from elastocal.plugins import load_plugins
 
 CELL = f"""\

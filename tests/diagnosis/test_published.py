@@ -11,7 +11,8 @@ from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, EXTRA, UNKNOWN, VERDICTS
 
 from elastocal.diagnosis.published import publish
-from elastocal.diagnosis.result import Diagnosis, Gap, Step
+from elastocal.diagnosis.result import Diagnosis, Gap
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.manipulator.model import Model
 
 
@@ -68,7 +69,7 @@ def test_what_is_not_known_is_null(model):
     unknown = replace(
         EXPLAINED,
         gap=Gap(math.nan, math.inf, 1e-5, 1e-5),
-        budget=(Step("nominal", math.inf, (-math.inf, math.nan)),),
+        budget=(BudgetStep("nominal", math.inf, (-math.inf, math.nan)),),
         location=None,
         noise=replace(EXPLAINED.noise, pure_error=None),
     )

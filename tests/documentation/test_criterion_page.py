@@ -14,7 +14,7 @@ from elastocal.design.design import design
 from elastocal.design.options import DesignOptions
 from elastocal.errors import InputError
 from elastocal.planning.criteria import CRITERIA, make_criterion, register
-from elastocal.report.plan_tables import plan_lines
+from elastocal.report.plan_view import plan_lines
 
 PAGE = Path(__file__).parents[2] / "docs" / "adding-a-criterion.md"
 BOUNDED, USED, UNBOUNDED = re.findall(

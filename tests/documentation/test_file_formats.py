@@ -19,7 +19,7 @@ from elastocal.diagnosis.result import Curve, Untested
 from elastocal.diagnosis.separate.result import RivalPair
 from elastocal.identification.knowledge import KnowledgeTable
 from elastocal.identification.outlier import Outlier
-from elastocal.identification.robust.report import Finding
+from elastocal.identification.robust.report import FaultyGroup
 from elastocal.manipulator.dh import DH_FAMILIES
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
@@ -89,7 +89,11 @@ def test_every_column_of_the_dh_table_is_on_the_page():
 
 def test_every_key_of_an_identification_is_on_the_page(course):
     text = section("Result of `identify`")
-    rare = [*(f.name for f in fields(Outlier)), *(f.name for f in fields(Finding)), "moves_most"]
+    rare = [
+        *(f.name for f in fields(Outlier)),
+        *(f.name for f in fields(FaultyGroup)),
+        "moves_most",
+    ]
     rare.remove("column")  # published as moves_most
     for result in course.results:
         assert not missing([*keys(result), *rare], text)

@@ -257,10 +257,10 @@ def test_pose_observation(stated):
     plan = table_at(random_poses(chain, 30, 3))
     table = simulate(true, replace(plan, rotation=np.zeros((30, 3))), truth, rng)
     result = identify(model, table)
-    assert result.noise["kind"] == ("stated" if stated else "independent")
+    assert result.noise.kind == ("stated" if stated else "independent")
     if stated:  # s² · dof is χ²(dof)
         low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], result.dof)
-        assert low < result.noise["ratio_to_stated"] ** 2 * result.dof < high
+        assert low < result.noise.ratio_to_stated**2 * result.dof < high
     assert_one_arm_is_covered(result, truth)
     assert len(result.residual) == 180
 

@@ -55,16 +55,16 @@ def test_p_values_are_uniform_where_nothing_lacks():
     p = []
     for seed in range(60):
         model, table = campaign(seed)
-        p.append(identify(model, table).noise["lack_of_fit"]["p"])
+        p.append(identify(model, table).noise.lack_of_fit.p)
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
 def test_a_configuration_effect_is_told():
     model, table = campaign(3, effect=1e-4)
     result = identify(model, table, Options(method="ols"))
-    found = result.noise["lack_of_fit"]
+    found = result.noise.lack_of_fit
     # The effect's variance is 4 times a reading's; means of 4 readings carry it whole.
-    assert found["p"] < 1e-6 and 5 < found["F"] < 50
+    assert found.p < 1e-6 and 5 < found.F < 50
     assert any(w.startswith(SENTENCE) for w in result.warnings)
     json.dumps(result.to_json(), allow_nan=False)
 
@@ -73,14 +73,12 @@ def test_the_default_counts_with_a_configuration_effect():
     """The same table: the effect is in the noise model, so intervals are wider and nobody warns."""
     model, table = campaign(3, effect=1e-4)
     plain, result = identify(model, table, Options(method="ols")), identify(model, table)
-    assert result.noise["kind"].endswith("+configuration")
-    assert result.noise["lack_of_fit"]["p"] < 1e-6
+    assert result.noise.kind.endswith("+configuration")
+    assert result.noise.lack_of_fit.p < 1e-6
     assert not any(w.startswith(SENTENCE) for w in result.warnings)
     assert np.trace(result.covariance) > 2 * np.trace(plain.covariance)
-    (common,) = (
-        v for v in result.noise["variances"] if v["name"] == "common to each configuration"
-    )
-    assert 50 < common["sigma_um"] < 200  # 100 µm, from a handful of configurations
+    (common,) = (s for s in result.noise.sizes if s.name == "common to each configuration")
+    assert 50e-6 < common.sigma < 200e-6  # 100 µm, from a handful of configurations
 
 
 def test_a_clean_campaign_is_left_in_peace():
@@ -91,5 +89,5 @@ def test_a_clean_campaign_is_left_in_peace():
 def test_without_repeats_there_is_no_test():
     model, table = campaign(5, repeats=1)
     result = identify(model, table)
-    assert result.noise["lack_of_fit"] is None
+    assert result.noise.lack_of_fit is None
     assert not any(w.startswith(SENTENCE) for w in result.warnings)

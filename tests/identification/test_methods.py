@@ -21,8 +21,8 @@ from elastocal.errors import InputError
 from elastocal.identification import published
 from elastocal.identification.identify import Options, identify
 from elastocal.identification.intervals import KINDS as INTERVALS
-from elastocal.identification.options import METHODS, ROBUST
 from elastocal.identification.intervals import KINDS as NOISES
+from elastocal.identification.options import METHODS, ROBUST
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
 from elastocal.simulation.simulate import simulate
@@ -160,12 +160,12 @@ def test_robust_intervals_hold_with_outliers():
 def test_every_noise_model_by_name(noise):
     model, table, truth = campaign(2, effect=1e-4)
     result = identify(model, table, Options(noise=noise))
-    assert result.noise["kind"] == noise and result.noise["reason"] == "as asked for"
+    assert result.noise.kind == noise and result.noise.reason == "as asked for"
     assert np.isfinite(result.covariance).all()
     if noise.endswith("+configuration"):
         assert np.abs(z(result, truth)).max() < 4.5
-        sizes = {v["name"]: v["sigma_um"] for v in result.noise["variances"]}
-        assert 50 < sizes["common to each configuration"] < 200
+        sizes = {s.name: s.sigma for s in result.noise.sizes}
+        assert 50e-6 < sizes["common to each configuration"] < 200e-6
 
 
 @pytest.mark.parametrize("noise", ["marker", "groups"])
@@ -173,7 +173,7 @@ def test_variances_bear_the_names_that_the_table_gives(noise):
     model, table, _ = campaign(2)
     poses = tuple(f"pose {c}" for c in table.configuration_labels)
     result = identify(model, replace(table, configuration_labels=poses), Options(noise=noise))
-    found = {v["name"].split(",")[0] for v in result.noise["variances"]}
+    found = {s.name.split(",")[0] for s in result.noise.sizes}
     used = (table.marker_names, table.marker) if noise == "marker" else (poses, table.configuration)
     kind = "marker" if noise == "marker" else "configuration"
     assert found == {f"{kind} {used[0][k]}" for k in np.unique(used[1])}
@@ -182,13 +182,13 @@ def test_variances_bear_the_names_that_the_table_gives(noise):
 def test_auto_says_what_it_chose_and_from_what():
     model, table, _ = campaign(3, effect=1e-4, stated=False)
     noise = identify(model, table).noise
-    assert noise["kind"].endswith("+configuration")
-    assert {t["kind"].removesuffix("+configuration") for t in noise["tried"]} >= {
+    assert noise.kind.endswith("+configuration")
+    assert {t.kind.removesuffix("+configuration") for t in noise.tried} >= {
         "independent", "axis", "marker", "groups", "polar",
     }  # fmt: skip
-    assert "smallest information criterion" in noise["reason"]
-    best = min(noise["tried"], key=lambda t: t["criterion"])
-    assert best["kind"] == noise["kind"]
+    assert "smallest information criterion" in noise.reason
+    best = min(noise.tried, key=lambda t: t.criterion)
+    assert best.kind == noise.kind
 
 
 def test_intervals_hold_where_the_arm_does_not_come_back_to_the_same_place():
@@ -216,7 +216,7 @@ def test_every_kind_of_intervals(kind):
     model, table, truth = campaign(4)
     options = Options(method="ols", intervals=kind)
     result, plain = identify(model, table, options), identify(model, table, Options(method="ols"))
-    assert result.noise["intervals"]["kind"].lower() == ("classical" if kind == "auto" else kind)
+    assert result.noise.interval_kind.lower() == ("classical" if kind == "auto" else kind)
     for name, true in zip(model.names, truth, strict=True):
         mine, other = result.estimate(name), plain.estimate(name)
         width = (mine.ci95[1] - mine.ci95[0]) / (other.ci95[1] - other.ci95[0])

@@ -285,7 +285,7 @@ def test_unit_weights_are_ols_and_worse():
     truth = true_values(model, rng)
     table = simulate(model, plan, truth, rng)
     weighted, unit = identify(model, table), identify(model, table, Options(weights="none"))
-    assert unit.method == "ols" and unit.noise["kind"] == "none"
+    assert unit.method == "ols" and unit.noise.kind == "none"
     assert np.trace(unit.covariance) > 4 * np.trace(weighted.covariance)
 
 
@@ -306,10 +306,10 @@ def test_ratio_to_stated_noise():
     plan = table_at(random_poses(model.chain, 30, 7))
     result = identify(model, simulate(model, plan, truth, rng))
     low, high = chi2_band(result.dof)
-    assert low < result.noise["ratio_to_stated"] ** 2 * result.dof < high
+    assert low < result.noise.ratio_to_stated**2 * result.dof < high
     assert result.noise["sigma_um"] is None
     unit = identify(model, measured(model, plan, truth, 5e-5, rng), Options(weights="none"))
     # Unit weights do not make the stated 20, 20, 50 µm forgotten.
-    assert unit.noise["ratio_to_stated"] == pytest.approx(np.sqrt((6.25 + 6.25 + 1) / 3), rel=0.2)
+    assert unit.noise.ratio_to_stated == pytest.approx(np.sqrt((6.25 + 6.25 + 1) / 3), rel=0.2)
     low, high = chi2_band(unit.dof)
     assert low < (unit.noise["sigma_um"] / 50) ** 2 * unit.dof < high

@@ -11,9 +11,9 @@ from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_
 from elastocal.cell import CartesianNoise, Tracker
 from elastocal.identification.identify import Options, identify
 from elastocal.identification.options import Method
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.model import Model
-from elastocal.report import identification_figures
+from elastocal.report import page as report_pages
 from elastocal.simulation.simulate import simulate, values_from
 
 EFFECTS = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
@@ -26,7 +26,7 @@ SIGMA = 3e-5
 class Case:
     """A result and the true values behind it."""
 
-    result: IdentificationResult
+    result: Calibration
     truth: dict[str, float]
 
 
@@ -112,4 +112,4 @@ def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
              "groups", "histograms", "waterfall", "matrix", "space", "over_time",
              "by_region")  # fmt: skip
     drawn = dict.fromkeys(names, "<svg></svg>")
-    monkeypatch.setattr(identification_figures, "drawn_for", lambda *_: drawn)
+    monkeypatch.setattr(report_pages, "drawn_for", lambda *_: drawn)

@@ -23,9 +23,7 @@ from elastocal.design.design import design
 from elastocal.design.options import DesignOptions
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.manipulator.model import Model
-from elastocal.report.diagnosis_page import diagnosis_page
-from elastocal.report.html import report_page
-from elastocal.report.plan_page import plan_page
+from elastocal.report.page import diagnosis_page, identification_page, plan_page
 from elastocal.tracker_noise import CartesianNoise
 
 playwright = pytest.importorskip("playwright.sync_api")
@@ -73,7 +71,7 @@ def texts(hostile: Any) -> dict[str, str]:
     cell = replace(cell, tracker=Tracker(noise=CartesianNoise(np.full(3, 1e-5))), design=spec)
     planned = design(cell, DesignOptions(effort="quick"))
     return {
-        "identification": report_page(hostile.result, command="elastocal identify"),
+        "identification": identification_page(hostile.result, command="elastocal identify"),
         "diagnosis": diagnosis_page(replace(EXPLAINED, calibrated=base), arm, HOSTILE),
         "plan": plan_page(planned),
     }

@@ -12,10 +12,11 @@ from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, EXTRA, HOSTILE, TWO, VERDICTS
 from support.pages import Page
 
-from elastocal.diagnosis.result import FaultyReading, Step
+from elastocal.diagnosis.result import FaultyReading
 from elastocal.errors import InputError
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.manipulator.model import Model
-from elastocal.report.diagnosis_page import diagnosis_page, write_diagnosis_report
+from elastocal.report.page import diagnosis_page, write_diagnosis_report
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +104,10 @@ def test_extra_poses_in_people_s_units(pages):
 
 
 def test_numbers_that_are_not_known_do_not_break_the_page(model):
-    steps = (Step("nominal", float("inf"), (float("nan"),) * 2), Step("a", 0.0, (0.0, 0.0)))
+    steps = (
+        BudgetStep("nominal", float("inf"), (float("nan"),) * 2),
+        BudgetStep("a", 0.0, (0.0, 0.0)),
+    )
     gap = replace(EXPLAINED.gap, noise_floor=float("nan"))
     Page(diagnosis_page(replace(EXPLAINED, budget=steps, gap=gap), model, "data.csv"))
     bare = replace(EXPLAINED, budget=(), candidates=(), structure=(), untested=(), warnings=())

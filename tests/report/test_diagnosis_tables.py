@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from support.diagnoses import EXPLAINED, EXTRA, VERDICTS
 
-from elastocal.report.diagnosis_tables import MOST_CANDIDATES, print_diagnosis
+from elastocal.report.terminal import MOST_CANDIDATES_PRINTED, print_diagnosis
 
 KINDS = ("revolute",) * 6
 
@@ -35,7 +35,7 @@ def test_every_step_and_the_best_candidates_are_listed():
     for step in ("nominal", "base frame", "joint offset", "gear eccentricity at joint 2"):
         assert step in text
     listed = [c.effect.replace("_", " ") in text for c in EXPLAINED.candidates]
-    assert listed == [True] * MOST_CANDIDATES + [False] * 2
+    assert listed == [True] * MOST_CANDIDATES_PRINTED + [False] * 2
     assert "joint2.eccentricity_sin" in text and "mrad" in text
     assert "no further effect" in text and "an effect outside the catalogue" in text
 

@@ -26,30 +26,30 @@ from support.diagnoses import (
 )
 
 from elastocal.diagnosis.result import EffectAt, NoiseFloor
-from elastocal.report.diagnosis_rows import budget_rows, candidate_rows, untested_rows
-from elastocal.report.diagnosis_verdict import (
-    headline,
-    hidden_below,
-    next_steps,
-    sensitivity,
-    verdict_lines,
-)
-from elastocal.report.diagnosis_words import (
+from elastocal.report.diagnosis_view import (
+    diagnosis_headline,
+    diagnosis_lines,
+    diagnosis_steps,
     effect_at,
+    gap_rows,
+    hypothesis_rows,
     name_of,
-    noise_lines,
+    noise_floor_lines,
     p_value,
     probability,
     reduction,
+    seen_from,
+    sensitivity,
     settings_text,
-    together,
+    untested_rows,
 )
+from elastocal.report.formatting import together
 
 KINDS = ("revolute",) * 6
 
 
 def spoken(d):
-    return " ".join(text for _, text in verdict_lines(d)) + " ".join(next_steps(d))
+    return " ".join(text for _, text in diagnosis_lines(d)) + " ".join(diagnosis_steps(d))
 
 
 def test_an_explained_gap_names_effect_probability_and_both_errors():
@@ -68,26 +68,26 @@ def test_of_two_effects_each_has_its_share():
 
 def test_an_ambiguous_verdict_names_the_whole_set_and_the_way_out():
     text = spoken(AMBIGUOUS)
-    assert headline(AMBIGUOUS) == (
+    assert diagnosis_headline(AMBIGUOUS) == (
         "Either gear eccentricity at joint 2 or link mass error of link 2 makes the gap; these "
         "data cannot tell which."
     )
     assert "explain" not in text
-    assert "Gear eccentricity at joint 2 (probability" not in headline(AMBIGUOUS)
-    assert "--plan" in text
+    assert "Gear eccentricity at joint 2 (probability" not in diagnosis_headline(AMBIGUOUS)
+    assert "(`plan`)" in text
 
 
 def test_an_effect_that_is_certain_beside_an_open_set_is_told_apart_from_it():
     sure = replace(ECCENTRICITY, effect="encoder_jump", where="joint1", probability=0.99)
     d = replace(AMBIGUOUS, effects=(*AMBIGUOUS.effects, sure))
-    labels = {label for label, text in verdict_lines(d) if "encoder jump" in text}
+    labels = {label for label, text in diagnosis_lines(d) if "encoder jump" in text}
     assert "Besides" in labels and "Likeliest" not in labels
-    assert ("Likeliest", "gear eccentricity at joint 2 (probability 0.58).") in verdict_lines(d)
+    assert ("Likeliest", "gear eccentricity at joint 2 (probability 0.58).") in diagnosis_lines(d)
 
 
 def test_two_open_sets_are_two_questions():
     pair = (EffectAt("joint_drift", "joint1"), EffectAt("base_drift", "base"))
-    text = headline(replace(AMBIGUOUS, indistinguishable=(*RIVALS, pair)))
+    text = diagnosis_headline(replace(AMBIGUOUS, indistinguishable=(*RIVALS, pair)))
     assert "and either joint drift at joint 1 or base drift make the gap" in text
 
 
@@ -97,24 +97,25 @@ def test_an_unknown_effect_has_a_place_a_driver_and_a_chance_but_no_name():
     assert "joint 2 angle (p = 0.0040)" in text
     assert "p < 0.001" in text
     # The curve is 80 µrad · sin(3q) over more than a turn of its argument.
-    assert "Shape" in dict(verdict_lines(UNKNOWN))
+    assert "Shape" in dict(diagnosis_lines(UNKNOWN))
     (moved,) = re.findall(r"joint 2 angle moves joint 2 rotation by ([\d.]+) mrad", text)
     assert float(moved) == pytest.approx(0.16, rel=0.01)
     # Tests that the whole family explains by chance are not told as findings.
     assert "joint 3 torque" not in text and "load (p" not in text
     assert not any(effect_at(c) in text for c in UNKNOWN.candidates)
-    assert "--plan" in text
+    assert "(`plan`)" in text
 
 
 def test_what_is_named_beside_something_unknown_has_to_prove_itself():
     beside = replace(UNKNOWN, effects=EXPLAINED.effects)
-    (step,) = [line for line in next_steps(beside) if "--cell-out" in line]
-    assert all(effect_at(f) in step for f in EXPLAINED.effects) and "--test" in step
-    assert not any("--cell-out" in line for line in next_steps(UNKNOWN))
+    (step,) = [line for line in diagnosis_steps(beside) if "`cell_out`" in line]
+    assert "effects named" in step and "identify with `test`" in step
+    assert all(effect_at(f) in diagnosis_headline(beside).lower() for f in EXPLAINED.effects)
+    assert not any("`cell_out`" in line for line in diagnosis_steps(UNKNOWN))
 
 
 def test_an_unknown_effect_without_a_place_says_so():
-    assert "do not show where" in headline(VERDICTS["unlocated"])
+    assert "do not show where" in diagnosis_headline(VERDICTS["unlocated"])
 
 
 def test_the_smallest_effect_that_shows_has_distance_five():
@@ -131,7 +132,7 @@ def test_the_smallest_effect_that_shows_has_distance_five():
     ("d", "text"), [(50.0, "0.10"), (5.0, "1.0"), (0.1, "50"), (0.01, "> 100"), (0.0, "–")]
 )
 def test_a_size_that_no_arm_has_is_not_given_as_a_number(d: float, text: str):
-    assert hidden_below(d) == text
+    assert seen_from(replace(CANDIDATES[0], detectable=d)) == text
 
 
 def test_nothing_says_what_hides_in_the_noise_and_what_does_not():
@@ -140,24 +141,24 @@ def test_nothing_says_what_hides_in_the_noise_and_what_does_not():
     for hidden in ("thermal expansion", "link bending", "base compliance"):
         assert hidden in text
     assert "encoder jump" not in text
-    assert "0.93" in headline(NOTHING) and "p = 0.41" in spoken(NOTHING)
+    assert "0.93" in diagnosis_headline(NOTHING) and "p = 0.41" in spoken(NOTHING)
 
 
 def test_extra_poses_promise_or_say_that_none_helps():
-    promise = " ".join(next_steps(replace(AMBIGUOUS, extra=EXTRA)))
+    promise = " ".join(diagnosis_steps(replace(AMBIGUOUS, extra=EXTRA)))
     assert "2 more poses" in promise and "from 0.69 to > 0.99" in promise and "0.85" in promise
-    assert "--plan" not in promise
+    assert "(`plan`)" not in promise
     assert "count as one" not in promise
     grouped = replace(EXTRA, inseparable=(("backlash:joint2", "encoder_scale:joint2"),))
-    lines = next_steps(replace(AMBIGUOUS, extra=grouped))
+    lines = diagnosis_steps(replace(AMBIGUOUS, extra=grouped))
     assert "Backlash at joint 2 and encoder scale at joint 2 count as one." in lines
-    hopeless = " ".join(next_steps(replace(AMBIGUOUS, extra=INSEPARABLE)))
+    hopeless = " ".join(diagnosis_steps(replace(AMBIGUOUS, extra=INSEPARABLE)))
     assert "No pose that this cell allows tells apart gear eccentricity at joint 2" in hopeless
     assert "rises" not in hopeless
 
 
 def test_the_same_advice_is_given_once():
-    advice = [s for s in next_steps(EXPLAINED) if "direction of the last motion" in s]
+    advice = [s for s in diagnosis_steps(EXPLAINED) if "direction of the last motion" in s]
     assert len(advice) == 1
     (row,) = untested_rows(EXPLAINED)
     assert row[0] == "hysteresis (joint 1, joint 2)"
@@ -166,7 +167,7 @@ def test_the_same_advice_is_given_once():
 @pytest.mark.parametrize("name", VERDICTS)
 def test_nothing_that_a_terminal_obeys_and_no_raw_names(name):
     d = VERDICTS[name]
-    text = spoken(d) + " ".join(noise_lines(d.noise, KINDS))
+    text = spoken(d) + " ".join(noise_floor_lines(d.noise, KINDS))
     assert "\x1b" not in text
     assert not re.search(r"\b(joint|link)[0-9]", text)
     assert "gear_" not in text
@@ -216,7 +217,7 @@ def test_lists():
 
 def test_budget_changes_add_up():
     """Change of every step, read back from its text, is the difference of the errors."""
-    table = budget_rows(EXPLAINED)
+    table = gap_rows(EXPLAINED)
     assert table[-1][:2] == ("noise alone", "19.0 µm")
     scale = {"mm": 1e-3, "µm": 1e-6}
 
@@ -229,7 +230,7 @@ def test_budget_changes_add_up():
 
 
 def test_candidates_seen_from_five_standard_deviations():
-    table = candidate_rows(EXPLAINED, 10)
+    table = hypothesis_rows(EXPLAINED, 10)
     for row, c in zip(table[:10], CANDIDATES, strict=True):
         if c.detectable:
             assert float(row[4]) * c.detectable == pytest.approx(5, rel=0.05)
@@ -243,10 +244,10 @@ def test_candidates_seen_from_five_standard_deviations():
 
 def test_noise_without_repeats_statement_or_faults():
     bare = NoiseFloor(False, 1.0, 2e-5, (0.0,) * 6, 0.0, None)
-    text = " ".join(noise_lines(bare, KINDS))
+    text = " ".join(noise_floor_lines(bare, KINDS))
     assert "nothing was stated" in text and "none that shows" in text
     assert "No reading is repeated" in text
     assert "faulty" not in text and "share" not in text
     mixed = replace(bare, repeatability=(1e-6,) * 6)
-    text = " ".join(noise_lines(mixed, ("prismatic", *KINDS[1:])))
+    text = " ".join(noise_floor_lines(mixed, ("prismatic", *KINDS[1:])))
     assert "joint 1 1.0 µm, joint 2 1.0 µrad" in text

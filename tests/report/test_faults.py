@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from elastocal.identification.outlier import Outlier
-from elastocal.identification.robust.report import Finding, OutlierReport
-from elastocal.report.faults import MOST_TOLD, fault_lines
-from elastocal.report.html import report_page
-from elastocal.report.tables import summary_lines
+from elastocal.identification.robust.report import FaultyGroup, OutlierReport
+from elastocal.report.identification_view import summary_lines
+from elastocal.report.method_and_noise import MOST_TOLD, fault_lines
+from elastocal.report.page import identification_page
 
-BLOCK = Finding(
+BLOCK = FaultyGroup(
     "block", "142 to 507", "common", tuple(range(366)), tuple(range(142, 508)), 366, 8.8, 8.8,
     1e-12, 23.0, 0,
 )  # fmt: skip
@@ -24,7 +24,7 @@ def outliers(lines: range, residual: float = 4.5e-3) -> tuple[Outlier, ...]:
     return tuple(Outlier(line, "7", "M1", residual, 9.0) for line in lines)
 
 
-def with_findings(result: Any, *findings: Finding, named: bool = True, **to: Any) -> Any:
+def with_findings(result: Any, *findings: FaultyGroup, named: bool = True, **to: Any) -> Any:
     n = len(result.determined)
     good = np.ones(len(result.observations.lead), dtype=bool)
     names = tuple(result.determined) if named else ()
@@ -87,7 +87,9 @@ def test_terminal_names_few_and_counts_the_rest(case: Any) -> None:
 
 def test_page_lists_every_group_beside_the_single_readings(case: Any, no_figures: None) -> None:
     groups = [replace(BLOCK, level="configuration", name=f"<b>{k}\x1b") for k in range(9)]
-    page = report_page(with_findings(case.result, *groups, excluded=outliers(range(142, 508))))
+    page = identification_page(
+        with_findings(case.result, *groups, excluded=outliers(range(142, 508)))
+    )
     section = page[page.index("<h2>Faulty readings") : page.index("<h2>To repeat")]
     assert section.count("<li>") == 9
     assert "at most 1 %" in section
@@ -100,7 +102,7 @@ def test_page_lists_every_group_beside_the_single_readings(case: Any, no_figures
 def test_group_without_a_reading_beyond_the_noise(case: Any, level: Any, no_figures: None) -> None:
     result = with_findings(case.result, replace(BLOCK, level=level, beyond=0))
     assert ", none of them beyond the noise alone" in fault_lines(result)[0]
-    page = report_page(result)
+    page = identification_page(result)
     assert "No single reading lies beyond" in page
 
 

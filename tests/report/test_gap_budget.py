@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from support.pages import Page
 
-from elastocal.report import gap_budget as module
-from elastocal.report.gap_budget import gap_budget
-from elastocal.report.rows import budget_table
-from elastocal.report.waterfall import waterfall
+from elastocal.identification import error_budget as module
+from elastocal.identification.error_budget import gap_budget
+from elastocal.report.figures import waterfall_of_steps
+from elastocal.report.identification_view import budget_steps, budget_table, rms_by_kind
 
 SIGMA = 3e-5  # m, of the readings of `case`
 
@@ -20,18 +20,20 @@ SIGMA = 3e-5  # m, of the readings of `case`
 def test_budget_goes_from_the_nominal_arm_to_the_held_out_error(case: Any) -> None:
     budget = gap_budget(case.result)
     assert budget is not None
-    names = ["nominal arm (base and markers placed)", "geometry", "compliance"]
-    assert [step.name for step in budget.steps] == names
-    first, middle, last = (step.rms for step in budget.steps)
+    assert [step.step for step in budget.steps] == ["nominal_arm", "geometry", "compliance"]
+    first, middle, last = (step.heldout_rms for step in budget.steps)
     # The nominal arm of the result has base and markers placed by all readings; here the
-    # configuration in question is left out.
+    # configuration in question is left out, and the name says so.
+    named = [name for name, *_ in budget_steps(case.result, budget)]
+    assert named == ["nominal arm (base and markers by other poses)", "geometry", "compliance"]
+    assert named[0] not in dict(rms_by_kind(case.result))
     assert first == pytest.approx(case.result.nominal_rms, rel=0.5)
     assert first > 3 * middle
     # The true compliances are the nominal ones: to fit them costs a little and buys nothing.
     assert middle == pytest.approx(last, rel=0.1) and middle < last
     assert last == pytest.approx(case.result.heldout_rms)
     for step in budget.steps:
-        assert step.ci95[0] < step.rms < step.ci95[1]
+        assert step.ci95[0] < step.heldout_rms < step.ci95[1]
 
 
 def test_floor_is_the_stated_noise_where_nothing_was_repeated(case: Any) -> None:
@@ -67,9 +69,9 @@ def test_no_budget_where_a_configuration_cannot_be_left_out(
 def test_table_and_figure_tell_the_same(case: Any) -> None:
     budget = gap_budget(case.result)
     assert budget is not None
-    rows = budget_table(budget).rows
-    assert [row[0] for row in rows] == [*(s.name for s in budget.steps), budget.floor_name]
-    steps = [(s.name, s.rms, s.ci95) for s in budget.steps]
-    text = Page(waterfall(steps, budget.floor, budget.floor_name)).text
+    rows = budget_table(case.result, budget).rows
+    steps = budget_steps(case.result, budget)
+    assert [row[0] for row in rows] == [*(name for name, *_ in steps), budget.floor_name]
+    text = Page(waterfall_of_steps(steps, budget.floor, budget.floor_name)).text
     for row in rows:
         assert row[1] in text

@@ -15,13 +15,13 @@ import pytest
 from support.pages import Page
 
 from elastocal.manipulator.observation import observe
-from elastocal.report import residuals
-from elastocal.report.html import report_page, write_report
+from elastocal.report import residual_view
+from elastocal.report.page import identification_page, write_identification_report
 
 
 @pytest.fixture(scope="module")
 def page(case: Any) -> str:
-    return report_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
+    return identification_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
 
 
 def test_every_parameter_is_on_the_page_and_no_number_where_none_is_known(
@@ -69,7 +69,7 @@ def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
 
 
 def test_names_from_files_are_text(hostile: Any) -> None:
-    page = report_page(hostile.result, command="elastocal <b>", inputs={"<i>.csv": "<u>"})
+    page = identification_page(hostile.result, command="elastocal <b>", inputs={"<i>.csv": "<u>"})
     structure = Page(page)
     structure.check_harmless(page)
     assert not {"b", "i", "u"} & set(structure.tags)
@@ -91,22 +91,24 @@ def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:
         observations=observe(seen.table.take(rows), seen.kind),
         residual=np.tile(case.result.residual, times),
         held_out=np.tile(case.result.held_out, times),
-        noise={**case.result.noise, "kind": "none"},
+        noise=replace(case.result.noise, kind="none"),
     )
-    write_report(long, tmp_path / "r.html")
+    write_identification_report(long, tmp_path / "r.html")
     assert (tmp_path / "r.html").stat().st_size < 6e6
     assert "a random choice of 5000 of" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
 def test_small_tables_are_drawn_whole(page: str, case: Any) -> None:
     assert "random choice" not in page
-    shown = residuals.residuals_of(case.result).shown
+    shown = residual_view.residuals_of(case.result).shown
     assert len(shown) == len(case.result.observations.lead)
 
 
 def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: str) -> None:
     with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30}):
-        again = report_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
+        again = identification_page(
+            case.result, case.truth, "elastocal identify c.toml d.csv", None, 3
+        )
     # What evaluated the model so far is another thing the second time.
     engine = re.compile(r"<td class=\"name\">model evaluated by</td><td>.*?</td>")
     assert engine.sub("", again) == engine.sub("", page)
@@ -115,17 +117,17 @@ def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: st
 def test_configuration_without_held_out_error(case: Any) -> None:
     held_out = case.result.held_out.copy()
     held_out[:12] = np.inf  # 2 markers × 2 loads × 3 coordinates
-    page = report_page(replace(case.result, held_out=held_out, heldout_rms=float("inf")))
+    page = identification_page(replace(case.result, held_out=held_out, heldout_rms=float("inf")))
     Page(page)
     assert "1 without held-out error" in page
     assert "is not known" in page
 
 
 def test_other_observations(pose: Any, bare: Any) -> None:
-    text = report_page(pose.result, pose.truth)
+    text = identification_page(pose.result, pose.truth)
     Page(text)
     assert "rz in µrad" in text
-    text = report_page(bare.result)
+    text = identification_page(bare.result)
     assert "No noise was stated" in text
     (faulty,) = bare.result.outliers
     (row,) = [row for row in Page(text).rows if len(row) == 5 and row[0] == str(faulty.line)]

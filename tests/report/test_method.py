@@ -8,21 +8,21 @@ from typing import Any
 import pytest
 
 from elastocal.identification.constrained.minimise import ActiveConstraint
-from elastocal.report.method import constraints_line, method_and_weights
+from elastocal.report.method_and_noise import constraints_line, method_and_weights
 
 AT_BOUND = (ActiveConstraint("joint2.compliance >= 0", "lower", ("joint2.compliance",), 0.0, 1.0),)
 
 
 def held(case: Any, noise: dict[str, Any] | None = None, **fields: Any) -> Any:
     """The case's result as that of a constrained fit with one compliance at its bound."""
-    noise = {**case.result.noise, **(noise or {})}
+    noise = replace(case.result.noise, **(noise or {}))
     given = {"method": "constrained", "active": AT_BOUND} | fields
     return replace(case.result, noise=noise, **given)
 
 
 def test_only_intervals_that_do_take_active_constraints_for_exact(case: Any) -> None:
     def line(kind: str) -> str:
-        return constraints_line(held(case, noise={"intervals": {"kind": kind}})) or ""
+        return constraints_line(held(case, noise={"interval_kind": kind})) or ""
 
     assert "take these for exact" in line("t under constraints")
     assert "stop at bounds" in line("constrained profile")
@@ -52,8 +52,8 @@ def test_fit_with_knowledge_names_what_was_known_and_the_weights(case: Any) -> N
 
     assert line(noise={"kind": "none"}) == "fit under constraints, all readings weighted alike"
     assert line().startswith("fit under constraints, weights estimated by restricted likelihood")
-    assert line().endswith(case.result.noise["description"])
-    stated = {"variances": None, "kind": "axis", "description": "tracker sigma 10 µm"}
+    assert line().endswith(case.result.noise.description)
+    stated = {"sizes": None, "kind": "axis", "description": "tracker sigma 10 µm"}
     assert line(noise=stated) == "fit under constraints, tracker sigma 10 µm"
     assert line(prior_share={"a": 0.5}).startswith("fit with a prior, ")
     both = line(prior_share={"a": 0.5}, active=AT_BOUND)

@@ -13,43 +13,40 @@ from rich.console import Console
 from support.pages import Page
 
 from elastocal.identification.constrained.minimise import ActiveConstraint
+from elastocal.identification.findings import judged
 from elastocal.identification.intervals import KINDS as INTERVALS
+from elastocal.identification.lack_of_fit import LackOfFit
+from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.options import METHODS
 from elastocal.identification.residual_summary import summarise_residuals
+from elastocal.identification.variance.choose import Trial
 from elastocal.identification.variance.structure import noise_models
-from elastocal.report.html import report_page
-from elastocal.report.method import (
-    constraints_line,
-    intervals_line,
-    method_and_weights,
-    prior_line,
-)
-from elastocal.report.noise import (
+from elastocal.report.identification_view import summary_lines
+from elastocal.report.method_and_noise import (
     candidate_rows,
+    constraints_line,
     does_noise_explain_it,
+    intervals_line,
     kind_in_words,
+    method_and_weights,
     noise_model_line,
+    prior_line,
     repeats_line,
     shape_line,
     size_rows,
 )
-from elastocal.report.tables import print_result, summary_lines
+from elastocal.report.page import identification_page
+from elastocal.report.terminal import print_result
 
-MISFIT = {"F": 9.31, "p": 2e-9, "dof_between": 30, "dof_pure": 200}
-AXES = [{"name": n, "sigma_um": v} for n, v in (("x", 12.0), ("y", 31.4), ("rz", 5.0))]
-TRIED = [
-    {"kind": "independent", "variances": 1, "criterion": -90.0},
-    {"kind": "axis+configuration", "variances": 4, "criterion": -104.25},
-]
+MISFIT = LackOfFit(F=9.31, p=2e-9, dof_between=30, dof_pure=200)
+AXES = tuple(NoiseSize(n, v * 1e-6) for n, v in (("x", 12.0), ("y", 31.4), ("rz", 5.0)))
+TRIED = (Trial("independent", 1, -90.0), Trial("axis+configuration", 4, -104.25))
+NONE = Noise("none", "")
 
 
 def changed(result: Any, noise: dict[str, Any] | None = None, **fields: Any) -> Any:
-    """The result with other fields, whether its class declares them yet or not."""
-    new = copy.copy(result)
-    for name, value in fields.items():
-        object.__setattr__(new, name, value)
-    object.__setattr__(new, "noise", {**result.noise, **(noise or {})})
-    return new
+    """The result with other fields, judged anew."""
+    return judged(replace(result, noise=replace(result.noise, **(noise or {})), **fields))
 
 
 @pytest.fixture(scope="module")
@@ -62,10 +59,11 @@ def noisy(case: Any) -> Any:
         "kind": "axis+configuration",
         "description": "one variance per axis, and a deviation common to each configuration",
         "reason": "smallest of all",
-        "variances": [*AXES, {"name": "common to each configuration", "sigma_um": 40.0}],
+        "sizes": (*AXES, NoiseSize("common to each configuration", 40e-6)),
         "tried": TRIED,
         "lack_of_fit": MISFIT,
-        "intervals": {"kind": "kenward-roger", "description": "adjusted"},
+        "interval_kind": "kenward-roger",
+        "interval_description": "adjusted",
     }
     name = "joint2.compliance"
     active = (ActiveConstraint(f"{name} >= 0", "lower", (name,), 0.0, 1.0),)
@@ -109,20 +107,25 @@ def test_stated_weights_are_named_with_the_method(case: Any) -> None:
     ],
 )
 def test_every_kind_of_interval_says_what_it_assumes(case: Any, kind: str) -> None:
-    given = {"intervals": {"kind": kind, "description": "in other words"}}
+    given = {"interval_kind": kind}
     text = intervals_line(changed(case.result, given))
     assert "in other words" not in text
     assert re.search("assume|take|known|independent", text)
-    unknown = {"intervals": {"kind": "new", "description": "in other words"}}
+    unknown = {"interval_kind": "new", "interval_description": "in other words"}
     assert intervals_line(changed(case.result, unknown)) == "new: in other words"
 
 
 def test_lack_of_fit_says_what_follows_for_the_intervals(case: Any) -> None:
     def line(p: float, kind: str, intervals: str = "classical") -> str | None:
-        noise = {"lack_of_fit": {**MISFIT, "p": p}, "kind": kind, "intervals": {"kind": intervals}}
+        misfit = replace(MISFIT, p=p)
+        noise = {"lack_of_fit": misfit, "kind": kind, "interval_kind": intervals}
         return repeats_line(changed(case.result, noise))
 
-    assert "agree" in (line(0.4, "axis") or "")
+    assert "no common deviation worth counting" in (line(0.4, "axis") or "")
+    # A noise model that has one must not stand beside a sentence that there is none.
+    both = line(0.4, "axis+configuration") or ""
+    assert "Repeats agree" in both and "has one; the intervals include it" in both
+    assert "worth counting" not in both
     assert "too narrow" in (line(1e-9, "axis") or "")
     for text in (line(1e-9, "axis+configuration"), line(1e-9, "axis", "CR2"),
                  line(1e-9, "axis", "wild")):  # fmt: skip
@@ -135,24 +138,24 @@ def test_lack_of_fit_says_what_follows_for_the_intervals(case: Any) -> None:
 
 
 def test_sizes_are_all_named_or_told_by_their_extremes() -> None:
-    assert size_rows({"variances": AXES}) == [
+    assert size_rows(replace(NONE, sizes=AXES)) == [
         ("x", "12.0 µm"), ("y", "31.4 µm"), ("rz", "5.00 µrad"),
     ]  # fmt: skip
-    many = [{"name": f"configuration {k}", "sigma_um": 10.0 + k} for k in range(91)]
-    rows = size_rows({"variances": [*many, {"name": "common to each cell", "sigma_um": 7.0}]})
+    many = [NoiseSize(f"configuration {k}", (10.0 + k) * 1e-6) for k in range(91)]
+    rows = size_rows(replace(NONE, sizes=(*many, NoiseSize("common to each cell", 7e-6))))
     assert rows == [
         ("median of 91", "55.0 µm"),
         ("smallest (configuration 0)", "10.0 µm"),
         ("largest (configuration 90)", "100 µm"),
         ("common to each cell", "7.00 µm"),
     ]
-    factor = {"name": "factor", "sigma_um": None, "factor": 1.25}
-    assert size_rows({"variances": [factor]}) == [("factor", "1.25")]
-    assert size_rows({}) == []
+    factor = NoiseSize("factor", None, 1.25)
+    assert size_rows(replace(NONE, sizes=(factor,))) == [("factor", "1.25")]
+    assert size_rows(NONE) == []
 
 
 def test_candidates_are_ranked_by_their_criterion() -> None:
-    assert candidate_rows({"tried": TRIED}) == [
+    assert candidate_rows(replace(NONE, tried=TRIED)) == [
         ("one size per axis + deviations of a configuration", "4", "0.0"),
         ("equal noise", "1", "14.2"),
     ]
@@ -163,7 +166,7 @@ def test_candidates_are_ranked_by_their_criterion() -> None:
 
 def test_estimated_noise_is_judged_against_the_stated_one(case: Any) -> None:
     def line(ratio: float | None, method: str) -> str:
-        given = {"ratio_to_stated": ratio, "sigma_um": 25.0}
+        given = {"ratio_to_stated": ratio, "sigma": 25e-6}
         return does_noise_explain_it(changed(case.result, given, method=method))
 
     assert "agrees" in line(1.0, "reml")
@@ -235,7 +238,7 @@ def test_terminal_has_tables_and_all_lines(noisy: Any, width: int) -> None:
 
 
 def test_page_has_a_section_on_noise(noisy: Any) -> None:
-    page = report_page(noisy)
+    page = identification_page(noisy)
     section = page[page.index("<h2>Noise</h2>") : page.index("<h2>Faulty readings")]
     for piece in ("restricted likelihood", "31.4 µm", "common to each configuration", "14.2",
                   "the intervals include it", "Kenward and Roger", "scatters unlike",
@@ -250,10 +253,10 @@ def test_page_has_a_section_on_noise(noisy: Any) -> None:
 
 def test_names_from_the_result_are_text(noisy: Any, no_figures: None) -> None:
     script = "<script>\x1b[31m"
-    sizes = [{"name": script, "sigma_um": 1.0}]
-    tried = [{"kind": script, "variances": 1, "criterion": float(k)} for k in range(2)]
-    noise = {"variances": sizes, "tried": tried, "description": script, "reason": script}
-    page = report_page(changed(noisy, noise))
+    sizes = (NoiseSize(script, 1e-6),)
+    tried = tuple(Trial(script, 1, float(k)) for k in range(2))
+    noise = {"sizes": sizes, "tried": tried, "description": script, "reason": script}
+    page = identification_page(changed(noisy, noise))
     found = Page(page)
     found.check_harmless(page)
     assert script.replace("\x1b", "\N{REPLACEMENT CHARACTER}") in found.text
@@ -262,14 +265,14 @@ def test_names_from_the_result_are_text(noisy: Any, no_figures: None) -> None:
 
 def test_without_residuals_the_page_has_no_distribution(case: Any) -> None:
     nothing = changed(case.result, residual=np.zeros_like(case.result.residual), residual_rms=0.0)
-    page = report_page(changed(nothing, residual_summary=None))
+    page = identification_page(changed(nothing, residual_summary=None))
     assert page.count("<figure>") == 8
     assert "Histograms by group" not in page
-    assert noise_model_line(changed(case.result, {"variances": [], "reason": None})) is None
+    assert noise_model_line(changed(case.result, {"sizes": (), "reason": None})) is None
 
 
 def test_interval_without_an_end_has_no_bar(case: Any) -> None:
     e = copy.copy(case.result.estimates[0])
     object.__setattr__(e, "ci95", (-np.inf, np.inf))
-    page = report_page(changed(case.result, estimates=(e, *case.result.estimates[1:])))
+    page = identification_page(changed(case.result, estimates=(e, *case.result.estimates[1:])))
     assert "nan" not in page[page.index("<h2>Parameters") : page.index("<h2>Combinations")]

@@ -18,8 +18,9 @@ from elastocal.design.design import design
 from elastocal.design.options import DesignOptions
 from elastocal.design.plan import Certificate, SizePoint
 from elastocal.errors import InputError
-from elastocal.report import plan_page as module
-from elastocal.report.plan_page import headline, plan_page, plan_space, write_plan_report
+from elastocal.report.arm_view import plan_space
+from elastocal.report.page import plan_page, write_plan_report
+from elastocal.report.plan_view import plan_headline, plan_steps, plan_tone
 from elastocal.tracker_noise import CartesianNoise
 
 SCRIPT = "<script>alert(1)</script>"
@@ -99,9 +100,9 @@ def test_the_verdict_says_how_far_from_the_best(
     certificate = Certificate(30, 1.0, pool, None, continuum)
     warnings = ("something",) if warned else ()
     told = replace(plan, certificate=certificate, warnings=warnings)
-    assert text in headline(told)
-    assert module._tone(told) == tone
-    advised = any("--effort thorough" in step for step in module._steps(told))
+    assert text in plan_headline(told)
+    assert plan_tone(told) == tone
+    advised = any("effort='thorough'" in step for step in plan_steps(told))
     assert advised == (continuum == 0.7)
 
 

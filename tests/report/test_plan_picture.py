@@ -12,8 +12,7 @@ from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges, ran
 
 from elastocal.cell import HalfSpace, Nominal, Solid, Tracker, Workspace
 from elastocal.errors import InputError
-from elastocal.report.plan_picture import draw_plan, write_plan_picture
-from elastocal.report.wireframe import wireframe
+from elastocal.report.plan_picture import draw_plan, wireframe, write_plan_picture
 
 PLACED = np.eye(4)
 PLACED[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()

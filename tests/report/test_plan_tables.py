@@ -13,8 +13,8 @@ from elastocal.cell import DesignSpec, Tracker
 from elastocal.design.design import design
 from elastocal.design.options import DesignOptions
 from elastocal.design.plan import Certificate, SizePoint
-from elastocal.report.plan_rows import served
-from elastocal.report.plan_tables import plan_lines, print_plan
+from elastocal.report.plan_view import plan_lines, served
+from elastocal.report.terminal import PRINTED_WIDTH, plan_text, print_plan
 from elastocal.tracker_noise import CartesianNoise
 
 LOADS = np.array([[0, 0, 0], [0, 0, -2600.0]])
@@ -112,3 +112,12 @@ def test_loads_curve_sums_and_warnings_fit_too(plan, width):
     assert "3.25" in told and "2.125" in told and "and 6 more" in told
     assert "-2600" in told
     assert "[brackets]" in told
+
+
+def test_print_of_a_plan_is_what_the_terminal_shows(plan):
+    text = str(plan)
+    assert text == plan_text(plan)
+    joined = " ".join(text.split())
+    for label, sentence in plan_lines(plan):
+        assert f"{label}: {sentence}" in joined
+    assert max(map(len, text.splitlines())) <= PRINTED_WIDTH and "\x1b" not in text

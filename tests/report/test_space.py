@@ -16,10 +16,19 @@ from support.robots import packaged_urdf
 from elastocal.cell import Robot, Solid, Tracker, Workspace
 from elastocal.design.feasibility.carriers import WORLD
 from elastocal.manipulator.choice import load_chain
-from elastocal.report import residual_space as residual_module
-from elastocal.report.arm_bodies import base_or_joint, shells_of, triangles_of
-from elastocal.report.residual_space import residual_space
-from elastocal.report.space import ARROW, Posed, frames_at, in_script, space_json, space_of
+from elastocal.report import arm_view as residual_module
+from elastocal.report.arm_view import (
+    ARROW,
+    Posed,
+    base_or_joint,
+    frames_at,
+    in_script,
+    residual_space,
+    shells_of,
+    space_json,
+    space_of,
+    triangles_of,
+)
 
 TURNED = np.eye(4)
 TURNED[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]

@@ -10,27 +10,22 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
+from elastocal.identification.findings import standings
 from elastocal.identification.result import Combination
-from elastocal.report.rows import (
+from elastocal.report.identification_view import (
     HALF_LENGTH,
     MIDDLE,
+    SECTIONS,
     bar_from_nominal,
-    parameter_rows,
-    texts,
-)
-from elastocal.report.tables import (
-    combination_table,
-    parameter_table,
-    print_result,
-    summary_lines,
-)
-from elastocal.report.trust import SECTIONS, judgement, without_sections
-from elastocal.report.words import (
     combination_truth,
     inside,
+    judgement,
+    parameter_rows,
     shortened,
-    standings,
+    summary_lines,
+    texts,
 )
+from elastocal.report.terminal import combination_table, parameter_table, print_result
 
 
 def cells(table: Table) -> list[dict[str, str]]:
@@ -139,8 +134,14 @@ def test_the_terminal_ends_with_the_verdict_of_the_page_and_what_to_do(case: Any
     assert f"Verdict: {judged.headline}" in words
     assert judged.steps
     assert words.count("Next: ") == len(judged.steps)
-    assert all(without_sections(step) in words for step in judged.steps)
-    assert not any(section in words for section in SECTIONS)
+    assert all(step in words for step in judged.steps)
+    assert not any(f"({section})" in words for _, section in SECTIONS.values())
+
+
+def test_steps_name_the_sections_of_the_page_only_where_there_is_one(case: Any) -> None:
+    found = judgement(case.result, sections=True)
+    assert any("(What is not determined)" in step for step in found.steps)
+    assert len(found.steps) == len(judgement(case.result).steps)
 
 
 def test_summary_in_words(case: Any) -> None:

@@ -7,17 +7,25 @@ from typing import Any
 
 import pytest
 
+from elastocal.identification.findings import judged
+from elastocal.identification.lack_of_fit import LackOfFit
 from elastocal.identification.result import TestErrors
-from elastocal.report.trust import judgement
+from elastocal.report import identification_view
+
+MISFIT = LackOfFit(9.0, 1e-5, 30, 200)
+
+
+def judgement(result: Any) -> identification_view.Judgement:
+    """What is said of a result whose fields were changed, judged anew."""
+    return identification_view.judgement(judged(result))
 
 
 @pytest.fixture(scope="module")
 def fine(case: Any) -> Any:
     """A result that nothing speaks against."""
-    noise = {k: v for k, v in case.result.noise.items() if k != "lack_of_fit"}
     return replace(
         case.result,
-        noise=noise | {"ratio_to_stated": 1.0},
+        noise=replace(case.result.noise, lack_of_fit=None, ratio_to_stated=1.0),
         heldout_rms=1.05 * case.result.residual_rms,
         converged=True,
         excluded=(),
@@ -29,24 +37,24 @@ def test_what_nothing_speaks_against_can_be_trusted(fine: Any) -> None:
     found = judgement(fine)
     assert found.tone == "good"
     assert found.headline.startswith("This calibration can be trusted: positions in poses that")
-    assert any("--test" in step for step in found.steps)
+    assert any("give them with `test`" in step for step in found.steps)
     assert not any("diagnose" in step for step in found.steps)
     tested = replace(fine, test=TestErrors(fine.heldout_rms, 0.0, 0.0, 9))
-    assert not any("--test" in step for step in judgement(tested).steps)
+    assert not any("give them with `test`" in step for step in judgement(tested).steps)
 
 
 def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
     doubts = {
         "times the stated noise": (
-            replace(fine, noise=fine.noise | {"ratio_to_stated": 2.0}), "diagnose"
+            replace(fine, noise=replace(fine.noise, ratio_to_stated=2.0)), "diagnose"
         ),
         "scatter more than repeats": (
-            replace(fine, noise=fine.noise | {"lack_of_fit": {"p": 1e-5}}), "diagnose"
+            replace(fine, noise=replace(fine.noise, lack_of_fit=MISFIT)), "diagnose"
         ),
         "unseen poses are worse": (
-            replace(fine, heldout_rms=3 * fine.residual_rms), "--augment"
+            replace(fine, heldout_rms=3 * fine.residual_rms), "augment"
         ),
-        "is not known": (replace(fine, heldout_rms=float("inf")), "--augment"),
+        "is not known": (replace(fine, heldout_rms=float("inf")), "augment"),
         "test data are off": (
             replace(fine, test=TestErrors(2 * fine.heldout_rms, 0.0, 0.0, 9)), ""
         ),
@@ -85,7 +93,7 @@ def test_faulty_readings_are_pointed_at(fine: Any, hostile: Any) -> None:
 
 
 def test_without_stated_noise_it_asks_for_it(fine: Any) -> None:
-    unstated = replace(fine, noise=fine.noise | {"ratio_to_stated": None})
+    unstated = replace(fine, noise=replace(fine.noise, ratio_to_stated=None))
     steps = " ".join(judgement(unstated).steps)
     assert "State the tracker's noise ([tracker] sigma_um" in steps and "diagnose" in steps
     assert "State the tracker's noise" not in " ".join(judgement(fine).steps)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.report.units import (
+from elastocal.report.formatting import (
     display,
     estimate,
     length,
@@ -107,8 +107,8 @@ def test_estimate_in_display_units() -> None:
         (4.705e-3, "4.71 mm"),
         (1.5, "1.50 m"),
         (0.0, "0 µm"),
-        (math.inf, "none"),
-        (math.nan, "none"),
+        (math.inf, "not available"),
+        (math.nan, "not available"),
     ],
 )
 def test_length(metres: float, text: str) -> None:

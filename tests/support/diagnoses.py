@@ -12,21 +12,21 @@ from elastocal.diagnosis.result import (
     Diagnosis,
     EffectAt,
     FaultyReading,
-    Finding,
     FittedParameter,
+    FoundEffect,
     Gap,
     Location,
     NoiseFloor,
-    Step,
     StructureTest,
     Untested,
 )
 from elastocal.diagnosis.separate.result import ExtraPlan, RivalPair
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.measurements import Measurements
 
 HOSTILE = "<script>alert(1)</script>\x1b[31m"
 
-ECCENTRICITY = Finding(
+ECCENTRICITY = FoundEffect(
     effect="gear_eccentricity",
     where="joint2",
     probability=0.981,
@@ -39,7 +39,7 @@ ECCENTRICITY = Finding(
     ),
     settings={},
 )
-JUMP = Finding(
+JUMP = FoundEffect(
     effect="encoder_jump",
     where="joint1",
     probability=0.91,
@@ -95,12 +95,12 @@ EXPLAINED = Diagnosis(
     verdict="explained",
     gap=Gap(nominal=3.2e-3, calibrated=84e-6, explained=21e-6, noise_floor=19e-6),
     budget=(
-        Step("nominal", 3.2e-3, (2.9e-3, 3.5e-3)),
-        Step("base_frame", 1.9e-3, (1.7e-3, 2.1e-3)),
-        Step("joint_offset", 410e-6, (360e-6, 450e-6)),
-        Step("joint_compliance", 84e-6, (71e-6, 97e-6)),
-        Step("gear_eccentricity:joint2", 21e-6, (19e-6, 23e-6)),
-        Step("noise_floor", 19e-6, (19e-6, 19e-6)),
+        BudgetStep("nominal", 3.2e-3, (2.9e-3, 3.5e-3)),
+        BudgetStep("base_frame", 1.9e-3, (1.7e-3, 2.1e-3)),
+        BudgetStep("joint_offset", 410e-6, (360e-6, 450e-6)),
+        BudgetStep("joint_compliance", 84e-6, (71e-6, 97e-6)),
+        BudgetStep("gear_eccentricity:joint2", 21e-6, (19e-6, 23e-6)),
+        BudgetStep("noise_floor", 19e-6, (19e-6, 19e-6)),
     ),
     effects=(ECCENTRICITY,),
     candidates=CANDIDATES,
@@ -150,7 +150,7 @@ NOTHING = replace(
     EXPLAINED,
     verdict="nothing_significant",
     gap=replace(EXPLAINED.gap, calibrated=24e-6, explained=24e-6, noise_floor=23e-6),
-    budget=(*EXPLAINED.budget[:-3], Step("joint_compliance", 24e-6, (21e-6, 27e-6))),
+    budget=(*EXPLAINED.budget[:-3], BudgetStep("joint_compliance", 24e-6, (21e-6, 27e-6))),
     effects=(),
     candidates=UNLIKELY,
     location=None,

@@ -33,8 +33,7 @@ from elastocal.config import (
     required,
 )
 from elastocal.errors import InputError, require
-from elastocal.text import is_label
-from elastocal.text import quoted
+from elastocal.text import is_label, quoted
 from elastocal.units import to_si
 
 Observe = Literal["position", "deflection", "pose", "distance"]

@@ -54,8 +54,7 @@ from elastocal.config import (
 )
 from elastocal.errors import InputError, require
 from elastocal.files import check_exists
-from elastocal.text import did_you_mean
-from elastocal.text import listed
+from elastocal.text import did_you_mean, listed
 from elastocal.units import to_si
 
 Record = TypeVar("Record")

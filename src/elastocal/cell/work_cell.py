@@ -24,9 +24,7 @@ from elastocal.config import Table, Text, Vector2, checked, header, key, read_to
 from elastocal.errors import require
 from elastocal.files import check_exists
 from elastocal.plugin_loader import is_plugin_file, load_plugins
-from elastocal.text import did_you_mean
-from elastocal.text import listed
-from elastocal.text import quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 KnownEffects = Collection[str]
 

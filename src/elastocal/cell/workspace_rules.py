@@ -40,8 +40,7 @@ from elastocal.config import (
     numbers,
 )
 from elastocal.errors import require
-from elastocal.text import is_label
-from elastocal.text import quoted
+from elastocal.text import is_label, quoted
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 Part = Annotated[str, Field(pattern=r"^(base|flange|link[1-9][0-9]{0,2})$")]

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from elastocal import __version__
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import ElastocalError, InputError, options_as_flags
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -77,7 +77,7 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
         try:
-            with _telling_of_ctrl_c():
+            with _telling_of_ctrl_c(), options_as_flags():
                 command(*args, **kwargs)
         except ElastocalError as error:
             _complain(str(error))

@@ -141,9 +141,9 @@ def compensate(
         both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
         typer.echo(json_text(both))
         return
-    from elastocal.cli.compensate_files import print_summaries
+    from elastocal.report.terminal import print_compensation
 
-    print_summaries(console(), content)
+    print_compensation(console(), content)
     for path in written:
         typer.echo(f"wrote {path}")
     if output is not None:

@@ -9,8 +9,6 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.tables import csv_text
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from elastocal.cell import Array
     from elastocal.compensation.compensate import Compensation
     from elastocal.compensation.table import CorrectionTable, Grid
@@ -157,52 +155,3 @@ def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[di
         content["rotation_without_urad"] = spread(found.before[:, 1])
         content["rotation_with_urad"] = spread(found.between[:, 1])
     return content, csv_text([*heads, "status"], rows)
-
-
-def print_summaries(screen: Console, content: dict[str, Any]) -> None:
-    """Errors before and after, uncertainty and warnings, on the terminal."""
-    commands, table = content.get("commands"), content.get("table")
-    if commands is not None:
-        rows = {
-            "nominal command": commands["error_before_um"],
-            "new command": commands["error_after_um"],
-            "standard uncertainty": commands["std_um"],
-        }
-        _print_spreads(screen, "Position of the tool, predicted", rows)
-        for k, command in enumerate(commands.get("commands", ())):
-            joints = ", ".join(f"{n} {v:.6f}" for n, v in command.items() if n != "status")
-            screen.print(f"target {k + 1}: {joints or command['status']}")
-        screen.print(
-            f"{commands['reached']} of {commands['n']} targets reached by the {commands['point']}; "
-            f"targets in the {commands['frame']} frame.",
-            markup=False,  # a marker may be called [red]
-        )
-        for told in commands["warnings"]:
-            screen.print(f"Warning: {told}", markup=False)
-    if table is not None:
-        rows = {"without the table": table["error_without_um"]}
-        rows["with it, interpolated"] = table["error_with_um"]
-        title = f"Position of the tool at {table['checked_between']} points between the grid's"
-        _print_spreads(screen, title, rows)
-        screen.print(
-            f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
-            "first order (beside singular postures or limits)."
-        )
-
-
-def _length(um: float) -> str:
-    from elastocal.report.units import length
-
-    return "< 0.01 µm" if um < 0.01 else length(um * 1e-6)
-
-
-def _print_spreads(screen: Console, title: str, rows: dict[str, dict[str, Any]]) -> None:
-    from elastocal.report.console_table import titled
-
-    shown = titled(title)
-    shown.add_column("")
-    for head in ("rms", "95 %", "max"):
-        shown.add_column(head, justify="right")
-    for name, values in rows.items():
-        shown.add_row(name, *("–" if v is None else _length(v) for v in values.values()))
-    screen.print(shown)

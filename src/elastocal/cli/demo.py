@@ -39,7 +39,7 @@ def demo(
     if as_json:
         typer.echo(json_text(done.result.to_json() | {"truth": done.truth}))
         return
-    from elastocal.report.tables import print_result
+    from elastocal.report.terminal import print_result
 
     print_result(console(), done.result, truth=done.truth)
     typer.echo(

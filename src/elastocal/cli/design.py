@@ -164,7 +164,7 @@ def design(
     if as_json:
         typer.echo(summary.read_text(encoding="utf-8"), nl=False)
         return
-    from elastocal.report.plan_tables import print_plan
+    from elastocal.report.terminal import print_plan
 
     print_plan(console(), plan)
     for path in written:

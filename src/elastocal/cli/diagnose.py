@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from elastocal.measurements import Measurements
 
 MOST_POSES = 10
-# Verdicts that leave rivals to be told apart by more poses.
-OPEN = ("ambiguous", "unknown_effect")
 
 
 @app.command()
@@ -92,7 +90,7 @@ def diagnose(
         model, (table,) = load_inputs(cell, [data])
         check_apart(outputs.wanted, [cell, data, *files_of(model.cell)])
         found = run(model, table, options, progress)
-        if plan is not None and found.verdict in OPEN:
+        if plan is not None and found.open:
             most = MOST_POSES if poses is None else poses
             found = _with_extra_poses(model, table, found, most, seed, progress)
         content = publish(found, model, str(data))
@@ -100,7 +98,7 @@ def diagnose(
     if as_json:
         typer.echo(json_text(content))
         return
-    from elastocal.report.diagnosis_tables import print_diagnosis
+    from elastocal.report.terminal import print_diagnosis
 
     print_diagnosis(console(), found, model.chain.kinds)
     for line in told:

@@ -51,7 +51,7 @@ def write_diagnosis(
         atomic_write_text(outputs.json, json_text(content) + "\n")
         told.append(f"wrote {outputs.json}")
     if outputs.report is not None:
-        from elastocal.report.diagnosis_page import write_diagnosis_report
+        from elastocal.report.page import write_diagnosis_report
 
         command = shlex.join(["elastocal", *sys.argv[1:]])
         write_diagnosis_report(

@@ -118,7 +118,7 @@ def export(
 
 def _tell(done: Exported) -> None:
     """What the file holds and what not, for people."""
-    from elastocal.report.words import printable
+    from elastocal.report.formatting import printable
 
     screen = console()
     cost, (name, in_title) = done.cost, NAMES[done.format]
@@ -165,15 +165,14 @@ def _tell(done: Exported) -> None:
 
 def _rounding(metres: float | None) -> str:
     """A length; what is below a nanometre is rounding and no number to read."""
-    from elastocal.report.units import length
+    from elastocal.report.formatting import length
 
     return "< 0.001 µm" if not metres or metres < 1e-9 else length(metres)
 
 
 def _cost_table(title: str, cost: Cost) -> Table:
-    from elastocal.report.console_table import titled
-    from elastocal.report.units import length
-    from elastocal.report.words import printable
+    from elastocal.report.formatting import length, printable
+    from elastocal.report.terminal import titled
 
     table = titled(title)
     for head in ("effect", "markers rms", "max", "flange rms", "max", ""):

@@ -152,7 +152,7 @@ def identify(
     if as_json:
         typer.echo(json_text(result.to_json()))
         return
-    from elastocal.report.tables import print_result
+    from elastocal.report.terminal import print_result
 
     print_result(console(), result)
     for path in written:

@@ -12,9 +12,8 @@ from rich.text import Text
 from elastocal.cli.import_words import left_out
 from elastocal.importing.import_files import Imported
 from elastocal.importing.records import Understood
-from elastocal.report.console_table import titled
-from elastocal.report.verdict import counted
-from elastocal.report.words import printable
+from elastocal.report.formatting import counted, printable
+from elastocal.report.terminal import titled
 from elastocal.text import listed
 
 FIRST_ROWS = 5

@@ -68,14 +68,12 @@ def check_apart(written: Iterable[Path | None], read: Iterable[Path | None]) -> 
 
 def files_of(cell: Cell) -> tuple[Path | None, ...]:
     """Files that the cell names and a plan depends on."""
-    from elastocal.plugin_loader import is_file
+    from elastocal.plugin_loader import is_plugin_file
 
     robot, path = cell.robot, cell.design.test_path
     meshes = [s.mesh for s in cell.workspace.obstacles]
     meshes += [body.solid.mesh for body in cell.workspace.bodies]
-    plugins = (
-        [cell.path.parent / name for name in cell.plugins if is_file(name)] if cell.path else []
-    )
+    plugins = [Path(name) for name in cell.plugins if is_plugin_file(name)]
     test_path = None if path is None else path.file
     return (robot.urdf, robot.dh, robot.masses, test_path, *meshes, *plugins)
 
@@ -107,7 +105,7 @@ def write_all(
 
 def write_page(plan: Plan, path: Path, read: list[Path]) -> None:
     """The report of a plan; `read` are the files it depends on."""
-    from elastocal.report.plan_page import write_plan_report
+    from elastocal.report.page import write_plan_report
 
     command = shlex.join(["elastocal", *sys.argv[1:]])
     write_plan_report(plan, path, command=command, inputs=list(dict.fromkeys(read)))

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from elastocal.files import atomic_write_text
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.tables import csv_text
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
-    from elastocal.report.html import Published
+    from elastocal.report.page import Published
 
 
 def write_results(
-    result: IdentificationResult,
+    result: Calibration,
     output: Path | None,
     report: Path | None,
     residuals: Path | None,
@@ -38,10 +38,10 @@ def write_results(
         header = list(rows[0])
         atomic_write_text(residuals, csv_text(header, ([row[h] for h in header] for row in rows)))
     if report is not None:
-        from elastocal.report.html import write_report
+        from elastocal.report.page import write_identification_report
 
         command = shlex.join(["elastocal", *sys.argv[1:]])
-        write_report(
+        write_identification_report(
             result, report, truth=truth, command=command, inputs=inputs, seed=seed,
             published=published,
         )  # fmt: skip

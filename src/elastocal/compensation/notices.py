@@ -9,7 +9,6 @@ from elastocal.cell import Cell
 from elastocal.compensation.targets import Targets
 from elastocal.compensation.uncertainty import Uncertainty
 from elastocal.manipulator.chain import Array, Chain
-from elastocal.text import listed
 from elastocal.manipulator.effects import effect_of
 from elastocal.text import listed
 

@@ -27,9 +27,6 @@ from elastocal.design.shares import check_available, most_poses, shares_of
 from elastocal.design.target_poses import test_poses
 from elastocal.errors import InsufficientDataError, require
 from elastocal.manipulator.model import Model
-from elastocal.text import did_you_mean
-from elastocal.text import listed
-from elastocal.text import quoted
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.exact_plan import size_curve
 from elastocal.planning.exchange import values_without

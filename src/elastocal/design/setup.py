@@ -30,7 +30,6 @@ from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.manipulator.effects import effect_of
 from elastocal.manipulator.model import Model
-from elastocal.text import listed
 from elastocal.planning.criteria import criterion_named, make_criterion
 from elastocal.planning.criterion import Criterion
 from elastocal.simulation.simulate import draw_errors, values_from

@@ -19,15 +19,17 @@ from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet, with_items
 from elastocal.diagnosis.noise import NoisyData
 from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.result import Gap, Step
+from elastocal.diagnosis.result import Gap
 from elastocal.diagnosis.scene import Scene
-from elastocal.manipulator.effects import CATALOGUE
+from elastocal.identification.error_budget import BudgetStep, stage_of
 from elastocal.manipulator.effects.placements import BaseFrame
 
 Array = NDArray[np.float64]
 
 
-def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, tuple[Step, ...]]:
+def budget(
+    scene: Scene, found: Found, rng: np.random.Generator
+) -> tuple[Gap, tuple[BudgetStep, ...]]:
     """Held-out 3-D errors of each step, and the gap they add up to.
 
     `scene` is about the fit without further effects.  Where an effect goes with time, what is
@@ -37,7 +39,7 @@ def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, t
     together = _left_out_together(scene, chosen)
     # The nominal arm, base and markers placed, as the baseline left it.
     placed = scene.blocks.pack(scene.base.nominal.reshape(-1, scene.blocks.size, 1))[:, :, 0]
-    steps = [Step(BaseFrame.name, *rms_with_interval(scene.data, placed, rng))]
+    steps = [BudgetStep(BaseFrame.name, *rms_with_interval(scene.data, placed, rng))]
     steps += [_step(name, data, nothing, together, rng) for name, data in _fitted_steps(scene)]
     known = [k for k, item in enumerate(chosen.items) if item.known]
     for n in range(len(known)):
@@ -56,7 +58,7 @@ def budget(scene: Scene, found: Found, rng: np.random.Generator) -> tuple[Gap, t
     if unknown:
         # What a smooth curve without a name takes away: no explanation, but how much is at stake.
         steps.append(_step("unknown:" + "+".join(unknown), chosen.data, chosen, together, rng))
-    return gap, (*steps, Step("noise_floor", floor, (floor, floor)))
+    return gap, (*steps, BudgetStep("noise_floor", floor, (floor, floor)))
 
 
 def _left_out_together(scene: Scene, chosen: ModelSet) -> Labels | None:
@@ -73,12 +75,12 @@ def _step(
     fitted: ModelSet,
     together: Labels | None,
     rng: np.random.Generator,
-) -> Step:
+) -> BudgetStep:
     # Weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
     # effect is that effect, and weights by it would spare it.
     residual = left_out_residual(project(data, fitted.noise.of_instrument()), together)
     rms, interval = rms_with_interval(data, residual, rng)
-    return Step(name, rms, interval)
+    return BudgetStep(name, rms, interval)
 
 
 def _fitted_steps(scene: Scene) -> list[tuple[str, NoisyData]]:
@@ -97,11 +99,3 @@ def _fitted_steps(scene: Scene) -> list[tuple[str, NoisyData]]:
             )
         )
     return steps
-
-
-def stage_of(effect: str) -> int:
-    """0 for what places base and markers, 1 for geometry, 2 for what yields under load."""
-    known = CATALOGUE[effect]
-    if known.registered:
-        return 0
-    return 2 if known.stage in ("compliance", "load") else 1

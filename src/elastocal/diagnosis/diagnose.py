@@ -22,7 +22,7 @@ from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.diagnosis.play_law import with_likelier_play
 from elastocal.diagnosis.recorded_drivers import model_keys, with_recorded_drivers
 from elastocal.diagnosis.refit import refit
-from elastocal.diagnosis.result import Diagnosis, Finding
+from elastocal.diagnosis.result import Diagnosis, FoundEffect
 from elastocal.diagnosis.scene import Scene, scene_of
 from elastocal.diagnosis.screen import Screened, screen
 from elastocal.diagnosis.search import Search
@@ -145,7 +145,7 @@ def _check_enough(table: Measurements) -> None:
 
 def _findings(
     found: Found, answer: Answer, plain: Baseline, rng: np.random.Generator
-) -> tuple[Finding, ...]:
+) -> tuple[FoundEffect, ...]:
     """The known items with their probabilities, parameters and confirmed shrinkage."""
     chosen, scene = found.chosen, found.scene
     known = [k for k, item in enumerate(chosen.items) if item.known]
@@ -162,7 +162,7 @@ def _findings(
         measured = len(scene.blocks.member)
         fall = shrinkage(truths, measured, confirmation.unnamed, change, rng)
         findings.append(
-            Finding(
+            FoundEffect(
                 what.name,
                 what.where,
                 answer.probability[k],

@@ -10,8 +10,8 @@ from typing import Any
 
 import tomli_w
 
-from elastocal.cell import Cell, read_cell
-from elastocal.diagnosis.result import Finding
+from elastocal.cell.work_cell import read_cell
+from elastocal.diagnosis.result import FoundEffect
 from elastocal.files import atomic_write_text
 from elastocal.plugin_loader import is_plugin_file
 
@@ -29,7 +29,7 @@ PATHS = (
 def write_extended_cell(
     source: str | Path,
     target: str | Path,
-    found: Sequence[Finding],
+    found: Sequence[FoundEffect],
     model_keys: Mapping[str, str] | None = None,
 ) -> Cell:
     """Write the cell file `source` to `target` with the effects `found` switched on; read it back.
@@ -54,7 +54,7 @@ def write_extended_cell(
     return read_cell(target)
 
 
-def _switch_on(model: dict[str, Any], found: Sequence[Finding]) -> None:
+def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
     effects = model.setdefault("effects", [])
     for f in found:
         if (entry := f"{f.effect}:{f.where}") not in effects:

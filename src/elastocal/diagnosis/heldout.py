@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from elastocal.diagnosis.blocks import Blocks
 from elastocal.diagnosis.noise import NoiseValues, NoisyData, covariance
 from elastocal.diagnosis.projection import Projection
+from elastocal.identification.error_budget import resampled_rms
 
 Array = NDArray[np.float64]
 
 Labels = NDArray[np.int64]
 
-DRAWS = 1000
 TENTHS = 10  # blocks of time that are left out in turn
 
 
@@ -64,18 +64,6 @@ def rms_with_interval(
 ) -> tuple[float, tuple[float, float]]:
     """3-D rms in m of residuals (C, m) and its 95 % interval by resampling configurations."""
     return resampled_rms(*squared_lengths(data, packed), rng)
-
-
-def resampled_rms(
-    squares: NDArray, count: NDArray, rng: np.random.Generator
-) -> tuple[float, tuple[float, float]]:
-    """The rms √(Σ squares / Σ count) of configurations (C,) and its 95 % interval, by weights that
-    a Dirichlet distribution draws for them (the Bayesian bootstrap)."""
-    rms = float(np.sqrt(squares.sum() / count.sum()))
-    weight = rng.dirichlet(np.ones(len(squares)), DRAWS)
-    drawn = np.sqrt((weight @ squares) / (weight @ count))
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    return rms, (float(low), float(high))
 
 
 def noise_rms(data: NoisyData, noise: NoiseValues) -> float:

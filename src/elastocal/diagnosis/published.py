@@ -10,12 +10,12 @@ from elastocal.diagnosis.result import (
     Diagnosis,
     EffectAt,
     FaultyReading,
-    Finding,
+    FoundEffect,
     Location,
     NoiseFloor,
-    Step,
 )
 from elastocal.diagnosis.separate.result import ExtraPlan
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.manipulator.model import Model
 from elastocal.text import plain
 
@@ -59,6 +59,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "extra_plan": None if d.extra is None else _extra(d.extra),
         "model_keys": d.model_keys,
         "warnings": list(d.warnings),
+        "findings": [f.to_json() for f in d.findings],
         "backend": model.backend_report(),
         "n_readings": d.n_readings,
         "n_configurations": d.n_configurations,
@@ -66,7 +67,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
     return {key: plain(value) for key, value in content.items()}
 
 
-def _step(step: Step) -> dict[str, Any]:
+def _step(step: BudgetStep) -> dict[str, Any]:
     return {
         "step": step.step,
         "heldout_rms_um": step.heldout_rms * MICRO,
@@ -74,11 +75,11 @@ def _step(step: Step) -> dict[str, Any]:
     }
 
 
-def _place(e: EffectAt | Finding | Candidate) -> dict[str, Any]:
+def _place(e: EffectAt | FoundEffect | Candidate) -> dict[str, Any]:
     return {"effect": e.effect, "where": e.where}
 
 
-def _finding(f: Finding) -> dict[str, Any]:
+def _finding(f: FoundEffect) -> dict[str, Any]:
     return _place(f) | {
         "probability": f.probability,
         "gap_reduction": f.gap_reduction,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from elastocal.diagnosis.hypotheses import recorded
-from elastocal.diagnosis.result import Diagnosis, Finding
+from elastocal.diagnosis.result import Diagnosis, FoundEffect
 from elastocal.manipulator.effects.changes_in_time import ThermalExpansion
 from elastocal.manipulator.effects.play import Backlash
 from elastocal.manipulator.model import Model
@@ -43,7 +43,7 @@ def with_recorded_drivers(
     return Model(model.chain, cell)
 
 
-def model_keys(model: Model, found: tuple[Finding, ...]) -> dict[str, str]:
+def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
     """Keys of [model] that the effects found rest on."""
     names = {f.effect for f in found}
     spec = model.cell.model

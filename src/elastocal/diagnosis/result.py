@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.separate.result import ExtraPlan
+from elastocal.errors import option
+from elastocal.identification.error_budget import BudgetStep
+from elastocal.identification.result import Finding, Number
 from elastocal.manipulator.effects.base import Stage
 from elastocal.notebook import ForNotebooks
 
 Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
 Interval = tuple[float, float]
+
+# A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
+# Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
+SEEN, FAINTEST = 5.0, 3.0
+STRUCTURE = 0.05  # family-wise p-value from which on a driver is told
 
 
 @dataclass(frozen=True)
@@ -33,7 +43,7 @@ class FittedParameter:
 
 
 @dataclass(frozen=True)
-class Finding:
+class FoundEffect:
     """An effect held to be real (or, where the verdict is ambiguous, the likeliest of a set).
 
     `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
@@ -68,6 +78,21 @@ class Candidate:
     detectable: float
     settings: dict[str, float]
 
+    @property
+    def seen_from(self) -> float:
+        """The size, in typical sizes, from which it would have been seen."""
+        return SEEN / self.detectable if self.detectable > 0 else math.inf
+
+    @property
+    def visible(self) -> bool:
+        """Whether it would have shown at its typical size."""
+        return self.detectable >= SEEN
+
+    @property
+    def hidden(self) -> bool:
+        """Whether it hides in the noise at its typical size."""
+        return self.detectable < FAINTEST
+
 
 @dataclass(frozen=True)
 class Untested:
@@ -77,15 +102,6 @@ class Untested:
     where: str
     reason: str
     advice: str
-
-
-@dataclass(frozen=True)
-class Step:
-    """A step of the gap budget: 3-D rms error (m) on configurations left out of the fit."""
-
-    step: str
-    heldout_rms: float
-    ci95: Interval
 
 
 @dataclass(frozen=True)
@@ -175,12 +191,15 @@ class NoiseFloor:
 
 @dataclass(frozen=True)
 class Diagnosis(ForNotebooks):
-    """The whole answer.  `p_value`: of what was found, against the whole family of hypotheses."""
+    """The whole answer.  `p_value`: of what was found, against the whole family of hypotheses.
+
+    `findings` are the judgements about it, the verdict first, each with its numbers and what to do.
+    """
 
     verdict: Verdict
     gap: Gap
-    budget: tuple[Step, ...]
-    effects: tuple[Finding, ...]
+    budget: tuple[BudgetStep, ...]
+    effects: tuple[FoundEffect, ...]
     candidates: tuple[Candidate, ...]
     indistinguishable: tuple[tuple[EffectAt, ...], ...]
     location: Location | None
@@ -199,3 +218,92 @@ class Diagnosis(ForNotebooks):
     model_keys: dict[str, str] = field(default_factory=dict)
     # The arm as it was fitted before any effect was added, and its residuals.
     calibrated: Baseline | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def open(self) -> bool:
+        """Whether rivals are left that more poses may tell apart."""
+        return self.verdict in ("ambiguous", "unknown_effect")
+
+    @property
+    def dependences(self) -> tuple[StructureTest, ...]:
+        """Drivers that the residual depends on, the most conspicuous first."""
+        found = [t for t in self.structure if t.p_family <= STRUCTURE]
+        return tuple(sorted(found, key=lambda t: t.p_family))
+
+    @property
+    def smallest_seen(self) -> float:
+        """The rms motion of the markers (m) from which an effect would have been seen; NaN where
+        there are no configurations.
+
+        d² = Σ |δ|² / σ² per axis, with a configuration as one reading of the noise floor: more
+        readings and loads per configuration only make smaller effects visible.
+        """
+        independent = 3 * self.n_configurations
+        return SEEN * self.gap.noise_floor / math.sqrt(independent) if independent else math.nan
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        return tuple(_findings(self))
+
+
+def _findings(d: Diagnosis) -> Iterator[Finding]:
+    numbers: dict[str, Number] = {
+        "effects": tuple(f"{f.effect}:{f.where}" for f in d.effects),
+        "p_value": d.p_value,
+        "probability_nothing": d.probability_nothing,
+        "probability_unknown": d.probability_unknown,
+    }
+    settled = d.verdict in ("explained", "nothing_significant")
+    yield Finding(d.verdict, "good" if settled else "care", numbers, _remedy(d.verdict))
+    if d.verdict == "unknown_effect" and d.effects:
+        names = {"effects": numbers["effects"]}
+        yield Finding(
+            "named_beside_unknown", "care", names,
+            f"The cell of {option('cell_out')} has the effects named added, and nothing for what "
+            "has no name: keep it only where it does better on poses kept back (identify with "
+            f"{option('test')}).",
+        )  # fmt: skip
+    if d.open and d.extra is None:
+        remedy = f"Plan the poses that tell the rivals apart ({option('plan')}), and measure them."
+        yield Finding("rivals_open", "note", {}, remedy)
+    if d.dependences:
+        yield Finding(
+            "depends_on", "note",
+            {
+                "drivers": tuple(t.driver for t in d.dependences),
+                "p_family": tuple(t.p_family for t in d.dependences),
+            },
+        )  # fmt: skip
+    yield Finding(
+        "sensitivity", "note",
+        {
+            "smallest_seen_um": d.smallest_seen * 1e6, "candidates": len(d.candidates),
+            "visible": sum(c.visible for c in d.candidates),
+            "hidden": sum(c.hidden for c in d.candidates),
+        },
+    )  # fmt: skip
+    if d.noise.faulty:
+        worst = max(f.error for f in d.noise.faulty)
+        yield Finding(
+            "faulty_readings", "note", {"left_out": len(d.noise.faulty), "worst_um": worst * 1e6}
+        )
+
+
+def _remedy(verdict: Verdict) -> str:
+    """What to do after a verdict."""
+    if verdict == "explained":
+        return (
+            f"Identify with the cell of {option('cell_out')}, which has these effects added, and "
+            f"check the promise on poses that were never fitted (identify with {option('test')})."
+        )
+    if verdict == "ambiguous":
+        return (
+            "Compensating with the likeliest of the set serves poses and loads like those "
+            "measured; beyond them the rivals may predict differently."
+        )
+    if verdict == "unknown_effect":
+        return (
+            "Look for a physical cause where the evidence points, and measure more where the curve "
+            "is steep; compensate nothing by a name that the data do not support."
+        )
+    return "Nothing calls for another effect in the model."

@@ -26,9 +26,6 @@ from elastocal.manipulator.chain import Array, Chain, Joint
 from elastocal.manipulator.dh import FIXED, dh_number, read_dh_table
 from elastocal.manipulator.effects.compliances import transverse_axes
 from elastocal.tables import csv_text
-from elastocal.manipulator.dh import DH_COLUMNS, FIXED
-from elastocal.manipulator.effects.compliances import transverse_axes
-from elastocal.tables import read_table
 
 Convention = Literal["standard", "modified"]
 CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}

@@ -26,8 +26,8 @@ from elastocal.export.urdf_new import BASE, FLANGE, new_urdf
 from elastocal.export.yaml_text import to_yaml
 from elastocal.manipulator.calibrated import Calibrated
 from elastocal.manipulator.chain import Array, Chain
-from elastocal.text import json_text
 from elastocal.manipulator.effects import effect_of
+from elastocal.text import json_text
 
 SCHEMA = "elastocal/export/1"
 POSES_AT_REST = 20

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from elastocal.identification.advice import warnings_for
 from elastocal.identification.faulty_report import report_faulty
+from elastocal.identification.findings import judged, of_solution, warning_sentences
 from elastocal.identification.heldout import rms_3d
 from elastocal.identification.intervals import Intervals
 from elastocal.identification.methods import Found, is_exact
-from elastocal.identification.noise_summary import noise_summary
+from elastocal.identification.noise_summary import noise_of
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
 from elastocal.identification.result import (
+    Calibration,
     Combination,
     Estimate,
-    IdentificationResult,
     Outlier,
 )
 from elastocal.identification.solve import Solution, residual_sigma
@@ -31,7 +31,7 @@ CORRELATED = 0.9
 
 def summarise(
     model: Model, whole: Solution, clean: Solution, found: Found, beyond: tuple[Outlier, ...]
-) -> IdentificationResult:
+) -> Calibration:
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
     `whole` holds all readings, `clean` the fit to those that agree.  `beyond` are the readings
@@ -46,10 +46,10 @@ def summarise(
     seen = solution.problem.observations
     set_apart = len(seen.lead) < len(whole.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
-    result = IdentificationResult(
+    result = Calibration(
         model=model,
         method=found.method,
-        noise=noise_summary(found, sigma),
+        noise=noise_of(found, sigma),
         estimates=estimates,
         combinations=combinations,
         x=final.x,
@@ -76,8 +76,8 @@ def summarise(
         active=found.active,
         prior_share=found.prior_share,
     )
-    result = warnings_for(result, solution)
-    return replace(result, warnings=found.warnings + result.warnings)
+    result = judged(result, of_solution(result, solution))
+    return replace(result, warnings=found.warnings + warning_sentences(result))
 
 
 def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSummary | None:

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from elastocal.identification.checks import check_rows, check_table, fixed_and_free
 from elastocal.identification.chunked import residual_at
 from elastocal.identification.estimates import summarise
+from elastocal.identification.findings import judged
 from elastocal.identification.heldout import rms_3d
 from elastocal.identification.methods import is_exact, run_method
 from elastocal.identification.noise import Weights, scaled_by_component, weights_for
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
 from elastocal.identification.partition import partition
-from elastocal.identification.result import IdentificationResult, TestErrors
+from elastocal.identification.result import Calibration, TestErrors
 from elastocal.identification.solve import Problem, Progress, Solution, solve
 from elastocal.identification.start import start_values
 from elastocal.manipulator.model import Model
@@ -34,7 +35,7 @@ def identify(
     options: Options | None = None,
     test: Measurements | None = None,
     progress: Progress = lambda message: None,
-) -> IdentificationResult:
+) -> Calibration:
     """Parameters with intervals from nothing but the nominal arm and a table.
 
     Start by registration, a first fit weakly tied to it, choice of a minimal complete set of
@@ -72,7 +73,9 @@ def identify(
     progress("intervals and held-out residuals")
     beyond = describe(whole, found.solution, ~found.good)
     result = summarise(model, whole, clean, found, beyond)
-    return result if test is None else replace(result, test=_test_errors(model, result.x, test))
+    if test is None:
+        return result
+    return judged(replace(result, test=_test_errors(model, result.x, test)))
 
 
 def _silent(message: str) -> None:

@@ -1,9 +1,9 @@
-"""What the result says of the noise: which model, its size, why, and whether repeats agree."""
+"""The noise of a result: which model, its size, why, and whether repeats agree."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from elastocal.errors import InputError
 from elastocal.identification.lack_of_fit import LackOfFit, lack_of_fit
 from elastocal.identification.methods import Found
 from elastocal.identification.noise import Weights, block_diagonal, weights_for, whitener
-from elastocal.identification.variance.choose import NoiseFit
+from elastocal.identification.variance.choose import SHARED, NoiseFit, Trial
 from elastocal.identification.variance.judge import own_noise
 from elastocal.identification.weighting import linearised
 from elastocal.measurements import Measurements
@@ -21,38 +21,113 @@ from elastocal.measurements import Measurements
 Array = NDArray[np.float64]
 
 NUMBERED = re.compile(r"^(marker|configuration) (\d+)")
+COMMON = "common to each"
+TOO_LARGE = (
+    "the table is too large for a choice among noise models; stated noise, or equal noise "
+    "where none is stated, is scaled to the residual"
+)
 
 
-def noise_summary(found: Found, sigma: float) -> dict[str, Any]:
-    """JSON-ready: kind, description, sizes, reason, candidates, lack of fit, kind of intervals.
+@dataclass(frozen=True)
+class NoiseSize:
+    """An estimated standard deviation `sigma` in m (rad), or the `factor` on the stated noise."""
 
-    `sigma` is the standard deviation of a whitened row.  `sigma_um` is the noise of a reading's
-    component where one number says it, `ratio_to_stated` the residual over the stated noise where
-    any was stated.
+    name: str
+    sigma: float | None
+    factor: float | None = None
+
+    @property
+    def shared(self) -> bool:
+        """Whether it is a deviation that readings have in common, as those of a configuration."""
+        return self.name.startswith(COMMON)
+
+    def to_json(self) -> dict[str, Any]:
+        size: dict[str, Any] = {"name": self.name, "sigma_um": _um(self.sigma)}
+        return size if self.factor is None else size | {"factor": self.factor}
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise that an identification rests on.
+
+    `kind` and `description` name the weights.  `sigma` (m) is the noise of a reading's component
+    where one number says it, `ratio_to_stated` the residual over the stated noise where any was
+    stated.  `interval_kind` and `interval_description` say how intervals follow from it.  Where the
+    noise was estimated there are its `sizes` and the models `tried`; `reason` says why this one.
     """
-    weights = found.solution.problem.weights
-    misfit = _lack_of_fit(found)
-    covariance = found.intervals.covariance
-    summary: dict[str, Any] = {
-        "kind": weights.kind,
-        "description": weights.description,
-        "sigma_um": None if weights.absolute else sigma * 1e6,
-        "ratio_to_stated": _ratio_to_stated(found, sigma),
-        "lack_of_fit": None if misfit is None else asdict(misfit),
-        "intervals": {"kind": covariance.kind, "description": covariance.description},
-    }
+
+    kind: str
+    description: str
+    sigma: float | None = None
+    ratio_to_stated: float | None = None
+    lack_of_fit: LackOfFit | None = None
+    interval_kind: str = "classical"
+    interval_description: str = ""
+    reason: str | None = None
+    sizes: tuple[NoiseSize, ...] | None = None
+    tried: tuple[Trial, ...] | None = None
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the weights come from a noise model with estimated variances."""
+        return bool(self.sizes)
+
+    @property
+    def shared(self) -> bool:
+        """Whether the noise model has a deviation common to the readings of a configuration."""
+        return self.kind.endswith(SHARED)
+
+    @property
+    def intervals_by_configuration(self) -> bool:
+        """Whether the intervals hold where the readings of a configuration are correlated."""
+        kind = self.interval_kind.lower()
+        return kind in ("wild", "clustered") or kind.startswith("cr")
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-ready: lengths in µm, and only what is known of a noise that was not estimated."""
+        content: dict[str, Any] = {
+            "kind": self.kind,
+            "description": self.description,
+            "sigma_um": _um(self.sigma),
+            "ratio_to_stated": self.ratio_to_stated,
+            "lack_of_fit": None if self.lack_of_fit is None else asdict(self.lack_of_fit),
+            "intervals": {"kind": self.interval_kind, "description": self.interval_description},
+        }
+        if self.reason is not None:
+            content["reason"] = self.reason
+        if self.sizes is not None:
+            content["variances"] = [size.to_json() for size in self.sizes]
+        if self.tried is not None:
+            content["tried"] = [
+                {"kind": t.kind, "variances": t.n_variances, "criterion": t.criterion}
+                for t in self.tried
+            ]
+        return content
+
+
+def _um(metres: float | None) -> float | None:
+    return None if metres is None else metres * 1e6
+
+
+def noise_of(found: Found, sigma: float) -> Noise:
+    """The noise behind what was `found`; `sigma` is the standard deviation of a whitened row."""
+    weights, covariance = found.solution.problem.weights, found.intervals.covariance
+    noise = Noise(
+        weights.kind,
+        weights.description,
+        sigma=None if weights.absolute else sigma,
+        ratio_to_stated=_ratio_to_stated(found, sigma),
+        lack_of_fit=_lack_of_fit(found),
+        interval_kind=covariance.kind,
+        interval_description=covariance.description,
+    )
     if found.noise is not None:
-        summary |= _estimated(found.noise, found.solution.problem.observations.table)
-    elif found.solution.problem.large:
-        summary["reason"] = (
-            "the table is too large for a choice among noise models; stated noise, or equal noise "
-            "where none is stated, is scaled to the residual"
-        )
-    return summary
+        return _estimated(noise, found.noise, found.solution.problem.observations.table)
+    return replace(noise, reason=TOO_LARGE) if found.solution.problem.large else noise
 
 
-def _estimated(noise: NoiseFit, table: Measurements) -> dict[str, Any]:
-    fit = noise.fit
+def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
+    fit = found.fit
     labels = {"marker": table.marker_names, "configuration": table.configuration_labels}
 
     def label(numbered: re.Match[str]) -> str:
@@ -61,27 +136,25 @@ def _estimated(noise: NoiseFit, table: Measurements) -> dict[str, Any]:
     # The structure numbers markers and configurations; the user knows their names.
     names = [NUMBERED.sub(label, name) for name in fit.structure.names]
     own = [
-        {"name": name, "sigma_um": None, "factor": float(np.sqrt(v))}
+        NoiseSize(name, None, float(np.sqrt(v)))
         if fit.structure.name == "stated"
-        else {"name": name, "sigma_um": float(np.sqrt(v)) * 1e6}
+        else NoiseSize(name, float(np.sqrt(v)))
         for name, v in zip(names, fit.own, strict=True)
     ]
     shared = [
-        {"name": f"common to each {e.name}", "sigma_um": float(np.sqrt(v)) * 1e6}
+        NoiseSize(f"{COMMON} {e.name}", float(np.sqrt(v)))
         for e, v in zip(fit.shared, fit.common, strict=True)
     ]
     alone = fit.structure.name == "independent" and len(fit.own) == 1
-    return {
-        "kind": noise.kind,
-        "description": noise.description,
-        "reason": noise.reason,
-        "sigma_um": float(np.sqrt(fit.own[0])) * 1e6 if alone else None,
-        "variances": own + shared,
-        "tried": [
-            {"kind": t.kind, "variances": t.n_variances, "criterion": t.criterion}
-            for t in noise.trials
-        ],
-    }
+    return replace(
+        noise,
+        kind=found.kind,
+        description=found.description,
+        reason=found.reason,
+        sigma=float(np.sqrt(fit.own[0])) if alone else None,
+        sizes=(*own, *shared),
+        tried=found.trials,
+    )
 
 
 def _ratio_to_stated(found: Found, sigma: float) -> float | None:

@@ -14,8 +14,6 @@ from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.intervals import IntervalKind
 from elastocal.identification.noise import WeightKind
-from elastocal.identification.intervals import KINDS as NOISES
-from elastocal.text import did_you_mean
 from elastocal.identification.variance.structure import noise_models
 from elastocal.text import did_you_mean
 

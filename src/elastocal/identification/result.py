@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.identification.constrained.minimise import ActiveConstraint
+from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outlier import Outlier
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.robust.report import OutlierReport
@@ -96,8 +98,42 @@ class TestErrors:
     n: int
 
 
+Severity = Literal["good", "note", "care", "poor"]
+Number = float | str | tuple[float, ...] | tuple[str, ...] | None
+
+
 @dataclass(frozen=True)
-class IdentificationResult(ForNotebooks):
+class Finding:
+    """A judgement about a result: what was found, how bad it is, by which numbers, what to do.
+
+    `severity` is good (it speaks for the result), note (worth knowing), care (use the result
+    knowing this) or poor (do not use it).  `numbers` are those that the judgement rests on, with
+    units in their names; `remedy` is a sentence, empty where nothing needs to be done.
+    """
+
+    kind: str
+    severity: Severity
+    numbers: dict[str, Number] = field(default_factory=dict)
+    remedy: str = ""
+
+    def number(self, name: str) -> float:
+        """One of the numbers; infinite where it is not known."""
+        value = self.numbers[name]
+        return value if isinstance(value, float | int) else math.inf
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers, strings and lists; what is not finite is None."""
+        numbers = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in self.numbers.items()
+        }
+        return {
+            "kind": self.kind, "severity": self.severity, "numbers": numbers, "remedy": self.remedy,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Calibration(ForNotebooks):
     """What `identify` found.
 
     `x` (parameters,) are the values the model uses; `covariance` (determined, determined) goes
@@ -107,12 +143,13 @@ class IdentificationResult(ForNotebooks):
     deviation per whitened row (in m where unit weights were used), with `dof` degrees of freedom.
     `active` are the constraints that hold with equality; `prior_share` says by parameter what
     share of its information the prior gave, 0 to 1 (empty without a prior; parameters that
-    equalities fix are left out).
+    equalities fix are left out).  `findings` are the judgements about all this, each with its
+    numbers and what to do; `warnings` says those in sentences that call for attention.
     """
 
     model: Model
     method: str
-    noise: dict[str, Any]
+    noise: Noise
     estimates: tuple[Estimate, ...]
     combinations: tuple[Combination, ...]
     x: Array
@@ -137,6 +174,7 @@ class IdentificationResult(ForNotebooks):
     faulty_report: OutlierReport | None = None
     active: tuple[ActiveConstraint, ...] = ()
     prior_share: dict[str, float] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
@@ -157,24 +195,9 @@ class IdentificationResult(ForNotebooks):
                 return c
         raise KeyError(f"no combination starts with '{first}'")
 
-    def __str__(self) -> str:
-        """Plain table in SI units: what is known with its 95 % interval, and what is not."""
-        lines = [
-            f"{self.method} of {len(self.observations.lead)} readings, {self.noise['description']}",
-            f"residual rms {self.residual_rms * 1e6:.1f} µm, held out {self.heldout_rms * 1e6:.1f} "
-            f"µm, {self.dof} degrees of freedom",
-        ]
-        for e in self.estimates:
-            if e.value is not None and e.ci95 is not None:
-                lines.append(f"{e.name:32s} {e.value:13.6g} {_interval(e.value, e.ci95)} {e.unit}")
-            else:
-                lines.append(f"{e.name:32s} {'–':>13s}   {e.note}")
-        lines += [
-            f"{c.expression} = {c.value:.6g} ± {(c.ci95[1] - c.ci95[0]) / 2:.2g} {c.unit}"
-            for c in self.combinations
-        ]
-        lines += [f"correlation {r:+.3f}: {a}, {b}" for a, b, r in self.correlations]
-        return "\n".join([*lines, *self.warnings])
+    def finding(self, *kinds: str) -> Finding | None:
+        """The first finding of one of these kinds; None where there is none."""
+        return next((f for f in self.findings if f.kind in kinds), None)
 
     def residual_table(self) -> list[dict[str, Any]]:
         """One row per observation: line, configuration, repeat, marker, residuals in µm (µrad)."""
@@ -228,7 +251,7 @@ class IdentificationResult(ForNotebooks):
             "test_rms_um": None if self.test is None else _um(self.test.rms),
             "test_mean_um": None if self.test is None else _um(self.test.mean),
             "test_max_um": None if self.test is None else _um(self.test.maximum),
-            "noise": self.noise,
+            "noise": self.noise.to_json(),
             "residual_summary": (
                 None if self.residual_summary is None else self.residual_summary.to_json()
             ),
@@ -246,6 +269,7 @@ class IdentificationResult(ForNotebooks):
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
             "warnings": list(self.warnings),
+            "findings": [f.to_json() for f in self.findings],
         }  # fmt: skip
 
 
@@ -266,14 +290,6 @@ def _endless(ci95: tuple[float, float] | None) -> str:
         return ""
     ends = [name for name, v in zip(("lower", "upper"), ci95, strict=True) if not np.isfinite(v)]
     return f"the data set no {' or '.join(ends)} limit to it" if ends else ""
-
-
-def _interval(value: float, ci95: tuple[float, float]) -> str:
-    """ "± half width", or both ends of an interval that is not symmetric about the value."""
-    below, above = value - ci95[0], ci95[1] - value
-    if abs(above - below) <= LOPSIDED * max(above, below):
-        return f"± {(below + above) / 2:.2g}"
-    return f"[{ci95[0]:.3g}, {ci95[1]:.3g}]"
 
 
 def _finite(value: float) -> float | None:

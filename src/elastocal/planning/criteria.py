@@ -25,10 +25,6 @@ from typing import Any, Self, TypeVar, get_args
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.text import is_label
-from elastocal.text import did_you_mean
-from elastocal.text import listed
-from elastocal.text import quoted
 from elastocal.planning.criterion import (
     Cone,
     Criterion,
@@ -50,6 +46,7 @@ from elastocal.planning.information_matrices import (
     trustworthy,
     whitened_rows,
 )
+from elastocal.text import did_you_mean, is_label, listed, quoted
 
 Registered = TypeVar("Registered", bound=type[ScenarioCriterion])
 

@@ -17,10 +17,8 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.text import did_you_mean
-from elastocal.text import listed
-from elastocal.text import quoted
 from elastocal.planning.information_matrices import Array, IntArray, Interest, candidate_sums
+from elastocal.text import did_you_mean, listed, quoted
 
 Robust = Literal["none", "average", "worst"]
 Need = Literal["test_poses", "combination"]

@@ -27,7 +27,6 @@ from elastocal.manipulator import rigid
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects.loads import STANDARD_GRAVITY
 from elastocal.planning.information_matrices import Array
-from elastocal.manipulator.effects.loads import STANDARD_GRAVITY
 
 SMOOTHING = 1e-3  # m over which several distances blend into one
 MOST_SPHERES = 6  # spheres along an edge of a box

@@ -1,161 +1,350 @@
-"""The figures of the identification report, each an SVG element."""
+"""Figures as SVG that stands in a page and follows its colours; those of plan and diagnosis."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import hashlib
+import io
+import math
+import re
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from elastocal.identification.result import IdentificationResult
-from elastocal.report.residuals import (
-    Residuals,
-    reach,
-    rms_by_pose,
-    running_mean,
+from elastocal.design.plan import Plan
+from elastocal.diagnosis.result import Curve, Diagnosis
+from elastocal.report.diagnosis_view import (
+    driver_name,
+    effect_at,
+    error_steps,
+    name_of,
+    probability,
 )
-from elastocal.report.svg import FAINT, SERIES, dots, drawn
-from elastocal.report.units import length
-from elastocal.report.verdict import rms_by_kind
-from elastocal.report.words import short_name
+from elastocal.report.formatting import display, length, short_name, significant
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Stand-ins that the page's style sheet replaces by colours for light and dark, screen and print.
+INK, GRID, FAINT = "#010203", "#010204", "#010205"
+SERIES = ("#010206", "#010207", "#010208", "#010209", "#01020a", "#01020b")
+ARM = "#01020c"
+_VARIABLES = {
+    INK: "var(--ink)",
+    GRID: "var(--grid)",
+    FAINT: "var(--faint)",
+    ARM: "var(--arm)",
+    **{colour: f"var(--series{k + 1})" for k, colour in enumerate(SERIES)},
+}
+_STYLE: dict[str, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "elastocal",
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+    "text.parse_math": False,  # names from files are not formulas
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": FAINT,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.facecolor": "none",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "axes.prop_cycle": None,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "figure.facecolor": "none",
+    "legend.frameon": False,
+    "path.simplify": False,
+}
+Draw = Callable[["Figure"], None]
+
+
+def style() -> AbstractContextManager[None]:
+    """Defaults of matplotlib with this package's colours, whatever the user has configured."""
+    import matplotlib.style
+    from cycler import cycler
+
+    cycle = cycler(color=SERIES)
+    return matplotlib.style.context(["default", {**_STYLE, "axes.prop_cycle": cycle}])
+
+
+def drawn(draw: Draw, width: float, height: float, title: str) -> str:
+    """The SVG element of what `draw` puts on a figure of the given size in inches.
+
+    `title` says what the figure shows to those who cannot see it; it is not user text.
+    """
+    from matplotlib.figure import Figure
+
+    with style():
+        figure = Figure(figsize=(width, height), layout="constrained")
+        draw(figure)
+        buffer = io.StringIO()
+        nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
+        figure.savefig(buffer, format="svg", metadata=nothing)
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r'<g id="[^"]*"', "<g", text)  # several figures share a page
+    text = re.sub(r"<svg [^>]*viewBox=\"([^\"]*)\"[^>]*>", _head(title, width), text, count=1)
+    for colour, variable in _VARIABLES.items():
+        text = text.replace(colour, variable)
+    return _numbered(text, title)
+
+
+def _numbered(text: str, title: str) -> str:
+    """Ids by order and title: matplotlib's hash the layout, whose last bits differ between runs."""
+    prefix = hashlib.sha256(title.encode()).hexdigest()[:8]
+    number: dict[str, int] = {}
+
+    def name(match: re.Match[str]) -> str:
+        return f"{match[1]}f{prefix}-{number.setdefault(match[2], len(number))}"
+
+    return re.sub(r'(id="|#)([a-z][0-9a-f]{10})\b', name, text)
+
+
+def _head(title: str, width: float) -> str:
+    return (
+        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" '
+        rf'viewBox="\1" role="img" aria-label="{title}" style="max-width:{width * 96:.0f}px">'
+    )
+
+
+def dots(axes: Axes, x: NDArray, y: NDArray, colour: str, size: float, label: str = "") -> None:
+    """Scatter as one path of round caps: a third of the bytes of a marker per point."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    finite = np.isfinite(x) & np.isfinite(y)
+    points = np.column_stack([x[finite], y[finite]])
+    if label:
+        axes.plot([], [], "o", color=colour, markersize=size + 1, label=label)
+    if not len(points):
+        return
+    codes = np.tile([Path.MOVETO, Path.LINETO], len(points))
+    path = Path(np.repeat(points, 2, axis=0), codes)
+    axes.add_patch(
+        PathPatch(path, fill=False, edgecolor=colour, linewidth=size, capstyle="round", alpha=0.6)
+    )
+    axes.update_datalim(points)
+    axes.autoscale_view()
+
+
 WIDTH = 9.9
-MOST_LABELS = 30
-MOST_JOINT_DOTS = 2000  # per joint; the running mean uses every reading
+STEP_HEIGHT = 0.42  # inches per step
+LONGEST_NAME = 46
+# A budget that spans more than this is drawn on a logarithmic axis.
+WIDE_RANGE = 8.0
 
 
-def by_configuration(residuals: Residuals) -> str:
-    """Residual of every reading over its configuration, a panel per direction."""
-    n = len(residuals.components)
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
-        for k, axes in enumerate(panels):
-            _configuration_panel(axes, residuals, k)
-        panels[-1].set_xlabel("configuration")
-        every = range(0, len(residuals.labels), -(-len(residuals.labels) // MOST_LABELS))
-        names = [short_name(residuals.labels[i]) for i in every]
-        turn = 90 if max(map(len, names)) > 3 else 0
-        panels[-1].set_xticks(list(every), names, rotation=turn)
-        if 1 < len(residuals.markers) <= len(SERIES):
-            figure.legend(
-                *panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=6
-            )
-
-    return drawn(draw, WIDTH, 0.6 + 1.5 * n, "Residuals by configuration, marker and direction")
-
-
-def _configuration_panel(axes: Axes, residuals: Residuals, k: int) -> None:
-    many = len(residuals.markers)
-    values = residuals.value[:, k]
-    size = 2.6 if len(residuals.shown) <= 1500 else 1.6
-    shift = 0.6 * (np.arange(many) - (many - 1) / 2) / many
-    axes.axhline(0, color=FAINT, linewidth=0.8)
-    if many > len(SERIES):
-        at = residuals.shown
-        x = residuals.pose[at] + shift[residuals.marker[at]]
-        dots(axes, x, values[at], SERIES[0], size)
-    else:
-        for m, name in enumerate(residuals.markers):
-            at = residuals.shown[residuals.marker[residuals.shown] == m]
-            dots(axes, residuals.pose[at] + shift[m], values[at], SERIES[m], size, short_name(name))
-    axes.grid(axis="x", visible=False)
-    axes.set_xlim(-0.7, len(residuals.labels) - 0.3)
-    axes.set_ylabel(f"{residuals.components[k]} in {residuals.units[k]}")
-    alike = [i for i, unit in enumerate(residuals.units) if unit == residuals.units[k]]
-    _limit(axes, values, reach(residuals.value[:, alike]))
-
-
-def against_joints(kinds: Sequence[str], residuals: Residuals) -> str:
-    """Residual over the position of each joint, of `kinds`, with the running mean by direction."""
-    rows = -(-len(kinds) // 3)
-    n = residuals.positions
-    values = residuals.value[:, :n]
-    shown = residuals.shown
-    if len(shown) * n > MOST_JOINT_DOTS:
-        shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
-    height = reach(values)
+def waterfall_of_steps(
+    steps: Sequence[tuple[str, float, tuple[float, float]]],
+    floor: float | None,
+    floor_name: str,
+) -> str:
+    """SVG of the steps (name, rms in m, 95 % interval) and the `floor` (m) that noise leaves."""
+    rms = np.array([value for _, value, _ in steps])
+    ends = np.array([ci95 for *_, ci95 in steps]).reshape(-1, 2)
+    floor = math.nan if floor is None else floor
+    known = [v for v in (*rms, floor) if math.isfinite(v) and v > 0]
 
     def draw(figure: Figure) -> None:
-        grid = figure.subplots(rows, min(3, len(kinds)), sharey=True, squeeze=False).ravel()
-        for j, (axes, kind) in enumerate(zip(grid, kinds, strict=False)):
-            q = np.degrees(residuals.q[:, j]) if kind == "revolute" else residuals.q[:, j] * 1e3
-            axes.axhline(0, color=FAINT, linewidth=0.8)
-            for k in range(n):
-                dots(axes, q[shown], values[shown, k], SERIES[k], 1.3)
-            for k in range(n):
-                middle, mean, error = running_mean(q, values[:, k])
-                axes.errorbar(middle, mean, 2 * error, color=SERIES[k], linewidth=1.4,
-                              elinewidth=0.8, label=residuals.components[k])  # fmt: skip
-            axes.set_xlabel(f"joint {j + 1} in {'°' if kind == 'revolute' else 'mm'}")
-            axes.set_ylim(-height, height)
-        for axes in grid[len(kinds) :]:
-            axes.set_visible(False)
-        figure.supylabel("residual in µm", fontsize=9)
-        handles = grid[0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside upper right", ncols=n)
+        from matplotlib.ticker import LogLocator
 
-    return drawn(draw, WIDTH, 0.4 + 2.0 * rows, "Residuals against joint positions")
+        axes = figure.subplots()
+        for k, (value, (low, high)) in enumerate(zip(rms * 1e6, ends * 1e6, strict=True)):
+            if k:
+                label = "taken away" if k == 1 else None
+                axes.plot([rms[k - 1] * 1e6, value], [k, k], color=SERIES[5], linewidth=7,
+                          solid_capstyle="butt", label=label)  # fmt: skip
+            axes.plot([low, high], [k, k], color=SERIES[0], linewidth=1.6,
+                      label="95 % interval" if k == 0 else None)  # fmt: skip
+            axes.plot([value], [k], "o", color=SERIES[0], markersize=7,
+                      label="remaining error" if k == 0 else None)  # fmt: skip
+            axes.annotate(length(rms[k]), (value, k), (0, 7), textcoords="offset points",
+                          ha="center", fontsize=8)  # fmt: skip
+        if math.isfinite(floor):
+            axes.axvline(floor * 1e6, color=SERIES[1], linestyle="--", linewidth=1.2,
+                         label=f"{floor_name} ({length(floor)})")  # fmt: skip
+        axes.set_yticks(range(len(rms)), [short_name(name, LONGEST_NAME) for name, *_ in steps])
+        axes.set_ylim(len(rms) - 0.4, -0.75)
+        if known and max(known) > WIDE_RANGE * min(known):
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.margins(x=0.1)
+        else:
+            axes.set_xlim(0, 1.15e6 * max(known, default=1.0))
+        axes.xaxis.set_major_formatter(lambda x, _: _tick(x))
+        axes.xaxis.set_minor_formatter(lambda x, _: "")
+        axes.set_xlabel("3-D rms error on held-out poses")
+        axes.grid(axis="y", visible=False)
+        figure.legend(loc="outside upper right", ncols=4, fontsize=8)
+
+    return drawn(draw, WIDTH, 1.1 + STEP_HEIGHT * len(rms), "Gap budget, step by step")
 
 
-def errors(result: IdentificationResult) -> str:
-    """Nominal, fitted, held-out and test rms on one axis, logarithmic where they differ much."""
-    rows = [(name, v) for name, v in rms_by_kind(result) if np.isfinite(v) and v > 0]
+def _tick(micrometres: float) -> str:
+    """ "50 µm", "2 mm"."""
+    return f"{micrometres:g} µm" if micrometres < 1e3 else f"{micrometres / 1e3:g} mm"
+
+
+BAR_HEIGHT = 0.34  # inches per bar
+MOST_BARS = 10
+LONGEST_ENTRY = 24  # what moves, written along the height of a small panel
+# Unit of a curve's axis → (factor, unit shown).
+ABSCISSA = {
+    "rad": (180 / math.pi, "°"),
+    "s": (1 / 60, "min"),
+    "N m": (1.0, "N·m"),
+    "of the largest load": (1.0, "parts of the largest"),
+}
+ORDINATE = {"m": (1e6, "µm"), "rad": (1e6, "µrad"), "1": (1e6, "ppm")}
+
+
+def diagnosis_waterfall(d: Diagnosis) -> str:
+    """The gap budget of a diagnosis as a waterfall."""
+    steps = [(name_of(s.step), s.heldout_rms, s.ci95) for s in error_steps(d)]
+    return waterfall_of_steps(steps, d.gap.noise_floor, "noise alone")
+
+
+def candidate_bars(d: Diagnosis) -> str:
+    """Probability of the best candidates, of nothing, and of an effect outside the catalogue."""
+    rows = [(effect_at(c), c.probability, SERIES[0], "") for c in d.candidates[:MOST_BARS]]
+    rows.append(("an effect outside the catalogue", d.probability_unknown, SERIES[1], "////"))
+    rows.append(("no further effect", d.probability_nothing, FAINT, "...."))
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        for k, (name, v) in enumerate(rows):
-            colour = SERIES[0] if name.startswith("nominal") else SERIES[1]
-            axes.plot([v * 1e6], [-k], "o", color=colour, markersize=8)
-            axes.annotate(length(v), (v * 1e6, -k), (0, 7), textcoords="offset points", ha="center")
-        names = [name.replace(" (", "\n(") for name, _ in rows]
-        axes.set_yticks([-k for k in range(len(rows))], names)
-        axes.set_ylim(0.6 - len(rows), 0.7)
-        sizes = [v for _, v in rows]
-        if max(sizes, default=1.0) > 8 * min(sizes, default=1.0):
-            axes.set_xscale("log")
-            axes.margins(x=0.25)
-        else:
-            axes.set_xlim(0, 1.25e6 * max(sizes, default=1.0))
-        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g} µm" if x < 1e3 else f"{x / 1e3:g} mm")
-        axes.xaxis.set_minor_formatter(lambda x, _: "")
-        axes.set_xlabel("rms error")
+        for k, (_, p, colour, hatch) in enumerate(rows):
+            axes.barh(k, p, height=0.62, facecolor=colour if not hatch else "none",
+                      edgecolor=colour, hatch=hatch)  # fmt: skip
+            axes.text(p + 0.012, k, probability(p), va="center", fontsize=8)
+        axes.set_yticks(range(len(rows)), [_axis_name(name) for name, *_ in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.set_xlim(0, 1.1)
+        axes.set_xticks(np.linspace(0, 1, 6))
+        axes.set_xlabel("probability")
         axes.grid(axis="y", visible=False)
 
-    return drawn(draw, WIDTH / 2, 2.9, "Nominal, fitted, held-out and test error")
+    return drawn(draw, WIDTH, 0.7 + BAR_HEIGHT * len(rows), "Probability of every candidate")
 
 
-def held_out(result: IdentificationResult, residuals: Residuals) -> str:
-    """Held-out against fitted rms of every configuration: far above the line, few others help."""
-    fitted, held = rms_by_pose(result, residuals)
-    finite = np.isfinite(held)
-    unit, factor = ("mm", 1e-3) if fitted.max(initial=0.0) > 5e3 else ("µm", 1.0)
+def unknown_curves(d: Diagnosis) -> str:
+    """How the unknown effect depends on what drives it: smooth curves with bands of 2 sd."""
+    across = min(2, len(d.curves))
+    down = -(-len(d.curves) // 2)
+
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(down, across, squeeze=False).ravel()
+        for axes, curve in zip(grid, d.curves, strict=False):
+            _curve(axes, curve)
+        for axes in grid[len(d.curves) :]:
+            axes.set_visible(False)
+        handles = grid[0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside upper right", ncols=2, fontsize=8)
+
+    return drawn(draw, WIDTH, 0.4 + 2.6 * down, "Shape of the unknown dependence")
+
+
+def _curve(axes: Axes, curve: Curve) -> None:
+    wide, x_unit = ABSCISSA.get(curve.x_unit, (1.0, curve.x_unit))
+    high, y_unit = ORDINATE.get(curve.y_unit, (1.0, curve.y_unit))
+    x, y, sd = (np.array(v) for v in (curve.x, curve.y, curve.sd))
+    axes.axhline(0, color=FAINT, linewidth=0.8)
+    axes.fill_between(x * wide, (y - 2 * sd) * high, (y + 2 * sd) * high, color=SERIES[0],
+                      alpha=0.25, linewidth=0, label="± 2 standard deviations")  # fmt: skip
+    axes.plot(x * wide, y * high, color=INK, linewidth=1.4, label="estimated shape")
+    axes.set_xlabel(f"{_axis_name(driver_name(curve.driver))} in {x_unit}")
+    axes.set_ylabel(f"{short_name(driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}")
+
+
+def _axis_name(text: str) -> str:
+    return short_name(text, LONGEST_NAME)
+
+
+PLAN_ROW = 0.26  # inches per bar or dot
+MOST_PARAMETERS = 60
+LONGEST_PARAMETER = 40
+
+
+def plan_intervals(plan: Plan) -> str:
+    """Predicted half widths of the 95 % intervals, a panel per unit."""
+    units: dict[str, list[tuple[str, float]]] = {}
+    for p in plan.predicted[:MOST_PARAMETERS]:
+        shown, unit = display(p.half_width, p.unit)
+        units.setdefault(unit, []).append((short_name(p.name, LONGEST_PARAMETER), shown))
+    heights = [len(rows) + 1.5 for rows in units.values()]
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(len(units), 1, squeeze=False, height_ratios=heights)[:, 0]
+        for axes, (unit, rows) in zip(panels, units.items(), strict=True):
+            for k, (_, half) in enumerate(rows):
+                axes.plot([0, half], [k, k], color=SERIES[0], linewidth=5, solid_capstyle="butt")
+                axes.annotate(significant(half, 2), (half, k), (5, 0), va="center", fontsize=8,
+                              textcoords="offset points")  # fmt: skip
+            axes.set_yticks(range(len(rows)), [name for name, _ in rows])
+            axes.set_ylim(len(rows) - 0.4, -0.6)
+            axes.set_xlim(0, 1.12 * max(half for _, half in rows))
+            axes.set_xlabel(f"half width of the 95 % interval in {unit}")
+            axes.grid(axis="y", visible=False)
+
+    return drawn(
+        draw, WIDTH, 0.5 + PLAN_ROW * sum(heights) + 0.3 * len(units), "Predicted intervals"
+    )
+
+
+def plan_removed(plan: Plan) -> str:
+    """How many candidates each rule of the cell removed, and how many are feasible."""
+    c = plan.candidates
+    rows = [(name.replace("_", " "), n) for name, n in c.removed_by.items() if n]
+    rows.sort(key=lambda row: -row[1])
+    rows.append(("feasible", c.feasible))
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        top = 1.08 * factor * max([*fitted, *held[finite], 1e-9])
-        axes.plot([0, top], [0, top], color=FAINT, linewidth=1.0, label="no difference")
-        dots(axes, fitted * factor, held * factor, SERIES[2], 4.0, "a configuration")
-        axes.set_xlim(0, top)
-        axes.set_ylim(0, top)
-        axes.set_xlabel(f"fitted rms in {unit}")
-        axes.set_ylabel(f"held-out rms in {unit}")
-        axes.legend(loc="lower right", fontsize=8)
-        if not finite.all():
-            _remark(axes, f"{int((~finite).sum())} without held-out error")
+        for k, (name, n) in enumerate(rows):
+            look: dict[str, Any] = {"facecolor": "none", "edgecolor": FAINT, "hatch": "////"}
+            if name == "feasible":
+                look = {"facecolor": SERIES[2]}
+            axes.barh(k, n, height=0.62, **look)
+            axes.annotate(f"{n}", (n, k), (5, 0), textcoords="offset points", va="center",
+                          fontsize=8)  # fmt: skip
+        axes.set_yticks(range(len(rows)), [name for name, _ in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.set_xlim(0, 1.15 * max(n for _, n in rows) + 1)
+        axes.set_xlabel(f"of {c.tried} poses tried")
+        axes.grid(axis="y", visible=False)
 
-    return drawn(draw, WIDTH / 2, 2.9, "Held-out against fitted error by configuration")
-
-
-def _limit(axes: Axes, values: np.ndarray, height: float) -> None:
-    axes.set_ylim(-height, height)
-    if beyond := int((np.abs(values) > height).sum()):
-        _remark(axes, f"{beyond} beyond this axis")
+    return drawn(draw, WIDTH, 0.7 + 1.2 * PLAN_ROW * len(rows), "What removed candidates")
 
 
-def _remark(axes: Axes, text: str) -> None:
-    axes.text(0.01, 0.97, text, transform=axes.transAxes, va="top", fontsize=8)
+def plan_curve(plan: Plan) -> str:
+    """The criterion of the best plan found against its number of poses, with its bound."""
+    points = plan.curve
+    bounded = [(s.poses, s.bound) for s in points if s.bound is not None]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot([s.poses for s in points], [s.value for s in points], "o-", color=SERIES[0],
+                  markersize=6, label="best plan found")  # fmt: skip
+        if bounded:
+            axes.plot([n for n, _ in bounded], [bound for _, bound in bounded], "_--",
+                      color=SERIES[1], markersize=12,
+                      label="no plan can be better (on the pool)")  # fmt: skip
+        axes.set_xticks([s.poses for s in points])
+        axes.set_xlabel("poses")
+        name = "ρ₀" if plan.criterion == "test_pose" else plan.criterion
+        axes.set_ylabel(f"{name} in {plan.unit}" if plan.unit else name)
+        axes.set_ylim(bottom=0)
+        axes.legend(fontsize=8)
+
+    return drawn(draw, WIDTH, 3.0, "Criterion against the number of poses")

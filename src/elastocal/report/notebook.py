@@ -5,31 +5,284 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from html import escape
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from elastocal.compensation.commands_file import commands_csv, joint_columns, summary
 from elastocal.compensation.compensate import Compensation
 from elastocal.design.plan import Plan
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.errors import InputError
-from elastocal.identification.result import IdentificationResult
-from elastocal.report import notebook_figures as figures
-from elastocal.report.diagnosis_rows import BUDGET, CANDIDATES, budget_rows, candidate_rows
-from elastocal.report.diagnosis_verdict import verdict_lines
-from elastocal.report.plan_tables import plan_lines
-from elastocal.report.rows import combination_rows, parameter_rows
-from elastocal.report.units import length
-from elastocal.report.verdict import summary_lines
+from elastocal.identification.result import Calibration
+from elastocal.report.diagnosis_view import (
+    BUDGET_HEADS,
+    CANDIDATE_HEADS,
+    diagnosis_lines,
+    effect_at,
+    error_steps,
+    gap_rows,
+    hypothesis_rows,
+    name_of,
+)
+from elastocal.report.formatting import display, length, printable
+from elastocal.report.identification_view import combination_rows, parameter_rows, summary_lines
+from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
+from elastocal.report.plan_view import plan_lines
+from elastocal.report.residual_view import residuals_of
+from elastocal.report.terminal import (
+    compensation_text,
+    diagnosis_text,
+    identification_text,
+    plan_text,
+)
 from elastocal.text import did_you_mean, listed, quoted
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Array = NDArray[np.float64]
+MOST_BARS = 40
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Horizontal intervals: `value`, and `low` to `high` where they are finite."""
+
+    names: tuple[str, ...]
+    value: Array
+    low: Array
+    high: Array
+    axis: str
+
+
+def residuals(result: Calibration, interactive: bool) -> Any:
+    """Residual of every reading (at most 5000) over its configuration, one panel a component."""
+    found = residuals_of(result)
+    panels = [f"{c} in {u}" for c, u in zip(found.components, found.units, strict=True)]
+    rows = found.shown
+    hover = [
+        f"configuration {printable(found.labels[found.pose[i]])}, marker "
+        f"{printable(found.markers[found.marker[i]])}"
+        for i in rows
+    ]
+    if interactive:
+        import plotly.graph_objects as go
+        from plotly.subplots import make_subplots
+
+        figure = make_subplots(rows=len(panels), cols=1, shared_xaxes=True)
+        for k, title in enumerate(panels):
+            for m, name in enumerate(found.markers):
+                at = np.flatnonzero(found.marker[rows] == m)
+                figure.add_trace(
+                    go.Scatter(
+                        x=found.pose[rows[at]], y=found.value[rows[at], k], mode="markers",
+                        marker={"color": COLOURS[m % len(COLOURS)], "size": 5},
+                        name=_plain(name), legendgroup=str(m), showlegend=k == 0,
+                        text=[_plain(hover[i]) for i in at], hovertemplate="%{text}: %{y:.1f}",
+                    ),
+                    row=k + 1, col=1,
+                )  # fmt: skip
+            figure.update_yaxes(title_text=title, row=k + 1, col=1)
+        figure.update_xaxes(title_text="configuration", row=len(panels), col=1)
+        return figure.update_layout(height=160 + 180 * len(panels), template="plotly_white")
+
+    def draw(figure: Any) -> None:
+        grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        for k, (axes, title) in enumerate(zip(grid, panels, strict=True)):
+            axes.axhline(0, color="#7f7f7f", linewidth=0.8)
+            for m, name in enumerate(found.markers):
+                at = rows[found.marker[rows] == m]
+                axes.plot(found.pose[at], found.value[at, k], ".", markersize=4,
+                          color=COLOURS[m % len(COLOURS)], label=printable(name))  # fmt: skip
+            axes.set_ylabel(title)
+        grid[-1].set_xlabel("configuration")
+        if 1 < len(found.markers) <= 12:
+            figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=6)
+
+    return _figure(draw, (9.0, 0.8 + 1.5 * len(panels)))
+
+
+def parameters(result: Calibration, interactive: bool) -> Any:
+    """Deviation of each identified parameter from nominal in units of its 95 % half width."""
+    kept = [e for e in result.estimates if e.value is not None and e.ci95 is not None]
+    kept = [e for e in kept if np.isfinite(e.ci95).all()][:MOST_BARS]  # type: ignore[arg-type]
+    value = np.array([e.value - e.nominal for e in kept if e.value is not None])
+    ends = np.array([e.ci95 for e in kept], dtype=float).reshape(-1, 2)
+    nominal = np.array([e.nominal for e in kept])
+    half = np.maximum((ends[:, 1] - ends[:, 0]) / 2, np.finfo(float).tiny)
+    bars = Bars(
+        tuple(e.name for e in kept), value / half, (ends[:, 0] - nominal) / half,
+        (ends[:, 1] - nominal) / half,
+        "deviation from nominal, in half widths of the 95 % interval",
+    )  # fmt: skip
+    return _bars(bars, interactive)
+
+
+def intervals(plan: Plan, interactive: bool) -> Any:
+    """Half widths of the 95 % intervals that the plan promises, over the largest of their unit."""
+    shown = [display(p.half_width, p.unit) for p in plan.predicted[:MOST_BARS]]
+    names = [f"{p.name} ({unit})" for p, (_, unit) in zip(plan.predicted, shown, strict=False)]
+    value = np.array([v for v, _ in shown])
+    nothing = np.full(len(value), np.nan)
+    return _bars(
+        Bars(tuple(names), value, nothing, nothing, "half width of the 95 % interval"), interactive,
+        logarithmic=True,
+    )  # fmt: skip
+
+
+def budget(d: Diagnosis, interactive: bool) -> Any:
+    """The gap budget: held-out rms error after each step, with its 95 % interval, and the noise."""
+    steps = error_steps(d)
+    ends = np.array([s.ci95 for s in steps]).reshape(-1, 2) * 1e6
+    names = [*(name_of(s.step) for s in steps), "noise alone"]
+    value = np.array([*(s.heldout_rms for s in steps), d.gap.noise_floor]) * 1e6
+    low, high = (np.append(ends[:, k], np.nan) for k in (0, 1))
+    positive = bool((value > 0).all())
+    bars = Bars(tuple(names), value, low, high, "rms error on held-out poses in µm")
+    return _bars(bars, interactive, logarithmic=positive and value.max() > 8 * value.min())
+
+
+def candidates(d: Diagnosis, interactive: bool) -> Any:
+    """Probabilities of the ten best candidates, of an unknown effect and of none."""
+    best = d.candidates[:10]
+    names = [*map(effect_at, best), "an effect outside the catalogue", "no further effect"]
+    value = np.array([*(c.probability for c in best), d.probability_unknown, d.probability_nothing])
+    nothing = np.full(len(value), np.nan)
+    return _bars(Bars(tuple(names), value, nothing, nothing, "probability"), interactive)
+
+
+def errors(c: Compensation, interactive: bool) -> Any:
+    """Predicted error at the nominal commands, of the rows that are reached."""
+    return _of_targets(c, c.before, "error at the nominal command in µm", interactive)
+
+
+def uncertainties(c: Compensation, interactive: bool) -> Any:
+    """Standard uncertainty of the tool's position at the new commands, of the rows reached."""
+    return _of_targets(c, c.uncertainty.std, "standard uncertainty in µm", interactive)
+
+
+def _of_targets(c: Compensation, metres: Array, axis: str, interactive: bool) -> Any:
+    rows = np.flatnonzero(c.reached)[:MOST_BARS]
+    table = c.targets.table
+    names = tuple(table.configuration_labels[table.configuration[i]] for i in rows)
+    nothing = np.full(len(rows), np.nan)
+    return _bars(Bars(names, metres[rows] * 1e6, nothing, nothing, axis), interactive)
+
+
+def poses(plan: Plan, interactive: bool) -> Any:
+    """The arm in every pose; interactive: in space, to be turned."""
+    cell, chain = plan.model.cell, plan.model.chain
+    if not interactive:
+        from matplotlib.style import context
+
+        with context(["default", STYLE]):
+            figure = draw_plan(
+                cell, chain, plan.q, names=plan.configurations, group=plan.group,
+                group_names=plan.group_names,
+            )  # fmt: skip
+        return _showing(figure)
+    import plotly.graph_objects as go
+
+    arms, markers = pose_lines(cell, chain, plan.q)
+    figure = go.Figure()
+    for k, name in enumerate(plan.configurations):
+        colour = COLOURS[int(plan.group[k]) % len(COLOURS)]
+        figure.add_trace(
+            go.Scatter3d(
+                x=arms[k, :, 0], y=arms[k, :, 1], z=arms[k, :, 2], mode="lines+markers",
+                line={"color": colour, "width": 4}, marker={"size": 2, "color": colour},
+                name=f"pose {name}",
+            )
+        )  # fmt: skip
+        figure.add_trace(
+            go.Scatter3d(
+                x=markers[k, :, 0], y=markers[k, :, 1], z=markers[k, :, 2], mode="markers",
+                marker={"size": 3, "color": colour, "symbol": "diamond"}, showlegend=False,
+                text=[_plain(marker) for marker in cell.tool.markers], hoverinfo="text",
+            )
+        )  # fmt: skip
+    tracker = cell.tracker.position
+    figure.add_trace(
+        go.Scatter3d(x=[tracker[0]], y=[tracker[1]], z=[tracker[2]], mode="markers",
+                     marker={"size": 5, "color": "#1a1a1a"}, name="tracker")
+    )  # fmt: skip
+    axes = {f"{a}axis": {"title": {"text": f"{a} in m"}} for a in "xyz"}
+    return figure.update_layout(scene={"aspectmode": "data", **axes}, height=640)
+
+
+def _bars(bars: Bars, interactive: bool, logarithmic: bool = False) -> Any:
+    n = len(bars.names)
+    below, above = (np.abs(bars.value - end) for end in (bars.low, bars.high))
+    if interactive:
+        import plotly.graph_objects as go
+
+        error = {"type": "data", "symmetric": False, "array": np.nan_to_num(above),
+                 "arrayminus": np.nan_to_num(below)}  # fmt: skip
+        figure = go.Figure(
+            go.Scatter(x=bars.value, y=[_plain(name) for name in bars.names], mode="markers",
+                       marker={"color": COLOURS[0], "size": 9}, error_x=error)
+        )  # fmt: skip
+        figure.update_xaxes(title_text=bars.axis, type="log" if logarithmic else "linear")
+        figure.update_yaxes(autorange="reversed")
+        return figure.update_layout(height=140 + 28 * n, template="plotly_white")
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        at = np.arange(n)
+        widths = np.nan_to_num(np.vstack([below, above]))
+        axes.errorbar(bars.value, at, xerr=widths, fmt="o", color=COLOURS[0], elinewidth=1.6)
+        axes.set_yticks(at, [_axis_label(printable(name)) for name in bars.names])
+        axes.set_ylim(n - 0.4, -0.6)
+        if logarithmic:
+            axes.set_xscale("log")
+        elif not (bars.value < 0).any():
+            axes.set_xlim(left=min(0.0, *np.nan_to_num(bars.low)) if n else 0.0)
+        axes.set_xlabel(bars.axis)
+        axes.grid(axis="x")
+
+    return _figure(draw, (8.0, 0.9 + 0.32 * max(n, 1)))
+
+
+def _figure(draw: Any, size: tuple[float, float]) -> Any:
+    """A matplotlib Figure that shows itself in a notebook and belongs to no global state."""
+    from matplotlib.figure import Figure
+    from matplotlib.style import context
+
+    with context(["default", STYLE]):
+        figure = Figure(figsize=size, layout="constrained")
+        draw(figure)
+    return _showing(figure)
+
+
+def _showing(figure: Any) -> Any:
+    """The figure, which a notebook can show although pyplot, whose hooks do so, is not loaded."""
+    figure._repr_png_ = partial(_png, figure)
+    return figure
+
+
+def _png(figure: Any) -> bytes:
+    picture = BytesIO()
+    figure.savefig(picture, format="png", dpi=100)
+    return picture.getvalue()
+
+
+def _axis_label(name: str, most: int = 44) -> str:
+    return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def _plain(name: str) -> str:
+    """A name for plotly, which reads some HTML in its texts."""
+    text = _axis_label(printable(name))
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
 MOST_ROWS = 60
-MOST_CANDIDATES = 8
+MOST_CANDIDATES_SHOWN = 8
 Drawn = Callable[[Any, bool], Any]
 
 
@@ -37,6 +290,7 @@ Drawn = Callable[[Any, bool], Any]
 class View:
     """How one kind of result shows itself; `figures` by kind, the first is the default."""
 
+    text: Callable[[Any], str]
     html: Callable[[Any], str]
     frame: Callable[[Any], pd.DataFrame]
     figures: Mapping[str, Drawn]
@@ -60,7 +314,7 @@ def view_of(result: object) -> View:
     raise TypeError(type(result).__name__)
 
 
-def _identification(result: IdentificationResult) -> str:
+def _identification_html(result: Calibration) -> str:
     known = [row for row in parameter_rows(result, None) if row.determined]
     rows = [(r.name, r.value, r.interval, r.unit, r.nominal) for r in known]
     rows += [(r.name, r.value, r.interval, r.unit, "") for r in combination_rows(result, None)]
@@ -69,21 +323,21 @@ def _identification(result: IdentificationResult) -> str:
     return _table("Identification", heads, rows) + _lines([(a, c) for a, _, c in lines])
 
 
-def _plan(plan: Plan) -> str:
+def _plan_html(plan: Plan) -> str:
     frame = _plan_frame(plan)
     rows = [tuple(_short(v) for v in row) for row in frame.itertuples(index=False)]
     return _table("Measurement plan", list(frame.columns), rows) + _lines(plan_lines(plan))
 
 
-def _diagnosis(d: Diagnosis) -> str:
+def _diagnosis_html(d: Diagnosis) -> str:
     return (
-        _lines(verdict_lines(d))
-        + _table("Gap budget (3-D rms error on held-out poses)", BUDGET, budget_rows(d))
-        + _table("Candidates", CANDIDATES, candidate_rows(d, MOST_CANDIDATES))
+        _lines(diagnosis_lines(d))
+        + _table("Gap budget (3-D rms error on held-out poses)", BUDGET_HEADS, gap_rows(d))
+        + _table("Candidates", CANDIDATE_HEADS, hypothesis_rows(d, MOST_CANDIDATES_SHOWN))
     )
 
 
-def _compensation(c: Compensation) -> str:
+def _compensation_html(c: Compensation) -> str:
     told = summary(c, c.chain.kinds, commands=False)
     rows = [
         (name, *("–" if v is None else length(v * 1e-6) for v in told[key].values()))
@@ -130,7 +384,7 @@ def _lines(lines: Sequence[tuple[str, str]]) -> str:
     return "".join(f"<p><b>{escape(label)}:</b> {escape(text)}</p>" for label, text in lines)
 
 
-def _estimates(result: IdentificationResult) -> pd.DataFrame:
+def _estimates(result: Calibration) -> pd.DataFrame:
     """One row per parameter, SI units: NaN where the data do not determine it alone."""
     import pandas as pd
 
@@ -204,16 +458,20 @@ def _commands(c: Compensation) -> pd.DataFrame:
 
 
 VIEWS: dict[type, View] = {
-    IdentificationResult: View(
-        _identification,
+    Calibration: View(
+        identification_text,
+        _identification_html,
         _estimates,
-        {"residuals": figures.residuals, "parameters": figures.parameters},
+        {"residuals": residuals, "parameters": parameters},
     ),
-    Plan: View(_plan, _plan_frame, {"poses": figures.poses, "intervals": figures.intervals}),
+    Plan: View(plan_text, _plan_html, _plan_frame, {"poses": poses, "intervals": intervals}),
     Compensation: View(
-        _compensation, _commands, {"errors": figures.errors, "uncertainty": figures.uncertainties}
+        compensation_text,
+        _compensation_html,
+        _commands,
+        {"errors": errors, "uncertainty": uncertainties},
     ),
     Diagnosis: View(
-        _diagnosis, _candidates, {"budget": figures.budget, "candidates": figures.candidates}
+        diagnosis_text, _diagnosis_html, _candidates, {"budget": budget, "candidates": candidates}
     ),
 }

@@ -34,9 +34,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from elastocal import __version__
 from elastocal.errors import InputError, require
 from elastocal.files import read_text
-from elastocal.text import did_you_mean
-from elastocal.text import listed
-from elastocal.text import quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 RESERVED = ("task", "task_hash", "task_row", "task_seconds", "elastocal", "task_error")
 TAKEN = f"{', '.join(RESERVED)} are columns of every study"

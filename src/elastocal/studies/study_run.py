@@ -27,9 +27,9 @@ from typing import Any, Self
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, require
 from elastocal.files import atomic_write_text
-from elastocal.text import quoted
 from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
 from elastocal.studies.study_results import SOONEST, Recorder, StudyResults, opened, read_results
+from elastocal.text import quoted
 
 GRACE = 30.0  # s that running tasks are waited for
 ANSWER = 10.0  # s in which a scheduler answers

@@ -34,7 +34,7 @@ FALSE_ALARM = 0.01  # chance that a clean table yields any finding at all
 
 
 @dataclass(frozen=True)
-class Finding:
+class FaultyGroup:
     """One thing that is wrong.
 
     `readings` (k,) indices of its observations and `lines` their lines; `beyond` how many of
@@ -67,7 +67,7 @@ class OutlierReport:
     the parameters where they have any.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[FaultyGroup, ...]
     x: Array
     sigma: float
     dof: int
@@ -172,7 +172,7 @@ def _finding(
     beyond: int,
     p: float,
     shift: Array | None,
-) -> Finding:
+) -> FaultyGroup:
     move = np.abs(fit.move(group.members))
     column = int(np.argmax(move))
     chosen = np.flatnonzero(group.members)
@@ -182,7 +182,7 @@ def _finding(
         pattern, error = "common", float(np.linalg.norm(shift))
     elif group.level == "reading":
         pattern = "single"
-    return Finding(
+    return FaultyGroup(
         group.level, group.name, pattern, tuple(chosen.tolist()), tuple(lines[chosen].tolist()),
         beyond, error, error / fit.sigma, p, float(move[column]), column,
     )  # fmt: skip

@@ -23,8 +23,6 @@ from elastocal.identification.variance.readings import Readings
 from elastocal.identification.variance.reml import LogPrior, Reml, reml, usual_start
 from elastocal.identification.variance.shared import shared_effects
 from elastocal.identification.variance.shrinkage import prior_of_groups
-from elastocal.identification.variance.structure import STRUCTURES, Structure
-from elastocal.text import did_you_mean
 from elastocal.identification.variance.structure import (
     REGISTERED,
     SHARED,

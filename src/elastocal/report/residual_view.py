@@ -1,19 +1,21 @@
-"""What the figures show: residuals by observation, standardised, and rms by configuration."""
+"""Residuals by observation, by configuration and by group, for tables and figures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.noise import weights_for
+from elastocal.identification.noise import WeightKind, weights_for
+from elastocal.identification.residual_groups import groupings
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.observation import COMPONENTS, Observations
+from elastocal.report.formatting import TextTable, printable, significant
 
 Array = NDArray[np.float64]
-
 MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice of them
 
 
@@ -42,7 +44,7 @@ class Residuals:
         return self.units.count("µm")
 
 
-def residuals_of(result: IdentificationResult) -> Residuals:
+def residuals_of(result: Calibration) -> Residuals:
     return residuals_by(result.observations, result.residual)
 
 
@@ -72,20 +74,20 @@ def residuals_by(seen: Observations, residual: Array) -> Residuals:
     )
 
 
-def summary_of(result: IdentificationResult) -> ResidualSummary | None:
+def summary_of(result: Calibration) -> ResidualSummary | None:
     """The result's own summary of its whitened residuals, else one of the standardised ones."""
-    own: ResidualSummary | None = getattr(result, "residual_summary", None)
-    if own is not None:
-        return own
+    if result.residual_summary is not None:
+        return result.residual_summary
     return summarise_residuals(result.observations, standardised(result), absolute=False)
 
 
-def standardised(result: IdentificationResult) -> Array:
+def standardised(result: Calibration) -> Array:
     """Weighted residuals (rows,) over their standard deviation; unweighted where the result does
     not hold the weights: those of a given matrix or of an estimated noise."""
-    seen, kind = result.observations, result.noise["kind"]
+    seen, kind = result.observations, result.noise.kind
     if result.method == "wls" and kind in ("rows", "axis", "polar"):
-        whitened = weights_for(seen, result.model.cell.tracker, kind).apply(result.residual)
+        weights = weights_for(seen, result.model.cell.tracker, cast(WeightKind, kind))
+        whitened = weights.apply(result.residual)
         return np.asarray(whitened) / result.sigma
     parts = result.residual.reshape(-1, seen.size)
     spread = np.sqrt((parts**2).mean(axis=0))
@@ -94,7 +96,7 @@ def standardised(result: IdentificationResult) -> Array:
     return (parts / np.where(spread > 0, spread, 1.0)).ravel()
 
 
-def rms_by_pose(result: IdentificationResult, residuals: Residuals) -> tuple[Array, Array]:
+def rms_by_pose(result: Calibration, residuals: Residuals) -> tuple[Array, Array]:
     """Fitted and held-out 3-D rms (configurations,) in µm; infinite where nothing is held out."""
     size = result.observations.size
     count = np.bincount(residuals.pose)
@@ -131,3 +133,51 @@ def running_mean(x: Array, y: Array, bins: int = 12) -> tuple[Array, Array, Arra
     mean = np.array([y[p].mean() for p in parts])
     error = np.array([y[p].std(ddof=1) / np.sqrt(len(p)) for p in parts])
     return middle, mean, error
+
+
+HEADS = ("readings of", "number", "mean", "rms", "largest", "unit")
+MOST_CONFIGURATIONS = 200
+Rows = list[tuple[str, ...]]
+
+
+def residual_table(seen: Observations, residuals: Residuals) -> TextTable:
+    """Mean, rms and largest residual of every direction, marker, load state and configuration.
+
+    Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
+    """
+    rows: Rows = []
+    groups: dict[int, str] = {0: "direction"}
+    for name, unit, value in zip(
+        residuals.components, residuals.units, residuals.value.T, strict=True
+    ):
+        largest = value[np.argmax(np.abs(value))]
+        rows.append((name, str(len(value)), _signed(value.mean()), _size(value), _signed(largest),
+                     unit))  # fmt: skip
+    part = residuals.value[:, : residuals.positions]
+    every = np.ones(len(seen.value), dtype=bool)
+    for labels in groupings(seen, every):
+        if labels.by == "component":
+            continue
+        code = labels.code[:: seen.size]
+        groups[len(rows)] = labels.by
+        rows += _group_rows(part, code, labels.names[:MOST_CONFIGURATIONS])
+    return TextTable(HEADS, rows, words=(0, 5), groups=groups)
+
+
+def _group_rows(part: NDArray[np.float64], code: NDArray[np.int64], names: tuple[str, ...]) -> Rows:
+    rows: Rows = []
+    for k, name in enumerate(names):
+        own = part[code == k]
+        sizes = np.linalg.norm(own, axis=1)
+        mean = float(np.linalg.norm(own.mean(axis=0)))
+        rows.append((printable(name), str(len(own)), significant(mean), _size(sizes),
+                     significant(float(sizes.max())), "µm"))  # fmt: skip
+    return rows
+
+
+def _size(values: NDArray[np.float64]) -> str:
+    return significant(float(np.sqrt((values**2).mean())))
+
+
+def _signed(value: float) -> str:
+    return f"{'−' if value < 0 else '+'}{significant(abs(float(value)))}"

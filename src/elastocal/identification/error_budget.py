@@ -3,52 +3,53 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.budget import stage_of
-from elastocal.diagnosis.heldout import resampled_rms
 from elastocal.errors import ElastocalError
 from elastocal.identification.heldout import held_out_residual
 from elastocal.identification.noise import weights_for
-from elastocal.identification.result import IdentificationResult
-from elastocal.report.verdict import nominal_arm
+from elastocal.identification.result import Calibration
+from elastocal.manipulator.effects import CATALOGUE
 
 Array = NDArray[np.float64]
 
-STAGES = ("", "geometry", "compliance")  # the first is the nominal arm
+STAGES = ("nominal_arm", "geometry", "compliance")
 MOST_NUMBERS = 30_000_000  # of a regressor held at once; larger tables get no budget
 STEPS, SETTLED = 4, 1e-3  # Gauss-Newton steps, and the relative gain that ends them
+DRAWS = 1000
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
 
 
 @dataclass(frozen=True)
-class ErrorStep:
-    """3-D rms error (m) on configurations left out of the fit, with its 95 % interval."""
+class BudgetStep:
+    """A step of a gap budget: 3-D rms error (m) on configurations left out of the fit."""
 
-    name: str
-    rms: float
+    step: str
+    heldout_rms: float
     ci95: tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Budget:
+class ErrorBudget:
     """The steps, and what noise alone gives (m, None where nothing says it), in words."""
 
-    steps: tuple[ErrorStep, ...]
+    steps: tuple[BudgetStep, ...]
     floor: float | None
     floor_name: str
 
 
-def gap_budget(result: IdentificationResult) -> Budget | None:
+def gap_budget(result: Calibration) -> ErrorBudget | None:
     """Held-out 3-D errors as the model gains base and markers, geometry, compliance.
 
     Each step fits the parameters of its stages that the whole fit determined, the later ones held
     at nominal, by a few Gauss-Newton steps from the whole fit; each configuration is predicted by
-    the fit to the others (`held_out_residual`), the last step as the result has it.  Intervals
-    are by resampling configurations.  None where some configuration
-    cannot be left out, and for tables too large to do it in passing.
+    the fit to the others (`held_out_residual`), the last step as the result has it.  The first
+    step is "nominal_arm", with base and markers placed by the other configurations.  Intervals are
+    by resampling configurations.  None where some configuration cannot be left out, and for tables
+    too large to do it in passing.
     """
     model = result.model
     if len(result.residual) * len(result.determined) > MOST_NUMBERS:
@@ -65,13 +66,13 @@ def gap_budget(result: IdentificationResult) -> Budget | None:
             continue
         residual = _fitted(result, np.flatnonzero(determined & (stage <= k)), stage > k)
         if residual is not None:
-            steps.append(_step(STAGES[k] or nominal_arm(result), result, residual, rng))
-    steps.append(_step(STAGES[last] or nominal_arm(result), result, result.held_out, rng))
-    return Budget(tuple(steps), *_floor(result))
+            steps.append(_step(STAGES[k], result, residual, rng))
+    steps.append(_step(STAGES[last], result, result.held_out, rng))
+    return ErrorBudget(tuple(steps), *_floor(result))
 
 
 def _fitted(
-    result: IdentificationResult, columns: NDArray[np.int64], held: NDArray[np.bool_]
+    result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
 ) -> Array | None:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
     model, seen = result.model, result.observations
@@ -100,17 +101,15 @@ def _fitted(
     return found if np.isfinite(found).all() else None
 
 
-def _step(
-    name: str, result: IdentificationResult, residual: Array, rng: np.random.Generator
-) -> ErrorStep:
+def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
     seen = result.observations
     squared = (residual.reshape(-1, seen.size)[:, :3] ** 2).sum(axis=1)
     _, code = np.unique(seen.configuration, return_inverse=True)
     rms, ci95 = resampled_rms(np.bincount(code, squared), np.bincount(code), rng)
-    return ErrorStep(name, rms, ci95)
+    return BudgetStep(name, rms, ci95)
 
 
-def _floor(result: IdentificationResult) -> tuple[float | None, str]:
+def _floor(result: Calibration) -> tuple[float | None, str]:
     """What repeats scatter, else what the stated noise gives."""
     seen = result.observations
     force = np.round(seen.table.force[seen.lead], 3)
@@ -123,8 +122,28 @@ def _floor(result: IdentificationResult) -> tuple[float | None, str]:
         count = np.bincount(code)
         mean = np.column_stack([np.bincount(code, p) / count for p in parts.T])
         return float(np.sqrt(((parts - mean[code]) ** 2).sum() / dof)), "repeats alone"
-    ratio = result.noise.get("ratio_to_stated")
+    ratio = result.noise.ratio_to_stated
     if ratio:
         scatter = result.residual_rms * float(np.sqrt(len(result.residual) / result.dof))
         return scatter / float(ratio), "stated noise"
     return None, ""
+
+
+def resampled_rms(
+    squares: NDArray[Any], count: NDArray[Any], rng: np.random.Generator
+) -> tuple[float, tuple[float, float]]:
+    """The rms √(Σ squares / Σ count) of configurations (C,) and its 95 % interval, by weights that
+    a Dirichlet distribution draws for them (the Bayesian bootstrap)."""
+    rms = float(np.sqrt(squares.sum() / count.sum()))
+    weight = rng.dirichlet(np.ones(len(squares)), DRAWS)
+    drawn = np.sqrt((weight @ squares) / (weight @ count))
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return rms, (float(low), float(high))
+
+
+def stage_of(effect: str) -> int:
+    """0 for what places base and markers, 1 for geometry, 2 for what yields under load."""
+    known = CATALOGUE[effect]
+    if known.registered:
+        return 0
+    return 2 if known.stage in ("compliance", "load") else 1

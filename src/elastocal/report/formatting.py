@@ -1,8 +1,11 @@
-"""Numbers for people: the units they think in, and no more digits than are known."""
+"""Numbers, names and tables as text: the units people think in, the digits that are known."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
 
 # SI unit → (factor, unit shown).
 SHOWN = {
@@ -96,9 +99,9 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def length(metres: float) -> str:
-    """A position error: µm below 1 mm, mm below 1 m, "none" where there is no number."""
+    """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
     if not math.isfinite(metres):
-        return "none"
+        return "not available"
     if abs(metres) < 0.9995e-3:
         return f"{significant(metres * 1e6)} µm"
     if abs(metres) < 0.9995:
@@ -115,3 +118,55 @@ def _end(value: float, half: float) -> str:
 def _round(value: float, decimals: int) -> float:
     """Rounded, and never -0."""
     return round(value, decimals) + 0.0
+
+
+def printable(text: str) -> str:
+    """Names from files may hold control characters, which a terminal would obey."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def short_name(name: str, most: int = 12) -> str:
+    """A printable name that fits a figure's axis."""
+    text = printable(name)
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def counted(n: int, one: str, many: str | None = None) -> str:
+    """ "1 pose", "2 poses"."""
+    return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+def signed_change(change: float) -> str:
+    return f"{'−' if change < 0 else '+'}{length(abs(change))}"
+
+
+def minus(text: str) -> str:
+    """Proper minus signs in front of numbers, ends and between terms, not in names."""
+    if text.startswith("-"):
+        text = "−" + text[1:]
+    return text.replace(" - ", " − ").replace("[-", "[−").replace(", -", ", −")
+
+
+Tone = Literal["good", "care", "poor"]
+
+
+def together(parts: Sequence[str], last: str = "and") -> str:
+    """ "a, b and c"."""
+    return f" {last} ".join([p for p in (", ".join(parts[:-1]), *parts[-1:]) if p])
+
+
+def capital(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of texts.  `words` are the columns that hold words; the others hold numbers.
+
+    `groups` names the rows that follow, by the index of the first: {0: "base frame", 6: …}.
+    """
+
+    heads: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    words: tuple[int, ...] = (0,)
+    groups: dict[int, str] = field(default_factory=dict)

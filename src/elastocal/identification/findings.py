@@ -1,0 +1,456 @@
+"""What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.
+
+Terminal, page, notebook and JSON print these findings and judge nothing of their own.  A threshold
+stands here or nowhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy import linalg, stats
+
+from elastocal.errors import option
+from elastocal.identification.outliers import blocks
+from elastocal.identification.residual_summary import ResidualSummary
+from elastocal.identification.result import (
+    Calibration,
+    Estimate,
+    Finding,
+    Number,
+    Outlier,
+    Severity,
+)
+from elastocal.identification.solve import Solution
+
+STATED = (0.025, 0.975)  # quantiles of χ² between which the residual agrees with the stated noise
+LACK_OF_FIT = 0.01  # p-value below which configurations scatter more than their repeats
+FLATTERS = 1.2  # held-out over fitted error, above which the fit flatters itself
+LITTLE = 1.25  # times better than the nominal arm, below which little was gained
+# Test data lie where the calibration was not made, or the arm has changed, where their errors are
+# this much larger than held-out poses' and chance allows for it in one table of a hundred.
+WORSE, CHANCE = 1.25, 0.01
+MANY = 0.05  # share of the readings fitted, above which those beyond the noise are no accidents
+NOT_NORMAL = 0.01  # p-value below which standardised residuals are not normal
+FEW_DOF_PER_PARAMETER = 1.0
+ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
+
+# How a parameter stands, in the order in which they are told.
+ALONE, COMBINED, ABSORBED, INVISIBLE, FIXED = "alone", "combined", "absorbed", "invisible", "fixed"
+
+LACKING = (
+    "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
+    "nothing, the excess is the robot's repeatability, or noise larger than stated."
+)
+STATE_NOISE = (
+    "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only beside "
+    "it does the residual say whether the model lacks something. elastocal diagnose looks for "
+    "that either way."
+)
+COMPARE = (
+    "Compare the test poses with those fitted: where they lie elsewhere (joints, load), fit some "
+    "like them; where they do not, the arm or the tracker has changed in between."
+)
+USE = (
+    "Use it (elastocal compensate, elastocal export) where poses and loads are like those measured."
+)
+# These come from the solver and stay when a result is judged anew.
+OF_SOLUTION = ("ill_conditioned", "at_bound", "beyond_bound")
+
+
+def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) -> Calibration:
+    """The same result with its findings, the overall one ("trust") first.
+
+    `of_solution` are those that only the solver can tell; by default the result's own are kept.
+    """
+    if of_solution is None:
+        of_solution = tuple(f for f in result.findings if f.kind in OF_SOLUTION)
+    found = [
+        *_spoilt(result),
+        *_few_poses(result),
+        *(f for f in of_solution if f.kind == "ill_conditioned"),
+        *_against_stated_noise(result),
+        *_repeats(result),
+        *_prediction(result),
+        *(f for f in of_solution if f.kind != "ill_conditioned"),
+        *_faulty(result),
+        *_undetermined(result),
+        *_shape(result),
+        *_test(result),
+    ]
+    return replace(result, findings=(_trust(found), *found))
+
+
+def _trust(found: list[Finding]) -> Finding:
+    """Can the calibration be used?  As the worst finding says."""
+    worst: Severity = "good"
+    for severity in ("care", "poor"):
+        if any(f.severity == severity for f in found):
+            worst = severity
+    doubts = tuple(f.kind for f in found if f.severity == worst) if worst != "good" else ()
+    return Finding("trust", worst, {"because": doubts}, USE if worst == "good" else "")
+
+
+def _um(metres: float) -> float:
+    return float(metres) * 1e6
+
+
+def _spoilt(result: Calibration) -> Iterator[Finding]:
+    """What makes the result worthless."""
+    if not result.converged:
+        yield Finding(
+            "not_converged", "poor", {"reason": result.reason},
+            "Give start hints in [model.nominal], fit fewer effects, or measure more poses.",
+        )  # fmt: skip
+    held, nominal = result.heldout_rms, result.nominal_rms
+    if math.isfinite(held) and math.isfinite(nominal) and held >= nominal:
+        numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
+        yield Finding("no_better_than_nominal", "poor", numbers)
+
+
+def _few_poses(result: Calibration) -> Iterator[Finding]:
+    n = len(result.determined)
+    if result.dof < FEW_DOF_PER_PARAMETER * n:
+        yield Finding(
+            "few_degrees_of_freedom", "note", {"dof": result.dof, "parameters": n},
+            "Measure more poses.",
+        )  # fmt: skip
+    if not math.isfinite(result.heldout_rms):
+        # Test data tell what held-out poses cannot.
+        severity: Severity = "care" if result.test is None else "note"
+        yield Finding("not_held_out", severity, {}, _more_poses())
+
+
+def _more_poses() -> str:
+    return (
+        f"Measure more poses: elastocal design with {option('augment')} plans what these data lack."
+    )
+
+
+def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
+    """The residual's mean square against the stated noise, by its χ² distribution."""
+    ratio = result.noise.ratio_to_stated
+    if ratio is None:
+        remedy = "" if _lacks_fit(result) else STATE_NOISE
+        yield Finding("noise_not_compared", "note", {}, remedy)
+        return
+    low, high = np.sqrt(stats.chi2.ppf(STATED, result.dof) / result.dof)
+    numbers: dict[str, Number] = {
+        "ratio": float(ratio), "by_chance_from": float(low), "by_chance_to": float(high),
+        "dof": result.dof,
+    }  # fmt: skip
+    if ratio > high:
+        yield Finding("residual_above_stated_noise", "care", numbers, LACKING)
+    elif ratio < low:
+        yield Finding("residual_below_stated_noise", "note", numbers)
+    else:
+        yield Finding("residual_agrees_with_stated_noise", "good", numbers)
+
+
+def _lacks_fit(result: Calibration) -> bool:
+    found = result.noise.lack_of_fit
+    return found is not None and found.p < LACK_OF_FIT
+
+
+def _repeats(result: Calibration) -> Iterator[Finding]:
+    """Do configurations scatter more than their repeats, and does anything count with it?"""
+    noise, test = result.noise, result.noise.lack_of_fit
+    if test is not None:
+        counted = "the intervals" if noise.intervals_by_configuration else "nothing"
+        numbers: dict[str, Number] = {
+            "F": test.F, "dof_between": test.dof_between, "dof_pure": test.dof_pure, "p": test.p,
+            "counted_by": "the noise model" if noise.shared else counted,
+        }  # fmt: skip
+        if _lacks_fit(result):
+            yield Finding("lack_of_fit", "care", numbers, LACKING)
+        else:
+            yield Finding("repeats_agree", "good", numbers)
+    shared = [s for s in noise.sizes or () if s.shared and s.sigma is not None]
+    if shared:
+        yield Finding(
+            "common_deviation", "note",
+            {
+                "of": tuple(s.name for s in shared),
+                "sigma_um": tuple(_um(s.sigma) for s in shared if s.sigma is not None),
+            },
+        )  # fmt: skip
+
+
+def _prediction(result: Calibration) -> Iterator[Finding]:
+    held, fitted, nominal = result.heldout_rms, result.residual_rms, result.nominal_rms
+    if math.isfinite(held) and held > FLATTERS * fitted:
+        numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "residual_rms_um": _um(fitted)}
+        yield Finding("fit_flatters", "care", numbers, _more_poses())
+    if held < nominal < LITTLE * held < math.inf:
+        numbers = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
+        yield Finding("little_gain", "care", numbers)
+
+
+def _faulty(result: Calibration) -> Iterator[Finding]:
+    n, fitted = len(result.faulty), len(result.observations.lead)
+    if n:
+        verb = "1 reading that lies" if n == 1 else f"{n} readings that lie"
+        yield Finding(
+            "faulty_readings", "note",
+            {"fitted": len(result.outliers), "left_out": len(result.excluded)},
+            f"Look at the {verb} beyond the noise.",
+        )  # fmt: skip
+    if len(result.outliers) > MANY * fitted:
+        yield Finding(
+            "many_faulty_readings", "care", {"faulty": len(result.outliers), "fitted": fitted},
+            "Look at where they lie before leaving any out.",
+        )  # fmt: skip
+
+
+def _undetermined(result: Calibration) -> Iterator[Finding]:
+    found = list(standings(result).values())
+    if n := found.count(INVISIBLE) + found.count(ABSORBED):
+        yield Finding(
+            "undetermined", "note", {"parameters": n},
+            f"{n} parameter{'' if n == 1 else 's'} cannot be had from these data. Poses and loads "
+            "like those measured are predicted all the same; for others, measure what shows them.",
+        )  # fmt: skip
+
+
+def standings(result: Calibration) -> dict[str, str]:
+    """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, INVISIBLE or FIXED."""
+    first = {next(iter(c.terms)) for c in result.combinations}
+
+    def standing(e: Estimate) -> str:
+        if e.identifiable:
+            return ALONE
+        if e.name in first:
+            return COMBINED
+        if e.combined_with:
+            return ABSORBED
+        return FIXED if e.note.startswith("fixed") else INVISIBLE
+
+    return {e.name: standing(e) for e in result.estimates}
+
+
+def _shape(result: Calibration) -> Iterator[Finding]:
+    if result.residual_summary is not None:
+        yield shape_of(result.residual_summary)
+        n = sum(g.n_deviating for g in result.residual_summary.groupings)
+        if n:
+            yield Finding("scatter_unlike_noise_model", "note", {"groups": n})
+
+
+def shape_of(summary: ResidualSummary) -> Finding:
+    """Are the standardised residuals normal?"""
+    whole = summary.whole
+    numbers: dict[str, Number] = {
+        "skewness": whole.skewness, "excess_kurtosis": whole.excess_kurtosis,
+        "p": whole.normality_p,
+    }  # fmt: skip
+    if whole.normality_p is None:
+        return Finding("residuals_too_few", "note", numbers)
+    if whole.normality_p >= NOT_NORMAL:
+        return Finding("residuals_normal", "good", numbers)
+    # Of a normal sample, kurtosis has twice the standard deviation of skewness.
+    if abs(whole.skewness) > abs(whole.excess_kurtosis) / 2:
+        return Finding("residuals_skew", "note", numbers)
+    kind = "residuals_heavy_tailed" if whole.excess_kurtosis > 0 else "residuals_light_tailed"
+    return Finding(kind, "note", numbers)
+
+
+def _test(result: Calibration) -> Iterator[Finding]:
+    """Test data against held-out poses, by an F-test of the two mean squares; the components of a
+    reading count as one."""
+    test, held = result.test, result.heldout_rms
+    if test is None:
+        yield Finding(
+            "untested", "note", {},
+            "Prove it: measure some poses that take no part in the fit, and give them with "
+            f"{option('test')}.",
+        )  # fmt: skip
+    elif math.isfinite(held):
+        allowed = math.sqrt(stats.f.ppf(1 - CHANCE, test.n, result.dof))
+        if test.rms > max(WORSE, allowed) * held:
+            numbers: dict[str, Number] = {"test_rms_um": _um(test.rms), "heldout_rms_um": _um(held)}
+            yield Finding("test_data_worse", "care", numbers, COMPARE)
+
+
+# What only the solver can tell.
+
+
+def of_solution(result: Calibration, solution: Solution) -> tuple[Finding, ...]:
+    """Conditioning of the fit, and parameters at or beyond their physical bounds."""
+    return (*_conditioning(result, solution), *_bounds(result, solution))
+
+
+def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
+    kept = solution.reduction.kept
+    # Unit columns: what is judged is how far they are from parallel, not their units.
+    scaled = solution.fit.triangle.R
+    scaled = scaled / np.linalg.norm(scaled, axis=0)
+    _, singular, Vt = linalg.svd(scaled[: len(kept)])
+    if singular[0] <= ILL_CONDITIONED * singular[-1]:
+        return
+    worst = np.argsort(-np.abs(Vt[-1]))[:3]
+    yield Finding(
+        "ill_conditioned", "note",
+        {
+            "condition_number": float(singular[0] / singular[-1]),
+            "parameters": tuple(result.determined[i] for i in worst),
+        },
+        "Measure poses in which these joints differ more, or fix one of them.",
+    )  # fmt: skip
+
+
+def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
+    at_bound = {result.model.names[c] for c in solution.reduction.at_bound}
+    for e, p in zip(result.estimates, result.model.parameters, strict=True):
+        if p.lower < e.held < p.upper or not (np.isfinite(p.lower) or np.isfinite(p.upper)):
+            continue
+        bound = p.lower if e.held <= p.lower else p.upper
+        numbers: dict[str, Number] = {"parameter": e.name, "unit": e.unit, "bound": bound}
+        if p.name in at_bound:
+            yield Finding(
+                "at_bound", "note", numbers,
+                "Check load direction and torque signs, or measure poses that load it more.",
+            )  # fmt: skip
+        elif e.value is not None and e.std is not None and abs(e.value - bound) > 2 * e.std:
+            yield Finding(
+                "beyond_bound", "note", numbers | {"value": e.value, "std": e.std},
+                "Check load direction and torque signs, measure poses that load it more, or fit "
+                "with bounds.",
+            )  # fmt: skip
+
+
+# Sentences.
+
+
+def warning_sentences(result: Calibration) -> tuple[str, ...]:
+    """The findings that call for attention as sentences that name the remedy."""
+    found = [text for f in result.findings if f.kind in _TOLD for text in _TOLD[f.kind](result, f)]
+    return tuple(found)
+
+
+def _not_converged(_: Calibration, f: Finding) -> list[str]:
+    return [f"The fit did not converge: {f.numbers['reason']}. {f.remedy}"]
+
+
+def _few_degrees(_: Calibration, f: Finding) -> list[str]:
+    return [
+        f"Only {f.numbers['dof']} degrees of freedom for {f.numbers['parameters']} determined "
+        f"parameters: intervals are wide and the residual flatters the model. {f.remedy}"
+    ]
+
+
+def _not_held_out(_: Calibration, f: Finding) -> list[str]:
+    return [
+        "Some configuration alone determines a parameter, so there is no held-out error for "
+        "it. Measure more configurations."
+    ]
+
+
+def _ill_conditioned(_: Calibration, f: Finding) -> list[str]:
+    names = f.numbers["parameters"]
+    assert isinstance(names, tuple)
+    return [
+        f"Ill-conditioned (condition number {f.number('condition_number'):.1e} after scaling): "
+        f"the data barely separate {', '.join(map(str, names))}. {f.remedy}"
+    ]
+
+
+def _above_stated(_: Calibration, f: Finding) -> list[str]:
+    return [
+        f"The residual is {f.number('ratio'):.1f} times the stated noise: something is unmodelled "
+        "or the stated noise is too small. The intervals use the residual, not the stated noise; "
+        "look for effects that the model lacks."
+    ]
+
+
+def _not_fitting(_: Calibration, f: Finding) -> list[str]:
+    if f.numbers["counted_by"] != "nothing":
+        return []
+    return [
+        f"Configurations scatter more than their repeats (lack of fit: F = {f.number('F'):.2f} on "
+        f"{f.numbers['dof_between']} and {f.numbers['dof_pure']} degrees of freedom, p = "
+        f"{f.number('p'):.1g}): the arm does not come back to the same place, or an effect is "
+        "missing. The intervals take all readings for independent and are too narrow: use the "
+        "default method, whose noise model has this scatter, or intervals by cr2; measure more "
+        "configurations rather than more repeats."
+    ]
+
+
+def _at_bound(_: Calibration, f: Finding) -> list[str]:
+    return [
+        f"{f.numbers['parameter']} stands at its bound {f.number('bound'):g} {f.numbers['unit']}; "
+        f"it is held there and has no interval. {f.remedy}"
+    ]
+
+
+def _beyond_bound(_: Calibration, f: Finding) -> list[str]:
+    return [
+        f"{f.numbers['parameter']} = {f.number('value'):.3g} ± {f.number('std'):.2g} "
+        f"{f.numbers['unit']} lies beyond its physical bound {f.number('bound'):g}: "
+        f"{f.remedy[:1].lower()}{f.remedy[1:]}"
+    ]
+
+
+def _faulty_readings(result: Calibration, _: Finding) -> list[str]:
+    found = []
+    if result.outliers:
+        found.append(
+            f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains "
+            f"({_lines(result.outliers)}) and had a part in the fit. Check them; "
+            f"{option('outliers', 'drop')} leaves them out."
+        )
+    if result.excluded:
+        found.append(
+            f"{_count(result.excluded, 'was', 'were')} left out as faulty "
+            f"({_lines(result.excluded)}): the noise does not explain them. All are listed in the "
+            f"result under 'excluded'; {option('outliers', 'keep')} fits them too."
+        )
+    return found
+
+
+def _many_faulty(_: Calibration, f: Finding) -> list[str]:
+    return [
+        "That is too large a share for reading errors: a shifted block of readings, or an effect "
+        f"that the model lacks in some load state, marker or region. {f.remedy}"
+    ]
+
+
+def _lines(readings: tuple[Outlier, ...]) -> str:
+    """ "lines 142–507, 610 …": runs of lines, the first eight."""
+    runs = blocks([o.line for o in readings])
+    shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in runs[:8])
+    return f"lines {shown}{' …' if len(runs) > 8 else ''}"
+
+
+def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
+    n = len(readings)
+    return f"1 reading {one}" if n == 1 else f"{n} readings {many}"
+
+
+_TOLD: dict[str, Callable[[Calibration, Finding], list[str]]] = {
+    "not_converged": _not_converged,
+    "few_degrees_of_freedom": _few_degrees,
+    "not_held_out": _not_held_out,
+    "ill_conditioned": _ill_conditioned,
+    "residual_above_stated_noise": _above_stated,
+    "lack_of_fit": _not_fitting,
+    "at_bound": _at_bound,
+    "beyond_bound": _beyond_bound,
+    "faulty_readings": _faulty_readings,
+    "many_faulty_readings": _many_faulty,
+}
+# Of these the warning says what to do.
+SAID_IN_WARNING = (
+    "not_converged", "few_degrees_of_freedom", "ill_conditioned", "at_bound", "beyond_bound",
+    "many_faulty_readings",
+)  # fmt: skip
+
+
+def next_steps(result: Calibration) -> list[Finding]:
+    """Findings whose remedy is still to be told, each remedy once."""
+    steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in SAID_IN_WARNING}
+    order = [f for f in result.findings if f.remedy and steps.get(f.remedy) is f]
+    trust = [f for f in order if f.kind == "trust"]
+    return [f for f in order if f.kind != "trust"] + trust

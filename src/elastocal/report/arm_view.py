@@ -1,0 +1,555 @@
+"""The arm in its poses with what is to be shown on it, in 3-D and as a still picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.cell import Cell
+from elastocal.cell.workspace_rules import Solid
+from elastocal.design.feasibility.bodies import Body, cell_bodies, skeleton
+from elastocal.design.feasibility.carriers import WORLD
+from elastocal.design.feasibility.frames import Kinematics
+from elastocal.design.feasibility.shapes import hull, mesh_hull
+from elastocal.design.feasibility.urdf_bodies import urdf_bodies
+from elastocal.design.plan import Plan
+from elastocal.errors import ElastocalError
+from elastocal.manipulator.chain import Chain
+from elastocal.manipulator.model import Model
+from elastocal.manipulator.observation import Observations
+from elastocal.report.figures import ARM, FAINT, INK, SERIES, drawn
+from elastocal.report.formatting import length, printable, short_name
+from elastocal.report.plan_view import first_stops, joint_text
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+MOST_TRIANGLES = 8000  # of all bodies together; more make the page slow and large
+MERIDIANS, PARALLELS = 14, 3  # of a cap
+# Radii of the first and the last link over the arm's length, where none are stated.
+STOUT, SLIM = 0.038, 0.014
+
+
+@dataclass(frozen=True)
+class Shell:
+    """A convex body as triangles: `points` (k, 3) m in its carrier's frame, `faces` (f, 3).
+
+    `carrier`: i ≥ 0 the frame of joint i after its motion, WORLD the base frame for the arm and
+    the data's frame for what stands in the cell.
+    """
+
+    points: Array
+    faces: IntArray
+    carrier: int
+
+
+@dataclass(frozen=True)
+class Shells:
+    """What is drawn of a cell: the arm with what it carries, what stands around it, and how."""
+
+    arm: tuple[Shell, ...]
+    around: tuple[Shell, ...]
+    drawn_from: str
+
+
+def shells_of(cell: Cell, chain: Chain) -> Shells:
+    """The bodies of a cell; a geometry that cannot be had is replaced by capsules, and said so."""
+    arm, drawn_from = _arm(cell, chain)
+    try:
+        bodies: Sequence[Body] = cell_bodies(cell, chain)
+    except ElastocalError:
+        bodies = ()  # a mesh that is not there stops no report
+    carried = [b for b in bodies if b.kind == "carried" and b.carrier >= 0]
+    around = [b for b in bodies if b.kind == "obstacle"]
+    return Shells(
+        (*arm, *_shells([(b.solid, b.carrier) for b in carried])),
+        _shells([(b.solid, b.carrier) for b in around]),
+        drawn_from,
+    )
+
+
+def _arm(cell: Cell, chain: Chain) -> tuple[tuple[Shell, ...], str]:
+    radii = cell.workspace.link_radius
+    if cell.robot.urdf is not None and not radii:
+        try:
+            shells = _shells(urdf_bodies(cell, chain))
+        except ElastocalError:
+            shells = ()  # no collision geometry, or its files are not there: meshes are optional
+        if shells and sum(len(s.faces) for s in shells) <= MOST_TRIANGLES:
+            return shells, "the convex hulls of the URDF's collision geometry"
+    if not radii:
+        length = chain_length(chain)
+        radii = tuple(float(r) for r in length * np.linspace(STOUT, SLIM, chain.n_joints))
+    capsules = skeleton(chain, radii, np.eye(4), f"{cell.path or cell.name}: [workspace]")
+    text = "capsules between its joints"
+    return _shells([(body.solid, body.carrier) for body in capsules]), text
+
+
+def chain_length(chain: Chain) -> float:
+    """Sum in m of the distances from joint to joint and to the flange; 1 m where all coincide."""
+    steps = [*(joint.placement for joint in chain.joints), chain.flange_placement]
+    return float(sum(np.linalg.norm(T[:3, 3]) for T in steps)) or 1.0
+
+
+def _shells(solids: Sequence[tuple[Solid, int]]) -> tuple[Shell, ...]:
+    found = []
+    for solid, carrier in solids:
+        try:
+            found.append(Shell(*triangles_of(solid), carrier))
+        except ElastocalError:
+            continue  # an unreadable mesh: the others are still worth drawing
+    return tuple(found)
+
+
+def triangles_of(solid: Solid) -> tuple[Array, IntArray]:
+    """Points (k, 3) in m in the carrier's frame and triangles (f, 3), turned outwards.
+
+    Round shapes become inscribed polyhedra.  Raises InputError for a mesh that cannot be read.
+    """
+    if solid.shape == "mesh":
+        points, faces = mesh_hull(solid)
+        return points @ solid.placement[:3, :3].T + solid.placement[:3, 3], faces
+    if solid.shape == "cylinder":
+        ring = _ring() * float(solid.size[0])
+        half = np.array([0.0, 0.0, float(solid.size[1]) / 2])
+        cloud = np.vstack([ring - half, ring + half])
+        cloud = cloud @ solid.placement[:3, :3].T + solid.placement[:3, 3]
+    else:
+        centres, radius = hull(solid)
+        ball = _ball() @ solid.placement[:3, :3].T
+        cloud = (centres[:, None] + radius * ball).reshape(-1, 3) if radius else centres
+    return _outward(cloud)
+
+
+def _outward(cloud: Array) -> tuple[Array, IntArray]:
+    from scipy.spatial import ConvexHull
+
+    found = ConvexHull(cloud)
+    used, index = np.unique(found.simplices, return_inverse=True)
+    points, faces = cloud[used], index.reshape(found.simplices.shape)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), found.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return points, faces.astype(np.int64)
+
+
+def _ring() -> Array:
+    angle = np.linspace(0, 2 * np.pi, MERIDIANS, endpoint=False)
+    return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(MERIDIANS)])
+
+
+def _ball() -> Array:
+    """Points of the unit sphere: poles, and rings of which one is the equator."""
+    height = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 2 * PARALLELS + 1))[1:-1]
+    rings = [_ring() * np.sqrt(1 - h * h) + [0.0, 0.0, h] for h in height]
+    return np.vstack([*rings, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+
+
+def base_or_joint(shell: Shell) -> int:
+    """Index of the shell's carrier among the frames (base, joint 1, …, joint n)."""
+    return 0 if shell.carrier == WORLD else shell.carrier + 1
+
+
+ARROW = 0.12  # length of a long arrow over the reach of what is drawn
+LONG = 95.0  # percentile of the residuals that is drawn so long
+AROUND = 0.35  # of the arm's reach: how far obstacles are shown beyond it
+FAR = 1.2  # a tracker further off than this many extents would shrink the arm to a dot
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The arm in one pose.  `frames` (n + 1, 4, 4): base and joints after their motion; `markers`
+    (m, 3) m with their `names`; `arrows` (m, 3) m, what is shown at each marker, or None."""
+
+    name: str
+    about: str
+    frames: Array
+    flange: Array
+    markers: Array
+    names: tuple[str, ...]
+    arrows: Array | None = None
+
+    @property
+    def line(self) -> Array:
+        """Base, joints and flange (n + 2, 3)."""
+        return np.vstack([self.frames[:, :3, 3], self.flange[None, :3, 3]])
+
+
+@dataclass(frozen=True)
+class Space:
+    """All poses, bodies, and the instrument where it stands near; `first` is shown first."""
+
+    poses: tuple[Posed, ...]
+    shells: Shells
+    tracker: Array | None
+    first: int
+    what: str
+
+    @property
+    def has_arrows(self) -> bool:
+        return any(p.arrows is not None for p in self.poses)
+
+    @property
+    def bodies(self) -> list[Array]:
+        """Points (k, 3) m of the arm's bodies in the first pose."""
+        frames = self.poses[self.first].frames
+        placed = [(s.points, frames[base_or_joint(s)]) for s in self.shells.arm]
+        return [points @ T[:3, :3].T + T[:3, 3] for points, T in placed]
+
+    @property
+    def extent(self) -> Array:
+        """Corners (2, 3) of the box around everything that is drawn, with room for arrows."""
+        every = np.vstack([points for p in self.poses for points in (p.line, p.markers)])
+        every = np.vstack([every, *self.bodies])
+        low, high = every.min(axis=0), every.max(axis=0)
+        room = AROUND * float((high - low).max())
+        # A hall's floor would shrink the arm to a dot.
+        near = [np.clip(s.points, low - room, high + room) for s in self.shells.around]
+        near += [] if self.tracker is None else [self.tracker[None]]
+        every = np.vstack([every, *near])
+        low, high = every.min(axis=0), every.max(axis=0)
+        room = 0.07 * float((high - low).max()) + 1e-3
+        return np.stack([low - room, high + room])
+
+    @property
+    def scale(self) -> float:
+        """How many times as long as they are arrows are drawn: 1, 2 or 5 times a power of ten."""
+        arrows = [p.arrows for p in self.poses if p.arrows is not None]
+        size = np.linalg.norm(np.vstack(arrows), axis=1) if arrows else np.zeros(0)
+        long = float(np.percentile(size, LONG)) if len(size) else 0.0
+        if not long > 0:
+            return 1.0
+        wanted = ARROW * float(np.ptp(self.extent, axis=0).max()) / long
+        power = 10.0 ** np.floor(np.log10(wanted))
+        return float(max(f * power for f in (1, 2, 5) if f * power <= wanted))
+
+
+def frames_at(
+    cell: Cell, chain: Chain, q: Array, flange: Array | None = None
+) -> tuple[Array, Array]:
+    """Frames (N, n + 1, 4, 4) of base and joints, and flanges (N, 4, 4), at joints q (N, n).
+
+    The nominal chain, moved as a whole to end at `flange` (N, 4, 4) where that is known: on a
+    page, the millimetres between the two cannot be seen.
+    """
+    kinematics = Kinematics(cell, chain)
+    poses = kinematics.poses(q, np.zeros(3))
+    base = np.broadcast_to(kinematics.T_data_base, (len(q), 1, 4, 4))
+    frames = np.concatenate([base, poses.frames[:, : chain.n_joints]], axis=1)
+    if flange is None:
+        return frames, poses.flange
+    T = np.where(np.isfinite(flange).all(axis=(1, 2), keepdims=True), flange, poses.flange)
+    return (T @ np.linalg.inv(poses.flange))[:, None] @ frames, T
+
+
+def space_of(
+    cell: Cell, chain: Chain, poses: Sequence[Posed], first: int = 0, what: str = "pose"
+) -> Space:
+    """The poses with the bodies of the cell, and the tracker where it is known to stand near."""
+    space = Space(tuple(poses), shells_of(cell, chain), None, first, what)
+    low, high = space.extent
+    at = cell.tracker.position
+    if not at.any():
+        return space  # the origin of its own data: most likely nobody said where it stands
+    away = np.maximum(np.maximum(low - at, at - high), 0.0)
+    near = float(np.linalg.norm(away)) < FAR * float((high - low).max())
+    return Space(space.poses, space.shells, at if near else None, first, what)
+
+
+def space_json(space: Space) -> Markup:
+    """The space for the page's script: lengths in m, arrows in µm; safe within a script element."""
+    low, high = space.extent
+    content = {
+        "what": space.what,
+        "first": space.first,
+        "scale": space.scale,
+        "arrows": space.has_arrows,
+        "range": np.stack([low, high], axis=1).round(3).tolist(),
+        "tracker": None if space.tracker is None else space.tracker.round(3).tolist(),
+        "bodies": [_shell(s, base_or_joint(s)) for s in space.shells.arm],
+        "things": [_shell(s, 0) for s in space.shells.around],
+        "poses": [_posed(p) for p in space.poses],
+    }
+    return in_script(content)
+
+
+def in_script(content: object) -> Markup:
+    """JSON in which nothing can end the element that holds it, whatever names hold."""
+    from markupsafe import Markup
+
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return Markup(text)
+
+
+def _shell(shell: Shell, carrier: int) -> dict[str, object]:
+    points = shell.points.round(4).ravel().tolist()
+    return {"carrier": carrier, "points": points, "faces": shell.faces.ravel().tolist()}
+
+
+def _posed(p: Posed) -> dict[str, object]:
+    return {
+        "name": printable(p.name),
+        "about": printable(p.about),
+        "frames": p.frames[:, :3].round(5).reshape(len(p.frames), 12).tolist(),
+        "line": p.line.round(4).tolist(),
+        "markers": p.markers.round(4).tolist(),
+        "names": [printable(name) for name in p.names],
+        "arrows": None if p.arrows is None else (p.arrows * 1e6).round(2).tolist(),
+    }
+
+
+MOST_POSES = 80  # in the page; of more, those with the largest residuals and a random choice
+WORST = 30
+
+
+def residual_space(model: Model, seen: Observations, x: Array, residual: Array) -> Space:
+    """One pose per configuration and load, its arrows the mean residual of each marker.
+
+    `residual` (rows,) is observed minus predicted at parameter values x (parameters,); of a pose
+    the position counts, a distance's residual lies along the line from its anchor.
+    """
+    table = seen.table
+    force = np.round(table.force[seen.lead], 3)
+    key = np.column_stack([seen.configuration, force])
+    _, first, entry = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    entry = entry.ravel()
+    vectors = residual_vectors(model, seen, x, residual)
+    rms = np.sqrt(np.bincount(entry, (vectors**2).sum(axis=1)) / np.bincount(entry))
+    chosen = _chosen(rms, np.argsort(first))
+    rows = seen.lead[first[chosen]]
+    frames, flange = frames_at(
+        model.cell, model.chain, table.q[rows], model.flange_poses(table.take(rows), x)
+    )
+    at = marker_positions(model, seen, x)
+    several = len(np.unique(force, axis=0)) > 1
+    poses = []
+    for k, code in enumerate(chosen):
+        own = np.flatnonzero(entry == code)
+        markers = np.unique(table.marker[seen.lead[own]])
+        groups = [own[table.marker[seen.lead[own]] == m] for m in markers]
+        name = table.configuration_labels[table.configuration[rows[k]]]
+        poses.append(
+            Posed(
+                name=f"{name}, {_load(table.force[rows[k]])}" if several else name,
+                about=f"rms residual {length(float(rms[code]))} of {len(own)} readings",
+                frames=frames[k],
+                flange=flange[k],
+                markers=np.array([at[g].mean(axis=0) for g in groups]),
+                names=tuple(table.marker_names[m] for m in markers),
+                arrows=np.array([vectors[g].mean(axis=0) for g in groups]),
+            )
+        )
+    return space_of(model.cell, model.chain, poses, int(np.argmax(rms[chosen])), "configuration")
+
+
+def view_caption(space: Space, configurations: int) -> str:
+    """What the arrows are, and how much they are enlarged in the still picture."""
+    text = (
+        f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
+        f"configuration {printable(space.poses[space.first].name)}, which has the largest, and in "
+        f"all of them. The arm is drawn as {space.shells.drawn_from}."
+    )
+    if len(space.poses) < configurations:
+        text += (
+            f" {len(space.poses)} poses of {configurations} configurations: those with the "
+            "largest residuals, and a random choice."
+        )
+    return text
+
+
+def time_caption(seen: Observations) -> str:
+    """What the figure over time shows, and what it would mean."""
+    text = (
+        "{}; lines are means with twice their standard error. A slope is a drift, a step something "
+        "that moved."
+    )
+    if seen.table.time is None:
+        return text.format("In the order of the table, which has no column time_s or time_min")
+    return text.format("Over time")
+
+
+def _chosen(rms: Array, order: IntArray) -> IntArray:
+    """The entries to show, in the table's order."""
+    if len(rms) <= MOST_POSES:
+        return order
+    worst = np.argsort(-rms)[:WORST]
+    rest = np.setdiff1d(order, worst)
+    drawn = np.random.default_rng(0).choice(rest, MOST_POSES - WORST, replace=False)
+    return order[np.isin(order, np.concatenate([worst, drawn]))]
+
+
+def residual_vectors(model: Model, seen: Observations, x: Array, residual: Array) -> Array:
+    """Residuals (N, 3) in m as vectors in the data's frame."""
+    parts = residual.reshape(-1, seen.size)
+    if seen.kind != "distance":
+        return np.asarray(parts[:, :3])
+    anchor = model.cell.tracker.anchor
+    line = marker_positions(model, seen, x) - (np.zeros(3) if anchor is None else anchor)
+    return np.asarray(parts * line / np.linalg.norm(line, axis=1, keepdims=True))
+
+
+def marker_positions(model: Model, seen: Observations, x: Array) -> Array:
+    """Where the markers (N, 3) were seen, or where the model puts them if only a distance was."""
+    table = seen.table
+    if table.position is not None:
+        return np.asarray(table.position[seen.lead])
+    return model.target_poses(table, x)[1][seen.lead]
+
+
+def _load(force: Array) -> str:
+    if not force.any():
+        return "unloaded"
+    return "(" + ", ".join(f"{f + 0.0:.6g}" for f in force) + ") N"
+
+
+WIDTH = 9.9
+MOST_NUMBERED = 40
+# Rows: to the right and upwards on paper, and towards the reader.
+_TURN, _TILT = np.radians(-50.0), np.radians(22.0)
+OBLIQUE = np.array(
+    [
+        [-np.sin(_TURN), np.cos(_TURN), 0.0],
+        [-np.sin(_TILT) * np.cos(_TURN), -np.sin(_TILT) * np.sin(_TURN), np.cos(_TILT)],
+        [np.cos(_TILT) * np.cos(_TURN), np.cos(_TILT) * np.sin(_TURN), np.sin(_TILT)],
+    ]
+)
+TOP = np.eye(3)
+SIDE = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
+
+
+def space_picture(space: Space, title: str) -> str:
+    """SVG: the first pose seen obliquely, and all poses from above and from the side.
+
+    `title` says what it shows to those who cannot see it; it is not user text.
+    """
+
+    def draw(figure: Figure) -> None:
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1.0))
+        large = figure.add_subplot(grid[:, 0])
+        _draw(large, space, OBLIQUE, whole=False)
+        large.set_axis_off()
+        for k, (view, name, up) in enumerate(((TOP, "from above", "y"), (SIDE, "side", "z"))):
+            axes = figure.add_subplot(grid[k, 1])
+            _draw(axes, space, view, whole=True)
+            axes.set_title(name)
+            axes.set_xlabel("x in m")
+            axes.set_ylabel(f"{up} in m")
+
+    return drawn(draw, WIDTH, 5.6, title)
+
+
+def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
+    """`whole`: all poses as lines; else the first as bodies, and with arrows it alone."""
+    shown = space.poses[space.first]
+    for shell in space.shells.around:
+        _fill(axes, shell.points @ view.T, FAINT, 0.25)
+    if whole or not space.has_arrows:
+        for pose in space.poses:
+            line = pose.line @ view.T
+            axes.plot(line[:, 0], line[:, 1], color=SERIES[0], linewidth=0.9, alpha=0.5)
+    if whole:
+        for pose in space.poses:
+            if not space.has_arrows and len(space.poses) <= MOST_NUMBERED:
+                tip = pose.line[-1] @ view.T
+                axes.annotate(short_name(pose.name, 6), (tip[0], tip[1]), (3, 2),
+                              textcoords="offset points", fontsize=7)  # fmt: skip
+    else:
+        _bodies(axes, space, view)
+    for pose in space.poses if whole else (shown,):
+        _markers(axes, pose, view, spokes=not whole)
+        if pose.arrows is not None:
+            _arrows(axes, pose, space.scale, view)
+    if space.tracker is not None:
+        at = view @ space.tracker
+        axes.plot([at[0]], [at[1]], "D", color=SERIES[2], markersize=6)
+        axes.annotate("tracker", (at[0], at[1]), (6, 3), textcoords="offset points", fontsize=8)
+    axes.set_aspect("equal")
+    drawn_poses = space.poses if whole or not space.has_arrows else (shown,)
+    _limit_view(axes, space, view, drawn_poses, [] if whole else space.bodies)
+
+
+def _limit_view(
+    axes: Axes, space: Space, view: Array, poses: Sequence[Posed], bodies: list[Array]
+) -> None:
+    """Limits that hold arms, arrows and tracker; of what stands around, what lies within."""
+    points = list(bodies)
+    points += [points for p in poses for points in (p.line, p.markers)]
+    points += [p.markers + space.scale * p.arrows for p in poses if p.arrows is not None]
+    points += [] if space.tracker is None else [space.tracker[None]]
+    flat = np.vstack(points) @ view.T
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    room = 0.09 * float((high - low)[:2].max())
+    axes.set_xlim(float(low[0]) - room, float(high[0]) + room)
+    axes.set_ylim(float(low[1]) - room, float(high[1]) + room)
+
+
+def _bodies(axes: Axes, space: Space, view: Array) -> None:
+    """Silhouettes of the first pose's bodies, the furthest first."""
+    placed = [points @ view.T for points in space.bodies]
+    for points in sorted(placed, key=lambda p: float(p[:, 2].mean())):
+        _fill(axes, points, ARM, 1.0)
+
+
+def _fill(axes: Axes, points: Array, colour: str, alpha: float) -> None:
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        outline = points[ConvexHull(points[:, :2]).vertices]
+    except QhullError:
+        return  # seen edge on
+    axes.fill(outline[:, 0], outline[:, 1], facecolor=colour, edgecolor=INK, linewidth=0.5,
+              alpha=alpha)  # fmt: skip
+
+
+def _markers(axes: Axes, pose: Posed, view: Array, spokes: bool) -> None:
+    at, tip = pose.markers @ view.T, pose.line[-1] @ view.T
+    if spokes:
+        for marker in at:
+            axes.plot([tip[0], marker[0]], [tip[1], marker[1]], color=INK, linewidth=0.8)
+    axes.plot(at[:, 0], at[:, 1], ".", color=INK, markersize=5 if spokes else 2)
+
+
+def _arrows(axes: Axes, pose: Posed, scale: float, view: Array) -> None:
+    assert pose.arrows is not None
+    at, step = pose.markers @ view.T, scale * pose.arrows @ view.T
+    axes.quiver(at[:, 0], at[:, 1], step[:, 0], step[:, 1], angles="xy", scale_units="xy", scale=1,
+                color=SERIES[1], width=0.004, headwidth=3.5, headlength=4, zorder=3)  # fmt: skip
+
+
+def plan_space(plan: Plan) -> Space:
+    """The arm in every pose of the plan."""
+    cell, chain = plan.model.cell, plan.model.chain
+    frames, flange = frames_at(cell, chain, plan.q)
+    names = tuple(cell.tool.markers)
+    local = np.array(list(cell.tool.markers.values())).reshape(-1, 3)
+    order = first_stops(plan)
+    poses = []
+    for k, T in enumerate(flange):
+        joints = [
+            f"q{i + 1} {joint_text(v, kind)}{' °' if kind == 'revolute' else ' mm'}"
+            for i, (v, kind) in enumerate(zip(plan.q[k], chain.kinds, strict=True))
+        ]
+        group = plan.group_names[plan.group[k]]
+        about = [f"stop {order[k]}", *([group] if plan.level_joint else []), ", ".join(joints)]
+        poses.append(
+            Posed(
+                name=plan.configurations[k],
+                about="; ".join(about),
+                frames=frames[k],
+                flange=T,
+                markers=local @ T[:3, :3].T + T[:3, 3],
+                names=names,
+            )
+        )
+    return space_of(cell, chain, poses)

@@ -1,0 +1,506 @@
+"""What a diagnosis says: names and numbers in words, its sentences and its rows."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from elastocal.diagnosis.result import (
+    Candidate,
+    Curve,
+    Diagnosis,
+    EffectAt,
+    FoundEffect,
+    Interval,
+    Location,
+    NoiseFloor,
+)
+from elastocal.diagnosis.separate.result import ExtraPlan
+from elastocal.identification.error_budget import BudgetStep
+from elastocal.report.formatting import (
+    TextTable,
+    capital,
+    display,
+    estimate,
+    length,
+    printable,
+    signed_change,
+    significant,
+    together,
+)
+
+# Places that are the only one their effects have: "base drift", not "base drift at base".
+SINGLE = ("base", "wrist", "load", "tracker")
+STAGES = {
+    "transmission": "transmission",
+    "geometry": "links",
+    "load": "loads",
+    "compliance": "compliance",
+    "tool": "tool and markers",
+    "tracker": "tracker",
+}
+LONG_TIME = 120.0  # s, from which on times are told in minutes
+
+
+def plain_name(name: str) -> str:
+    """ "gear_eccentricity" → "gear eccentricity"."""
+    return printable(name).replace("_", " ")
+
+
+def place(where: str) -> str:
+    """ "joint2" → "joint 2", "marker:M_1" → "marker M_1", "all" → "all links"."""
+    if where.startswith("marker:"):
+        return f"marker {printable(where.removeprefix('marker:'))}"
+    if where == "all":
+        return "all links"
+    return re.sub(r"^([a-z]+)([0-9]+)$", r"\1 \2", printable(where))
+
+
+def effect_at(e: EffectAt | FoundEffect | Candidate) -> str:
+    """ "gear eccentricity at joint 2", "base drift", "marker slip of marker M1"."""
+    name = plain_name(e.effect)
+    if e.where in SINGLE:
+        return name
+    of_what = e.where == "all" or e.where.startswith(("marker:", "link"))
+    return f"{name} {'of' if of_what else 'at'} {place(e.where)}"
+
+
+def name_of(text: str) -> str:
+    """A step of the budget or a rival: "base_frame", "link_bending at link2", "backlash:joint3"."""
+    effect, colon, where = text.replace(" at ", ":", 1).partition(":")
+    return effect_at(EffectAt(effect, where)) if colon else driver_name(plain_name(text))
+
+
+def driver_name(driver: str) -> str:
+    """ "joint2 angle" → "joint 2 angle"."""
+    return re.sub(r"\b(joint|link)([0-9]+)\b", r"\1 \2", printable(driver))
+
+
+def probability(p: float) -> str:
+    """Two decimals, and never a certainty."""
+    if not math.isfinite(p):
+        return "–"
+    if p > 0.995:
+        return "> 0.99"
+    return "< 0.01" if p < 0.005 else f"{p:.2f}"
+
+
+def p_value(p: float) -> str:
+    """Two digits, or that it is below a thousandth."""
+    if not math.isfinite(p):
+        return "–"
+    return "< 0.001" if p < 0.001 else significant(p, 2)
+
+
+def size_of(p: float) -> str:
+    """ "p = 0.02", "p < 0.001"."""
+    text = p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def percent(fraction: float) -> str:
+    """ "75 %"; "none" where there is no number."""
+    return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
+
+
+def reduction(f: FoundEffect) -> str:
+    """ "75 % (63 to 84 %)"."""
+    low, high = f.gap_reduction_ci95
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return percent(f.gap_reduction)
+    return f"{percent(f.gap_reduction)} ({round(100 * low)} to {percent(high)})"
+
+
+def settings_text(settings: Mapping[str, float]) -> str:
+    """Searched constants with their units: "jump time 12.0 min, ripple order 101"."""
+    return ", ".join(_setting(key, value) for key, value in settings.items())
+
+
+def _setting(key: str, value: float) -> str:
+    name, _, unit = key.rpartition("_")
+    if unit != "s":
+        return f"{plain_name(key)} {significant(value, 4)}"
+    if abs(value) < LONG_TIME:
+        return f"{plain_name(name)} {significant(value)} s"
+    return f"{plain_name(name)} {significant(value / 60)} min"
+
+
+def repeatabilities(noise: NoiseFloor, kinds: Iterable[str]) -> str:
+    """Every joint's scatter from visit to visit: "joint 1 6.0 µrad, joint 2 5.1 µrad"."""
+    texts = [
+        f"joint {i + 1} {significant(value * 1e6, 2)} {'µrad' if kind == 'revolute' else 'µm'}"
+        for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
+        if value > 0
+    ]
+    return ", ".join(texts) or "none that shows"
+
+
+def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
+    """What the data themselves say of the noise, a sentence each."""
+    sigma = length(noise.reading_sigma)
+    if noise.stated:
+        text = f"A reading scatters by {sigma} rms per axis, {significant(noise.stated_factor, 2)}"
+        lines = [f"{text} times what is stated."]
+    else:
+        lines = [f"A reading scatters by {sigma} rms per axis; nothing was stated."]
+    lines.append(f"Repeatability from visit to visit: {repeatabilities(noise, kinds)}.")
+    if noise.shared > 0:
+        lines.append(
+            "All visits of a configuration share a further scatter of "
+            f"{significant(noise.shared, 2)} times that."
+        )
+    if noise.pure_error is None:
+        lines.append("No reading is repeated, so the noise is known from the residuals only.")
+    else:
+        lines.append(f"Repeats scatter by {length(noise.pure_error)} rms per axis.")
+    if noise.faulty:
+        n = len(noise.faulty)
+        lines.append(
+            f"{n} faulty reading{'s were' if n > 1 else ' was'} left out, "
+            f"the worst {length(max(f.error for f in noise.faulty))} off."
+        )
+    return lines
+
+
+ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
+MOST_NAMED = 6
+
+
+def diagnosis_headline(d: Diagnosis) -> str:
+    """The verdict in one sentence."""
+    if d.verdict == "explained":
+        named = [f"{effect_at(f)} (probability {probability(f.probability)})" for f in d.effects]
+        return f"{capital(together(named))} explain{'s' * (len(named) == 1)} the gap."
+    if d.verdict == "ambiguous":
+        return _ambiguous(d)
+    if d.verdict == "unknown_effect":
+        return _unknown(d)
+    return (
+        "No further effect shows above the noise: the probability that there is none is "
+        f"{probability(d.probability_nothing)}."
+    )
+
+
+def _ambiguous(d: Diagnosis) -> str:
+    sets = [together([effect_at(e) for e in rivals], "or") for rivals in d.indistinguishable]
+    text = together([f"either {rivals}" for rivals in sets])
+    return f"{capital(text)} make{'s' * (len(sets) == 1)} the gap; these data cannot tell which."
+
+
+def _unknown(d: Diagnosis) -> str:
+    text = "Something that is not in the catalogue makes the gap"
+    if d.effects:
+        each = [f"{effect_at(f)} (probability {probability(f.probability)})" for f in d.effects]
+        named = together(each)
+        verb = "make" if len(each) > 1 else "makes"
+        text = f"{capital(named)} {verb} part of the gap; beside it, something not in the catalogue"
+        return f"{text} acts {location_text(d.location)}." if d.location else f"{text} acts."
+    if d.location is None:
+        return f"{text}; the data do not show where it sits."
+    return f"{text}: it sits {location_text(d.location)}."
+
+
+def location_text(location: Location) -> str:
+    """ "at joint 2, in the transmission (probability 0.97)"."""
+    at, stage = place(location.where), STAGES[location.stage]
+    where = f"at {at}, in the {stage}" if at != stage else f"at the {at}"
+    return f"{where} (probability {probability(location.probability)})"
+
+
+def diagnosis_lines(d: Diagnosis) -> list[tuple[str, str]]:
+    """(label, sentence) on what was found, for the terminal and the head of the page."""
+    lines = [("Verdict", diagnosis_headline(d))]
+    lines += [("Error", text) for text in _error_lines(d)]
+    if d.verdict == "unknown_effect":
+        lines += [("Depends on", text) for text in _dependence(d)]
+        lines += [("Shape", _shape(curve)) for curve in d.curves]
+    if d.open:
+        lines += [_finding_line(d, f) for f in d.effects]
+    if d.verdict == "nothing_significant":
+        lines += [("Sensitivity", text) for text in sensitivity(d)]
+    elif d.verdict == "ambiguous" and d.location is not None:
+        lines.append(("Location", f"{location_text(d.location)}."))
+    lines.append(("Chance", _chance(d)))
+    return lines
+
+
+def _error_lines(d: Diagnosis) -> list[str]:
+    """Error on held-out poses before and after, and the part of it that the effects remove."""
+    calibrated, floor = length(d.gap.calibrated), length(d.gap.noise_floor)
+    if not d.effects:
+        return [
+            f"On held-out poses the calibrated arm is off by {calibrated} rms; noise alone "
+            f"gives {floor}."
+        ]
+    text = (
+        f"On held-out poses the error falls from {calibrated} to {length(d.gap.explained)} rms "
+        f"(noise alone: {floor})."
+    )
+    if len(d.effects) == 1:
+        return [f"{text} The noise-free error of fresh poses shrinks by {reduction(d.effects[0])}."]
+    each = [f"{effect_at(f)} takes away {reduction(f)}" for f in d.effects]
+    return [f"{text} Of the noise-free error of fresh poses {together(each)}."]
+
+
+def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:
+    """An effect beside the open question, or the likeliest answer to it."""
+    open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
+    label = "Likeliest" if (f.effect, f.where) in open_sets else "Besides"
+    text = f"{effect_at(f)} (probability {probability(f.probability)}"
+    return label, f"{text}; {settings_text(f.settings)})." if f.settings else f"{text})."
+
+
+def _dependence(d: Diagnosis) -> list[str]:
+    """The drivers that the residual depends on, the strongest first."""
+    if not d.dependences:
+        return ["no single driver that was tested shows it; see the curves for its shape."]
+    told = d.dependences[:MOST_NAMED]
+    named = [f"{driver_name(t.driver)} ({size_of(t.p_family)})" for t in told]
+    more = len(d.dependences) - len(named)
+    return [together(named) + (f" and {more} more" if more else "") + "."]
+
+
+def _shape(curve: Curve) -> str:
+    """How much the driver moves the entry, from its lowest to its highest point."""
+    moved = max(curve.y) - min(curve.y)
+    how_far = length(moved) if curve.y_unit == "m" else _in_unit(moved, curve.y_unit)
+    return f"{driver_name(curve.driver)} moves {driver_name(curve.entry)} by {how_far} in all."
+
+
+def _in_unit(value: float, unit: str) -> str:
+    shown, text = display(value, unit)
+    return f"{significant(shown)} {text}"
+
+
+def _chance(d: Diagnosis) -> str:
+    if d.verdict == "nothing_significant":
+        return f"the strongest candidate is one that noise alone yields with {size_of(d.p_value)}."
+    return f"noise alone yields such a finding with {size_of(d.p_value)}, all candidates counted."
+
+
+def sensitivity(d: Diagnosis) -> list[str]:
+    """How small an effect would have been seen."""
+    if not d.candidates:
+        return []
+    lines = []
+    if math.isfinite(d.smallest_seen):
+        lines.append(
+            f"effects that move the markers by more than about "
+            f"{significant(d.smallest_seen * 1e6, 2)} µm rms, in a way that the fitted parameters "
+            "cannot follow, would have been seen."
+        )
+    visible = [c for c in d.candidates if c.visible]
+    faint = [c for c in d.candidates if c.hidden]
+    text = f"of {len(d.candidates)} candidates {len(visible)} would have shown at typical size"
+    if faint:
+        by_effect = dict.fromkeys(plain_name(c.effect) for c in faint)
+        names = list(by_effect)[:MOST_NAMED]
+        more = len(by_effect) - len(names)
+        text += f"; hidden in the noise even then: {len(faint)} ({', '.join(names)}"
+        text += f" and {more} more kinds)" if more else ")"
+    return [*lines, f"{text}."]
+
+
+def seen_from(c: Candidate) -> str:
+    """The size from which an effect would be seen, in typical sizes: "0.4"."""
+    if not math.isfinite(c.seen_from):
+        return "–"
+    return f"> {ABSURD:.0f}" if c.seen_from > ABSURD else significant(c.seen_from, 2)
+
+
+def diagnosis_steps(d: Diagnosis) -> list[str]:
+    """What to do now: the remedies of the findings, what extra poses promise, what to record."""
+    steps = [f.remedy for f in d.findings if f.remedy]
+    if d.extra is not None:
+        steps += extra_lines(d.extra)
+    # One piece of advice serves many effects.
+    return steps + list(dict.fromkeys(capital(printable(u.advice)) for u in d.untested))
+
+
+def extra_lines(extra: ExtraPlan) -> list[str]:
+    """What the extra poses promise, or that none would help."""
+    rivals = together([name_of(name) for name in extra.rivals], "or")
+    if not extra.separable:
+        lines = [f"No pose that this cell allows tells apart {rivals}."]
+    else:
+        n = extra.n_poses
+        lines = [
+            f"{n} more pose{'s' if n != 1 else ''} to tell apart {rivals}: the probability of "
+            f"naming the right one rises from {probability(extra.probability_before)} to "
+            f"{probability(extra.probability_after)} (as many random poses: "
+            f"{probability(extra.probability_random)})."
+        ]
+        for group in extra.inseparable:
+            lines.append(f"{capital(together([name_of(name) for name in group]))} count as one.")
+    return lines + [capital(printable(text)) for text in extra.advice]
+
+
+BUDGET_HEADS = ("model", "held-out rms", "95 %", "change")
+CANDIDATE_HEADS = ("candidate", "probability", "evidence", "d", "seen from", "settings")
+PARAMETER_HEADS = ("parameter", "value", "± 95 %", "unit")
+STRUCTURE_HEADS = ("depends on", "p", "p, all tests")
+FAULTY_HEADS = ("line", "configuration", "marker", "error", "error / noise")
+PAIR_HEADS = ("rivals", "d so far", "d with the extra poses")
+UNTESTED_HEADS = ("effect", "why", "record or measure")
+Rows = list[tuple[str, ...]]
+HALF_WIDTHS = 1.959964  # standard deviations in half a 95 % interval
+
+
+def error_steps(d: Diagnosis) -> tuple[BudgetStep, ...]:
+    """The steps of the gap budget that are models; the noise floor is none."""
+    return tuple(step for step in d.budget if step.step != "noise_floor")
+
+
+def gap_rows(d: Diagnosis) -> Rows:
+    """The gap budget step by step, the noise floor last."""
+    rows: Rows = []
+    before: float | None = None
+    for step in error_steps(d):
+        change = "" if before is None else signed_change(step.heldout_rms - before)
+        rows.append((name_of(step.step), length(step.heldout_rms), _ends(step.ci95), change))
+        before = step.heldout_rms
+    return [*rows, ("noise alone", length(d.gap.noise_floor), "", "")]
+
+
+def _ends(ci95: Interval) -> str:
+    return " to ".join(length(end) for end in ci95)
+
+
+def hypothesis_rows(d: Diagnosis, most: int) -> Rows:
+    """The best `most` candidates; nothing and an unknown effect are candidates as well."""
+    rows: Rows = [
+        (
+            effect_at(c),
+            probability(c.probability),
+            f"{c.score:+.1f}",
+            significant(c.detectable, 2),
+            seen_from(c),
+            settings_text(c.settings),
+        )
+        for c in d.candidates[:most]
+    ]
+    return [
+        *rows,
+        ("an effect outside the catalogue", probability(d.probability_unknown), "", "", "", ""),
+        ("no further effect", probability(d.probability_nothing), "", "", "", ""),
+    ]
+
+
+def added_parameter_rows(findings: Sequence[FoundEffect]) -> Rows:
+    """Fitted parameters of the effects found, with 95 % half widths, and their settings."""
+    rows: Rows = []
+    for f in findings:
+        for p in f.parameters:
+            value, half, unit = estimate(p.value, HALF_WIDTHS * p.std, p.unit)
+            rows.append((printable(p.name), value, half, unit))
+        if f.settings:
+            rows.append((effect_at(f), settings_text(f.settings), "", ""))
+    return rows
+
+
+def structure_rows(d: Diagnosis, most: int) -> Rows:
+    """Tests that name no effect, the most conspicuous first."""
+    tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))
+    return [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests[:most]]
+
+
+def faulty_rows(d: Diagnosis, most: int) -> Rows:
+    """Readings left out, the worst first."""
+    worst = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
+    return [
+        (
+            str(f.line),
+            printable(f.configuration),
+            printable(f.marker),
+            length(f.error),
+            significant(f.sigmas),
+        )
+        for f in worst[:most]
+    ]
+
+
+def pair_rows(extra: ExtraPlan) -> Rows:
+    """How far apart each pair of rivals is before and after the extra poses."""
+    return [
+        (
+            f"{name_of(pair.first)} or {name_of(pair.second)}",
+            significant(pair.distance_before, 2),
+            significant(pair.distance_after, 2),
+        )
+        for pair in extra.pairs
+    ]
+
+
+def untested_rows(d: Diagnosis) -> Rows:
+    """Effects that could not be tested, those with the same reason and remedy in one row."""
+    groups: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for u in d.untested:
+        effects = groups.setdefault((printable(u.reason), printable(u.advice)), {})
+        effects.setdefault(plain_name(u.effect), []).append(place(u.where))
+    return [
+        (", ".join(f"{name} ({', '.join(at)})" for name, at in effects.items()), *reason)
+        for reason, effects in groups.items()
+    ]
+
+
+MOST_PLACES = 8
+MOST_VISITS = 200
+BOX_WIDTH, GAP = 118, 18  # width of a box of the chain and the room between two, in SVG units
+
+
+@dataclass(frozen=True)
+class ChainBox:
+    """A link of the chain as the page draws it: `shade` 0 to 1, None where it cannot err."""
+
+    name: str
+    x: int
+    shade: float | None
+    evidence: str
+
+
+def chain_boxes(d: Diagnosis) -> list[ChainBox]:
+    """The chain from commanded joints to tracker, shaded by the evidence for each link."""
+    stages = {} if d.location is None else d.location.stages
+    named: list[tuple[str, float | None]] = [("commanded joints", None)]
+    named += [(name, stages.get(stage, 0.0) if stages else None) for stage, name in STAGES.items()]
+    return [
+        ChainBox(name, k * (BOX_WIDTH + GAP), shade, "" if shade is None else probability(shade))
+        for k, (name, shade) in enumerate(named)
+    ]
+
+
+def likeliest_places(d: Diagnosis) -> list[tuple[str, str]]:
+    """The likeliest places, the likeliest first."""
+    if d.location is None:
+        return []
+    order = sorted(d.location.places.items(), key=lambda item: -item[1])
+    return [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
+
+
+def extra_visits(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any] | None:
+    """The extra poses as a table, in the order of measuring; None where there are none."""
+    if d.extra is None or d.extra.plan is None:
+        return None
+    import numpy as np
+
+    plan = d.extra.plan
+    heads = ["order", "pose"]
+    heads += [f"q{i + 1} {'°' if kind == 'revolute' else 'mm'}" for i, kind in enumerate(kinds)]
+    heads.append("force N")
+    heads += ["approach"] if plan.approach is not None else []
+    heads += ["time min"] if plan.time is not None else []
+    shown = np.where(np.array(kinds) == "revolute", np.degrees(plan.q), plan.q * 1e3)
+    table: list[tuple[str, ...]] = []
+    for i in range(min(len(plan), MOST_VISITS)):
+        row = [str(i + 1), printable(plan.configuration_labels[plan.configuration[i]])]
+        row += [f"{v + 0.0:.2f}" for v in shown[i]]
+        row.append(" ".join(significant(f) for f in plan.force[i]))
+        if plan.approach is not None:
+            row.append(" ".join("+" if a > 0 else "−" if a < 0 else "0" for a in plan.approach[i]))
+        if plan.time is not None:
+            row.append(f"{plan.time[i] / 60:.1f}")
+        table.append(tuple(row))
+    return {"table": TextTable(tuple(heads), table, ()), "more": len(plan) - len(table)}

@@ -1,0 +1,593 @@
+"""What an identification says: its parameters as rows, its sentences, and the judgement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from elastocal.identification.error_budget import ErrorBudget, stage_of
+from elastocal.identification.findings import (
+    ABSORBED,
+    ALONE,
+    COMBINED,
+    FIXED,
+    INVISIBLE,
+    next_steps,
+    standings,
+)
+from elastocal.identification.result import (
+    LOPSIDED,
+    Calibration,
+    Combination,
+    Estimate,
+    Finding,
+    deviation,
+)
+from elastocal.report.formatting import (
+    TextTable,
+    Tone,
+    counted,
+    display,
+    estimate,
+    length,
+    minus,
+    plain,
+    printable,
+    resolution,
+    rounded_alike,
+    signed_change,
+    significant,
+    with_ends,
+)
+from elastocal.report.method_and_noise import (
+    MOST_TOLD,
+    constraints_line,
+    does_noise_explain_it,
+    fault_lines,
+    intervals_line,
+    method_and_weights,
+    noise_model_line,
+    prior_line,
+    repeats_line,
+    shape_line,
+)
+
+LARGEST_TERMS = 4
+Truth = dict[str, float]
+
+
+def names_of(result: Calibration, standing: str) -> list[str]:
+    return [printable(name) for name, s in standings(result).items() if s == standing]
+
+
+def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
+    """The first member and the largest other terms by factor, "+ n more" for the rest."""
+    (first, _), *rest = combination.terms.items()
+    kept = sorted(rest, key=lambda term: -abs(term[1]))[: most - 1]
+    text = printable(first)
+    for name, factor in [term for term in rest if term in kept]:
+        size = significant(abs(factor))
+        number = "" if float(size) == 1 else f"{size}·"
+        member = deviation(printable(name), combination.held.get(name), 4)
+        text += f" {'-' if factor < 0 else '+'} {number}{member}"
+    more = len(rest) - len(kept)
+    return f"{text} + {more} more" if more else text
+
+
+def short_note(result: Calibration, e: Estimate) -> str:
+    """Why a parameter has no number of its own, in a few words; empty where it has one."""
+    standing = standings(result)[e.name]
+    if standing == COMBINED:
+        return f"only as {shortened(result.combination(e.name))}"
+    if standing == ABSORBED:
+        several = len(e.combined_with) - 3
+        names = ", ".join(printable(n) for n in e.combined_with[:3])
+        return f"held: absorbed in {names}" + (f" + {several} more" if several > 0 else "")
+    if standing == INVISIBLE:
+        return "held: not visible in these data"
+    return "fixed by the user" if standing == FIXED else printable(e.note)
+
+
+def held_where(result: Calibration, names: list[str]) -> str:
+    """Where all of `names` are held: at nominal, or at a start value that is none."""
+    chosen = [e for e in result.estimates if printable(e.name) in names]
+    at_nominal = all(e.held == e.nominal and nominal_known(result, e.name) for e in chosen)
+    return "held at nominal" if at_nominal else "held at the start value"
+
+
+def combination_truth(result: Calibration, combination: Combination, truth: Truth) -> float | None:
+    """True value X_k + Σ f·(X_d − held_d), None where a member's true value is not known."""
+    (first, _), *rest = combination.terms.items()
+    if any(name not in truth for name in combination.terms):
+        return None
+    shift = sum(f * (truth[name] - result.estimate(name).held) for name, f in rest)
+    return truth[first] + shift
+
+
+def inside(value: float | None, ci95: tuple[float, float] | None) -> str:
+    """Whether a true value lies in the 95 % interval; empty where either is unknown."""
+    if value is None or ci95 is None:
+        return ""
+    return "inside" if ci95[0] <= value <= ci95[1] else "outside"
+
+
+def coverage(result: Calibration, truth: Truth) -> tuple[int, int]:
+    """How many 95 % intervals hold the true value, of how many that could be compared."""
+    found = [inside(truth.get(e.name), e.ci95) for e in result.estimates]
+    found += [inside(combination_truth(result, c, truth), c.ci95) for c in result.combinations]
+    return found.count("inside"), len(found) - found.count("")
+
+
+def nominal_known(result: Calibration, name: str) -> bool:
+    """False for a zero that only stands for "no nominal value stated", as of a compliance."""
+    parameter = result.model.parameters[result.model.names.index(name)]
+    return parameter.nominal != 0 or parameter.typical is not None
+
+
+def undetermined_lines(result: Calibration) -> list[str]:
+    """Which parameters have no number of their own, and why, one line per reason."""
+    lines = []
+    if names := names_of(result, INVISIBLE):
+        where = held_where(result, names)
+        lines.append(f"{where} (not visible in these data): {', '.join(names)}")
+    if names := names_of(result, ABSORBED):
+        where = held_where(result, names)
+        lines.append(f"{where}, absorbed in a combination: {', '.join(names)}")
+    if names := names_of(result, FIXED):
+        lines.append(f"fixed by the user: {', '.join(names)}")
+    return lines
+
+
+MOST_CORRELATIONS = 8
+READINGS = {
+    "position": "position readings",
+    "deflection": "deflections (loaded minus unloaded readings)",
+    "pose": "pose readings",
+    "distance": "distance readings",
+}
+
+
+def what_was_identified(result: Calibration) -> str:
+    alone, n = len(names_of(result, ALONE)), len(result.combinations)
+    text = f"{alone} of {counted(len(result.estimates), 'parameter')} known on their own"
+    if n:
+        absorbed = len(names_of(result, ABSORBED))
+        text += (
+            f", and {counted(n, 'combination')} of parameters that no reading tells apart "
+            f"({absorbed} held in exchange)"
+        )
+    if unseen := len(names_of(result, INVISIBLE)):
+        text += f"; {unseen} not visible in these data"
+    if fixed := len(names_of(result, FIXED)):
+        text += f"; {fixed} fixed by the user"
+    return text + "."
+
+
+def how_well_it_predicts(result: Calibration) -> str:
+    """Held-out error beside the nominal one, and the error on test data."""
+    what = {"deflection": "deflection", "distance": "distance"}.get(
+        result.observations.kind, "position"
+    )
+    nominal, held = result.nominal_rms, result.heldout_rms
+    if math.isfinite(held):
+        text = f"In poses that were not fitted the {what} is predicted to {length(held)} rms"
+        if held > 0 and nominal > held:
+            text += (
+                f"; the {nominal_arm(result)} is off by {length(nominal)}, "
+                f"{significant(nominal / held, 2)} times as much"
+            )
+        elif math.isfinite(nominal):
+            text += f", no better than the nominal arm ({length(nominal)})"
+        text += "."
+        if result.finding("fit_flatters") is not None:
+            text += (
+                f" The fitted poses look better ({length(result.residual_rms)}) than unseen ones: "
+                "more poses would help."
+            )
+    else:
+        text = (
+            "How well unseen poses are predicted is not known: some configuration alone "
+            "determines a parameter, so none can be held out."
+        )
+    if result.test is not None:
+        t = result.test
+        text += (
+            f" On {counted(t.n, 'test reading')} never fitted: {length(t.rms)} rms, "
+            f"{length(t.mean)} mean, {length(t.maximum)} at most."
+        )
+    return text
+
+
+def nominal_arm(result: Calibration) -> str:
+    """The nominal arm as `nominal_rms` has it: placed by all readings."""
+    return "nominal arm (base and markers placed)" if _placed(result) else "nominal arm"
+
+
+def nominal_arm_held_out(result: Calibration) -> str:
+    """The nominal arm as the gap budget has it: each configuration under the others' placing."""
+    return "nominal arm (base and markers by other poses)" if _placed(result) else "nominal arm"
+
+
+def _placed(result: Calibration) -> bool:
+    return any(stage_of(p.effect) == 0 for p in result.model.parameters)
+
+
+def rms_by_kind(result: Calibration) -> list[tuple[str, float]]:
+    """What the errors are with the nominal arm, fitted, held out and on test data (3-D rms, m)."""
+    rows = [
+        (nominal_arm(result), result.nominal_rms),
+        ("fitted poses", result.residual_rms),
+        ("held-out poses", result.heldout_rms),
+    ]
+    return rows if result.test is None else [*rows, ("test data", result.test.rms)]
+
+
+def rotation_rms(result: Calibration) -> tuple[float, float] | None:
+    """Fitted and held-out rms length of the rotation error in rad; None where none was read."""
+    if result.observations.kind != "pose":
+        return None
+    parts = [r.reshape(-1, 6)[:, 3:] for r in (result.residual, result.held_out)]
+    fitted, held = (float(np.sqrt((p**2).sum(axis=1).mean())) for p in parts)
+    return fitted, held
+
+
+def error_line(result: Calibration) -> str:
+    """All rms errors in one line."""
+    text = ", ".join(f"{name} {length(value)}" for name, value in rms_by_kind(result))
+    if (turns := rotation_rms(result)) is not None:
+        fitted, held = (
+            significant(v * 1e6) if math.isfinite(v) else "not available" for v in turns
+        )
+        text += f"; rotations {fitted} µrad fitted, {held} µrad held out"
+    return text
+
+
+def readings(result: Calibration) -> str:
+    seen = result.observations
+    poses = len(np.unique(seen.configuration))
+    markers = len(np.unique(seen.table.marker[seen.lead]))
+    return (
+        f"{len(seen.lead)} {READINGS[seen.kind]} in {counted(poses, 'configuration')}, "
+        f"{counted(markers, 'marker')} ({printable(seen.table.source)})"
+    )
+
+
+def correlation_lines(result: Calibration, most: int = MOST_CORRELATIONS) -> list[str]:
+    lines = []
+    for a, b, r in result.correlations[:most]:
+        number = f"{r:+.3f}" if abs(r) < 0.9995 else f"{r:+.6f}"
+        lines.append(f"{printable(a)} and {printable(b)}: {number}")
+    more = len(result.correlations) - len(lines)
+    return [*lines, f"and {more} more"] if more else lines
+
+
+def coverage_line(result: Calibration, truth: Truth) -> str:
+    hit, n = coverage(result, truth)
+    return f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
+
+
+def noise_lines(result: Calibration) -> list[tuple[str, str]]:
+    """Label and sentence: estimated noise model, repeats, shape of the residuals."""
+    summary = result.residual_summary
+    found = [
+        ("Noise model", noise_model_line(result)),
+        ("Repeats", repeats_line(result)),
+        ("Residuals", None if summary is None else shape_line(summary)),
+    ]
+    return [(label, text) for label, text in found if text is not None]
+
+
+def held_lines(result: Calibration) -> list[tuple[str, str]]:
+    """Label and sentence: what constraints and prior put into the estimates."""
+    found = [("Constraints", constraints_line(result)), ("Prior", prior_line(result))]
+    return [(label, text) for label, text in found if text is not None]
+
+
+def summary_lines(result: Calibration, truth: Truth | None = None) -> list[str]:
+    """The result in words, one statement per line, warnings last."""
+    lines = [
+        f"Readings: {readings(result)}",
+        f"Method: {method_and_weights(result)}",
+        f"Error (rms): {error_line(result)}",
+        f"Degrees of freedom: {result.dof}",
+        f"Identified: {what_was_identified(result)}",
+        f"Prediction: {how_well_it_predicts(result)}",
+        f"Noise: {does_noise_explain_it(result)}",
+    ]
+    lines += [f"{label}: {text}" for label, text in noise_lines(result)]
+    lines.append(f"Intervals: {intervals_line(result)}")
+    lines += [f"{label}: {text}" for label, text in held_lines(result)]
+    if truth:
+        lines.append(f"Truth: {coverage_line(result, truth)}")
+    if pairs := correlation_lines(result):
+        lines.append("Correlated over 0.9: " + "; ".join(pairs))
+    lines += [f"Faulty: {text}" for text in fault_lines(result, MOST_TOLD)]
+    return lines + [f"Warning: {printable(w)}" for w in result.warnings]
+
+
+# Bars have the true or nominal value in the middle and reach HALF_LENGTH to either side.
+MIDDLE, HALF_LENGTH = 72.0, 70.0
+TRUTH_REACH = 2.5  # half widths from the true value to a bar's end
+ROUNDING = 1e-9  # sides of an interval this short beside the value are alike
+
+
+@dataclass(frozen=True)
+class Bar:
+    """Where interval and estimate lie on a bar."""
+
+    low: float
+    high: float
+    value: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """A parameter or a combination as text; "–" where there is no number."""
+
+    name: str
+    determined: bool
+    value: str
+    half: str
+    unit: str
+    truth: str
+    verdict: str
+    nominal: str = ""
+    note: str = ""
+    whole: str = ""
+    bar: Bar | None = None
+    effect: str = ""
+    published: str = ""
+
+    @property
+    def interval(self) -> str:
+        """The half width with its sign, or both ends."""
+        return signed_half(self.half)
+
+
+def parameter_rows(
+    result: Calibration,
+    truth: Truth | None,
+    published: Mapping[str, tuple[float, float]] | None = None,
+) -> list[Row]:
+    """One row per parameter, all of them, in the model's order.
+
+    `published`: values and half widths (SI) that others found, by name.
+    """
+    rows = []
+    effects = {p.name: p.effect.replace("_", " ") for p in result.model.parameters}
+    for e in result.estimates:
+        true = None if truth is None else truth.get(e.name)
+        value, half, unit, known = texts(e, true)
+        nominal = e.nominal if nominal_known(result, e.name) else None
+        shown = "–" if nominal is None else minus(plain(display(nominal, e.unit)[0]))
+        rows.append(
+            Row(
+                printable(e.name), e.identifiable, minus(value), minus(half), unit, minus(known),
+                inside(true, e.ci95), shown, minus(short_note(result, e)),
+                bar=_bar(e, true, nominal, truth is not None), effect=effects[e.name],
+                published=_published((published or {}).get(e.name), e.unit),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _published(found: tuple[float, float] | None, unit: str) -> str:
+    """ "0.287 ± 0.003", in the unit of the row."""
+    if found is None:
+        return "–"
+    value, half, _ = estimate(*found, unit)
+    return f"{minus(value)} ± {half}"
+
+
+def budget_steps(
+    result: Calibration, budget: ErrorBudget
+) -> list[tuple[str, float, tuple[float, float]]]:
+    """Name, held-out rms (m) and its 95 % interval of every step."""
+    named = {"nominal_arm": nominal_arm_held_out(result)}
+    return [(named.get(s.step, s.step), s.heldout_rms, s.ci95) for s in budget.steps]
+
+
+def budget_table(result: Calibration, budget: ErrorBudget) -> TextTable:
+    """The steps with their intervals and what each changes; noise alone last."""
+    rows: list[tuple[str, ...]] = []
+    before: float | None = None
+    for name, rms, ci95 in budget_steps(result, budget):
+        change = "" if before is None else signed_change(rms - before)
+        rows.append((name, length(rms), " to ".join(map(length, ci95)), change))
+        before = rms
+    if budget.floor is not None:
+        rows.append((budget.floor_name, length(budget.floor), "", ""))
+    return TextTable(("model", "held-out rms", "95 %", "change"), rows)
+
+
+def combination_rows(result: Calibration, truth: Truth | None) -> list[Row]:
+    rows = []
+    for c in result.combinations:
+        true = None if truth is None else combination_truth(result, c, truth)
+        value, half, unit, known = texts(c, true)
+        short, whole = shortened(c), shortened(c, len(c.terms))
+        rows.append(
+            Row(
+                minus(short), True, minus(value), minus(half), unit, minus(known),
+                inside(true, c.ci95), whole=minus(whole) if whole != short else "",
+                bar=_bar(c, true, None, truth is not None),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str, str]:
+    """Value, half width or both ends, unit and true value; "–" for what is not determined."""
+    if e.value is None or e.ci95 is None:
+        known = "–" if true is None else plain(display(true, e.unit)[0])
+        return "–", "–", display(0.0, e.unit)[1], known
+    if is_lopsided(e.value, e.ci95):
+        shown, low, high = (display(number, e.unit)[0] for number in (e.value, *e.ci95))
+        value, half = with_ends(shown, low, high)
+        width, unit = resolution(shown, low, high), display(e.value, e.unit)[1]
+    else:
+        width = (e.ci95[1] - e.ci95[0]) / 2
+        value, half, unit = estimate(e.value, width, e.unit)
+        width = display(width, e.unit)[0]
+    known = "–" if true is None else rounded_alike(display(true, e.unit)[0], width)
+    return value, half, unit, known
+
+
+def is_lopsided(value: float, ci95: tuple[float, float]) -> bool:
+    """Whether the interval needs both ends to be told: not symmetric, or without an end."""
+    below, above = _sides(value, ci95)
+    if not (math.isfinite(below) and math.isfinite(above)):
+        return True
+    return abs(above - below) > max(LOPSIDED * max(above, below), ROUNDING * abs(value))
+
+
+def any_lopsided(found: Iterable[Estimate | Combination]) -> bool:
+    return any(
+        e.value is not None and e.ci95 is not None and is_lopsided(e.value, e.ci95) for e in found
+    )
+
+
+def half_head(lopsided: bool) -> str:
+    """Head of the column of intervals, which only says "±" where all are symmetric."""
+    return "95 %" if lopsided else "± 95 %"
+
+
+def signed_half(half: str) -> str:
+    """ "± 0.013", but the ends of a lopsided interval as they are."""
+    return half if half.startswith(("[", "–")) else f"± {half}"
+
+
+def bar_from_truth(value: float, ci95: tuple[float, float], true: float) -> Bar | None:
+    """The interval beside the true value; one scale for all bars, in half widths.
+
+    An interval without one end is scaled by its other side and reaches the end of the bar.
+    """
+    half = (ci95[1] - ci95[0]) / 2
+    if not math.isfinite(half):
+        half = max((side for side in _sides(value, ci95) if math.isfinite(side)), default=0.0)
+    return _bar_on(value, ci95, true, TRUTH_REACH * half)
+
+
+def bar_from_nominal(value: float, ci95: tuple[float, float], nominal: float) -> Bar | None:
+    """The interval beside the nominal value, on a scale of its own."""
+    far = [abs(x - nominal) for x in (value, *ci95) if math.isfinite(x)]
+    return _bar_on(value, ci95, nominal, 1.05 * max(far))
+
+
+def _sides(value: float, ci95: tuple[float, float]) -> tuple[float, float]:
+    return value - ci95[0], ci95[1] - value
+
+
+def _bar_on(value: float, ci95: tuple[float, float], middle: float, reach: float) -> Bar | None:
+    """The bar that shows `reach` to either side of the `middle`; None where nothing has an end."""
+    if not reach > 0 or not any(math.isfinite(end) for end in ci95):
+        return None
+
+    def place(x: float) -> float:
+        offset = (x - middle) / reach * HALF_LENGTH
+        return round(MIDDLE + min(max(offset, -HALF_LENGTH), HALF_LENGTH), 1)
+
+    return Bar(place(ci95[0]), place(ci95[1]), place(value))
+
+
+def _bar(
+    e: Estimate | Combination, true: float | None, nominal: float | None, compared: bool
+) -> Bar | None:
+    if e.value is None or e.ci95 is None:
+        return None
+    if compared:
+        return None if true is None else bar_from_truth(e.value, e.ci95, true)
+    return None if nominal is None else bar_from_nominal(e.value, e.ci95, nominal)
+
+
+# Sections of the page, by the finding they tell of, and the words that they are named after.
+SECTIONS = {
+    "faulty_readings": ("beyond the noise", "Faulty readings"),
+    "undetermined": ("from these data", "What is not determined"),
+}
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """`tone`: good (use it), care (use it knowing what is wrong), poor (do not use it)."""
+
+    tone: Tone
+    headline: str
+    steps: tuple[str, ...]
+
+
+def judgement(result: Calibration, sections: bool = False) -> Judgement:
+    """How good the calibration is and what follows from it, as the result's findings say.
+
+    `sections`: the steps name the sections of the page.
+    """
+    steps = tuple(_step(f, sections) for f in next_steps(result))
+    trust = result.finding("trust")
+    assert trust is not None, "every identification is judged"
+    if trust.severity == "poor":
+        why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
+        return Judgement("poor", f"Do not use this calibration: {DOUBTS[why.kind](why)}.", steps)
+    told = _accuracy(result)
+    if trust.severity == "care":
+        doubts = [f for f in result.findings if f.severity == "care" and f is not trust]
+        named = "; and ".join(DOUBTS[f.kind](f) for f in doubts)
+        text = f"Use this calibration with care: {told}, but {named}."
+        return Judgement("care", text, steps)
+    compared = result.finding("residual_agrees_with_stated_noise", "residual_below_stated_noise")
+    noise = "" if compared is None else ", and the residual is noise"
+    return Judgement("good", f"This calibration can be trusted: {told}{noise}.", steps)
+
+
+def _step(f: Finding, sections: bool) -> str:
+    if not sections or f.kind not in SECTIONS:
+        return f.remedy
+    phrase, section = SECTIONS[f.kind]
+    return f.remedy.replace(phrase, f"{phrase} ({section})", 1)
+
+
+def _length(f: Finding, name: str) -> str:
+    return length(f.number(name) * 1e-6)
+
+
+# What speaks against a calibration, in words.
+DOUBTS: dict[str, Callable[[Finding], str]] = {
+    "not_converged": lambda f: f"the fit did not converge ({f.numbers['reason']})",
+    "no_better_than_nominal": lambda f: (
+        f"unseen poses are predicted to {_length(f, 'heldout_rms_um')} rms, and the nominal arm "
+        f"does as well ({_length(f, 'nominal_rms_um')})"
+    ),
+    "not_held_out": lambda f: (
+        "how well it predicts other poses is not known: some pose alone determines a parameter"
+    ),
+    "residual_above_stated_noise": lambda f: (
+        f"the residual is {significant(f.number('ratio'))} times the stated noise"
+    ),
+    "lack_of_fit": lambda f: "configurations scatter more than repeats of one explain",
+    "fit_flatters": lambda f: (
+        f"unseen poses are worse than fitted ones ({_length(f, 'residual_rms_um')})"
+    ),
+    "little_gain": lambda f: "that is hardly better than the nominal arm",
+    "many_faulty_readings": lambda f: (
+        f"{f.numbers['faulty']} of the {f.numbers['fitted']} readings fitted lie beyond what the "
+        "noise explains"
+    ),
+    "test_data_worse": lambda f: (
+        f"test data are off by {_length(f, 'test_rms_um')} rms, more than chance explains"
+    ),
+}
+
+
+def _accuracy(result: Calibration) -> str:
+    what = {"deflection": "deflections", "distance": "distances"}.get(
+        result.observations.kind, "positions"
+    )
+    if not math.isfinite(result.heldout_rms):
+        return f"it reproduces the {what} that were fitted to {length(result.residual_rms)} rms"
+    text = f"{what} in poses that were not fitted are predicted to {length(result.heldout_rms)} rms"
+    gain = result.nominal_rms / result.heldout_rms if result.heldout_rms > 0 else math.inf
+    if math.isfinite(gain):
+        text += f", {significant(gain, 2)} times better than by the nominal arm"
+    return text

@@ -1,0 +1,486 @@
+"""How the numbers came about, in words: method, intervals, noise, faulty readings."""
+
+from __future__ import annotations
+
+import math
+from statistics import median
+
+import numpy as np
+
+from elastocal.identification.constrained.minimise import ActiveConstraint
+from elastocal.identification.findings import shape_of
+from elastocal.identification.noise_summary import Noise, NoiseSize
+from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
+from elastocal.identification.result import Calibration
+from elastocal.identification.robust.report import FaultyGroup
+from elastocal.identification.variance.choose import SHARED
+from elastocal.identification.variance.structure import REGISTERED
+from elastocal.report.formatting import display, length, plain, printable, significant
+from elastocal.tracker_noise import available_noise
+
+MOST_NAMED = 6
+MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
+METHODS = {
+    "reml": "generalised least squares, weights estimated by restricted likelihood (REML)",
+    "ols": "ordinary least squares, all readings weighted alike",
+    "wls": "weighted least squares",
+    "eq14": "weighted least squares as published, weights of eq. (14) with σ by group, iterated",
+    "eq14-residual": (
+        "weighted least squares as published, weights of eq. (14) from each residual, iterated; "
+        "it acts like a robust fit, and its stated intervals are far too narrow"
+    ),
+    "huber": "robust M-estimate with Huber's loss, which limits the pull of far readings",
+    "tukey": "robust MM-estimate with Tukey's biweight, which gives far readings no weight at all",
+    "l1": "least sum of residual lengths (L1), the robust relative of the median",
+    "student-t": "maximum likelihood under Student-t noise, which expects some far readings",
+}
+# What the weights are is said by the method itself, or by the line on the noise model.
+SAID = {"reml", "ols", "eq14", "eq14-residual"}
+INTERVALS = {
+    "kenward-roger": (
+        "t intervals of Kenward and Roger, which count with the weights being estimated; they "
+        "assume the noise model and normal noise"
+    ),
+    "classical": (
+        "t intervals that take the readings for independent (after weighting) and the size of the "
+        "noise from the residual, also where it was stated"
+    ),
+    "clustered": (
+        "robust to correlation within a configuration; they assume independent configurations"
+    ),
+    "wild": (
+        "wild cluster bootstrap over configurations; assumes only that these are independent, "
+        "not equal or normal noise"
+    ),
+    "bootstrap": (
+        "parametric bootstrap: noise drawn from the model and everything estimated anew; assumes "
+        "the noise model, not that estimates are normal"
+    ),
+    "profile": (
+        "profile of the sum of squares, which follows the curvature of the model and may be "
+        "lopsided; assumes independent normal noise"
+    ),
+    "t under constraints": (
+        "t intervals that take equalities for exact and end at bounds; no bound is active, and "
+        "they assume the noise of the method"
+    ),
+    "posterior": (
+        "t intervals of readings and prior together, ending at bounds; they take the prior at its "
+        "word and assume the noise of the method"
+    ),
+    "constrained profile": (
+        "profile of the fit under the constraints: one-sided at a bound, and too wide rather than "
+        "too narrow near one; assumes normal noise"
+    ),
+    "constrained bootstrap": (
+        "parametric bootstrap of the fit under the constraints: noise drawn from the model, its "
+        "size taken for known, and fitted anew; assumes the noise model"
+    ),
+    "eq7": "as published, eq. (7): equal, independent noise of the residual's size",
+    "eq8": "as published, eq. (8): independent noise whose σ are taken for known",
+    "eq11": "as published, eq. (11): independent noise whose σ are taken for known",
+    "eq13": (
+        "as published, eq. (13): weights taken for known although they come from the same "
+        "residuals, which makes the intervals too narrow"
+    ),
+}
+HC = (
+    "robust to unequal noise ({}): every reading may have a variance of its own; they assume "
+    "independent readings"
+)
+CR = (
+    "cluster-robust ({}): readings of a configuration may be correlated in any way; they assume "
+    "independent configurations"
+)
+# Without correction for leverage: right in the limit of many rows or configurations.
+LARGE = {
+    "hc0": "that these are many",
+    "hc1": "that these are many",
+    "cr0": "that these are many",
+    "cr1": "that these are many, ten or more per parameter",
+}
+SIGNS = {"lower": "≥", "upper": "≤", "equality": "="}
+HELD = {
+    "constrained profile": (
+        "Intervals keep the constraints: they stop at bounds and take equalities for exact"
+    ),
+    "constrained bootstrap": "Intervals come from fits that keep the constraints too",
+}
+ROBUST = "asymptotic covariance of the robust estimate ({}); assumes independent readings"
+
+
+def method_of(result: Calibration) -> str:
+    return str(result.method).replace("_", "-")
+
+
+def method_and_weights(result: Calibration) -> str:
+    """The method, and the weights where the method does not say them."""
+    method, noise = method_of(result), result.noise
+    if method == "constrained":
+        return _constrained(result)
+    text = METHODS.get(method, printable(method))
+    if method in SAID or noise.kind == "none":
+        return text
+    return f"{text}, {printable(noise.description)}"
+
+
+def _constrained(result: Calibration) -> str:
+    """What was known besides the readings, and the weights that the method before it gave these."""
+    prior, active = bool(result.prior_share), bool(result.active)
+    text = "fit with a prior" if prior else "fit under constraints"
+    text += " and under constraints" if prior and active else ""
+    noise = result.noise
+    if noise.kind == "none":
+        return f"{text}, all readings weighted alike"
+    how = "weights estimated by restricted likelihood (REML): " if noise.estimated else ""
+    return f"{text}, {how}{printable(noise.description)}"
+
+
+def interval_kind(result: Calibration) -> str:
+    return result.noise.interval_kind.lower()
+
+
+def intervals_line(result: Calibration) -> str:
+    """Which kind of interval, and what it assumes."""
+    kind = interval_kind(result)
+    if kind in INTERVALS:
+        return INTERVALS[kind]
+    if kind.startswith(("hc", "cr")):
+        text = (HC if kind.startswith("hc") else CR).format(printable(kind.upper()))
+        return f"{text} and {LARGE[kind]}" if kind in LARGE else text
+    if kind in ("h1", "h2", "h3"):
+        return ROBUST.format(kind.upper())
+    description = result.noise.interval_description
+    return printable(f"{kind}: {description}" if description else kind)
+
+
+def constraints_line(result: Calibration) -> str | None:
+    """Which constraints hold with equality, and what the intervals make of them."""
+    active = result.active
+    if not active:
+        return None
+    units = {p.name: p.unit for p in result.model.parameters}
+    texts = [_in_words(a, units) for a in active[:MOST_NAMED]]
+    more = len(active) - len(texts)
+    text = "; ".join([*texts, *([f"and {more} more"] if more else [])])
+    bound = any(a.kind != "equality" for a in active)
+    want = "; the readings alone would go beyond the bounds" if bound else ""
+    held = HELD.get(interval_kind(result), "Intervals take these for exact")
+    return f"Active: {text}. {held}{want}."
+
+
+def _in_words(a: ActiveConstraint, units: dict[str, str]) -> str:
+    """ "joint2.compliance ≥ 0 µrad/(N·m)"; a label of the user's own stays as it is."""
+    label = printable(a.label)
+    if a.kind == "semidefinite":
+        return f"{label} (semidefinite)"
+    own = a.kind == "equality" and a.label != f"{a.names[0]} = {a.value:.6g}"
+    if len(a.names) != 1 or own or a.names[0] not in units:
+        return label
+    value, unit = display(a.value, units[a.names[0]])
+    return f"{printable(a.names[0])} {SIGNS[a.kind]} {plain(value)} {unit}"
+
+
+def prior_line(result: Calibration) -> str | None:
+    """Parameters that owe more than half of their information to the prior."""
+    shares = result.prior_share
+    if not shares:
+        return None
+    mostly = sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n])
+    if not mostly:
+        largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
+        return f"No estimate is mostly prior (largest share {_percent(largest)})."
+    named = ", ".join(f"{printable(n)} {_percent(shares[n])}" for n in mostly[:MOST_NAMED])
+    more = len(mostly) - MOST_NAMED
+    text = f"Mostly prior, share of the information: {named}" + (
+        f", and {more} more" if more > 0 else ""
+    )
+    return f"{text}. These data say little about them; poses that load them more would."
+
+
+def _percent(share: float) -> str:
+    """Never 100 % where the data say anything."""
+    return f"{min(100 * share, 99.9):.3g} %" if share < 1 else "100 %"
+
+
+FEW = 6  # sizes that are named one by one; of more, the range and the extremes
+MOST_GROUPS = 4
+TURNED = ("rx", "ry", "rz", "rotation", "angular")  # sizes in rad
+KINDS = {
+    "independent": "equal noise",
+    "axis": "one size per axis",
+    "marker": "one size per marker",
+    "groups": "one size per configuration and direction",
+    "polar": "range and transverse sizes of the tracker",
+    "stated": "stated noise × factor",
+}
+COMPARED = (
+    "residual_above_stated_noise",
+    "residual_agrees_with_stated_noise",
+    "residual_below_stated_noise",
+)
+SHAPES = {
+    "residuals_skew": "errors lean to one side, as an effect that the model lacks would make them.",
+    "residuals_heavy_tailed": (
+        "far readings are more frequent. A robust method (huber, tukey, student-t) shows "
+        "whether the estimates depend on them."
+    ),
+    "residuals_light_tailed": "far readings are rarer, as with rounded or selected readings.",
+}
+
+
+def does_noise_explain_it(result: Calibration) -> str:
+    """Residual against stated noise, as the finding has it."""
+    f = result.finding(*COMPARED)
+    if f is None:
+        sigma, method = result.noise.sigma, method_of(result)
+        size = ""
+        if sigma is not None and method == "ols":
+            size = f"; the residual amounts to {length(sigma)} per coordinate"
+        elif _is_estimated(result):
+            size = "; the size of the noise was estimated from the readings"
+        return f"{_why_not_judged(result)}{size}."
+    size = (
+        f"{significant(f.number('ratio'))} times the stated noise; chance alone gives "
+        f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
+    )
+    if f.kind == "residual_agrees_with_stated_noise":
+        return f"The residual agrees with the stated noise ({size})."
+    if f.kind == "residual_above_stated_noise":
+        text = (
+            f"The residual is larger than the stated noise explains ({size}): something is "
+            "unmodelled, or the noise is larger than stated."
+        )
+    else:
+        text = f"The residual is smaller than the stated noise ({size}): it was stated too large."
+    if _is_estimated(result):
+        text += " Weights and intervals follow the noise that the readings show."
+    return text
+
+
+def _is_estimated(result: Calibration) -> bool:
+    """Whether the weights come from a noise model with estimated variances."""
+    return method_of(result) in ("reml", "constrained") and result.noise.estimated
+
+
+def _why_not_judged(result: Calibration) -> str:
+    """What is missing for a comparison of the residual with stated noise."""
+    seen, tracker = result.observations, result.model.cell.tracker
+    stated = available_noise(seen.table, tracker) != "none"
+    if seen.kind == "distance":
+        stated = tracker.distance_sigma is not None
+    nothing_says = "so nothing says how small the residual should be"
+    if seen.kind == "pose" and stated != (tracker.rotation_sigma is not None):
+        which = "positions" if stated else "rotations"
+        return f"Noise was stated for {which} only, {nothing_says}"
+    if stated or result.noise.kind == "covariance":
+        return "The residual was not compared with the stated noise"
+    return f"No noise was stated, {nothing_says}"
+
+
+def noise_model_line(result: Calibration) -> str | None:
+    """The estimated noise model with its sizes, and why it was chosen."""
+    noise = result.noise
+    sizes, reason = size_rows(noise), noise.reason
+    if not sizes and not reason:
+        return None
+    text = printable(noise.description)
+    text = text[:1].upper() + text[1:]
+    if sizes:
+        text += ": " + "; ".join(f"{name} {size}" for name, size in sizes)
+    candidates = candidate_rows(noise)
+    if len(candidates) > 1:
+        second, _, gap = candidates[1]
+        n = len(candidates)
+        reason = f"smallest information criterion of {n} models, next {second} (+{gap})"
+    return f"{text}. Chosen: {printable(reason)}." if reason else f"{text}."
+
+
+def size_rows(noise: Noise) -> list[tuple[str, str]]:
+    """Name and standard deviation of every noise component; of many, the two extremes."""
+    sizes = noise.sizes or ()
+    shared = [s for s in sizes if s.shared]
+    own = [s for s in sizes if not s.shared]
+    if len(own) <= FEW:
+        return [(printable(s.name), _size(s)) for s in [*own, *shared]]
+    ordered = sorted(own, key=_number)
+    middle = ordered[len(ordered) // 2]
+    named = [("smallest", ordered[0]), ("largest", ordered[-1])]
+    return [
+        (f"median of {len(own)}", _size(middle)),
+        *((f"{which} ({printable(s.name)})", _size(s)) for which, s in named),
+        *((printable(s.name), _size(s)) for s in shared),
+    ]
+
+
+def candidate_rows(noise: Noise) -> list[tuple[str, str, str]]:
+    """Noise models that were tried, best first: words, variances, criterion above the best."""
+    tried = sorted(noise.tried or (), key=lambda t: t.criterion)
+    return [
+        (
+            kind_in_words(t.kind),
+            str(t.n_variances),
+            f"{t.criterion - tried[0].criterion:.1f}",
+        )
+        for t in tried
+    ]
+
+
+def kind_in_words(kind: str) -> str:
+    own = kind.removesuffix(SHARED)
+    known = KINDS | {name: model.description for name, model in REGISTERED.items()}
+    text = printable(known.get(own, own))
+    return f"{text} + deviations of a configuration" if kind.endswith(SHARED) else text
+
+
+def repeats_line(result: Calibration) -> str | None:
+    """The lack-of-fit test, and what follows from it for the intervals; None without repeats."""
+    f = result.finding("lack_of_fit", "repeats_agree")
+    if f is None:
+        return None
+    numbers = (
+        f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
+        f"{f.numbers['dof_pure']} degrees of freedom, {_p(f.number('p'))}"
+    )
+    counted = f.numbers["counted_by"]
+    if f.kind == "repeats_agree":
+        text = f"Repeats agree with the scatter between configurations ({numbers})"
+        if counted == "the noise model":
+            return (
+                f"{text}: the test shows no common deviation. The noise model, chosen by its "
+                "criterion, has one; the intervals include it."
+            )
+        return f"{text}: readings of one configuration bear no common deviation worth counting."
+    text = (
+        f"Configurations scatter more than repeats of one explain ({numbers}): the arm does not "
+        "come back to the same place, or an effect is missing."
+    )
+    if counted == "the noise model":
+        return f"{text} The noise model has this common deviation; the intervals include it."
+    if counted == "the intervals":
+        return f"{text} The intervals take each configuration as a whole and include it."
+    return (
+        f"{text} The intervals do not include it and are too narrow: use the default method, whose "
+        "noise model has it, or intervals by cr2; measure more configurations, not more repeats."
+    )
+
+
+def shape_line(summary: ResidualSummary) -> str:
+    """Are the standardised residuals normal, and does any group scatter unlike the model?"""
+    f = shape_of(summary)
+    numbers = (
+        f"skewness {f.number('skewness'):+.2f}, excess kurtosis {f.number('excess_kurtosis'):+.2f}"
+    )
+    if f.kind == "residuals_too_few":
+        text = f"Too few values to judge whether residuals are normal ({numbers})."
+    elif f.kind == "residuals_normal":
+        numbers += f", {_p(f.number('p'))}"
+        text = f"Standardised residuals agree with a normal distribution ({numbers})."
+    else:
+        numbers += f", {_p(f.number('p'))}"
+        text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
+    found = sum(g.n_deviating for g in summary.groupings)
+    if not found:
+        return f"{text} No group of readings scatters more or less than the noise model says."
+    named = [f"{group_name(by, g)} {ratio(g)} times" for by, g in summary.deviating[:MOST_GROUPS]]
+    more = found - len(named)
+    tail = f", and {more} more" if more else ""
+    return f"{text} Scatter unlike the noise model: {', '.join(named)}{tail}."
+
+
+def group_name(by: str, group: GroupSummary) -> str:
+    return f"{by} {printable(group.name)}"
+
+
+def ratio(group: GroupSummary) -> str:
+    """Observed over expected standard deviation."""
+    return significant(float(np.sqrt(group.mean_square)), 2)
+
+
+def _size(s: NoiseSize) -> str:
+    if s.sigma is None:
+        return significant(_number(s))
+    if s.name in TURNED or s.name.endswith("(rotation)"):
+        return f"{significant(s.sigma * 1e6)} µrad"
+    return length(s.sigma)
+
+
+def _number(s: NoiseSize) -> float:
+    return (s.factor or 0.0) if s.sigma is None else s.sigma
+
+
+def _p(p: float) -> str:
+    return "p < 1e-6" if p < 1e-6 else f"p = {significant(p, 2)}"
+
+
+MOST_TOLD = 3  # in the terminal's summary
+FULL_WEIGHT = ("reml", "ols", "wls", "eq14")  # methods that let far readings bend the fit
+PLACE = {
+    "block": "Block of lines {}",
+    "marker": "Marker {}",
+    "configuration": "Configuration {}",
+}
+
+
+def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
+    """A sentence per group of readings beyond the noise, the largest first; of more, how many."""
+    report = result.faulty_report
+    groups = [] if report is None else [f for f in report.findings if f.level != "reading"]
+    lines = [_sentence(result, finding) for finding in groups[:most]]
+    more = len(groups) - len(lines)
+    return [*lines, f"And {more} more."] if more else lines
+
+
+def false_alarm_line(result: Calibration) -> str | None:
+    """How often the search would accuse readings of a table in which nothing is wrong."""
+    report = result.faulty_report
+    if report is None or not fault_lines(result):
+        return None
+    share = 100 * report.false_alarm
+    return f"Of tables in which nothing is wrong, at most {share:g} % would yield any finding."
+
+
+def _sentence(result: Calibration, finding: FaultyGroup) -> str:
+    n, beyond = len(finding.lines), finding.beyond
+    how = "err in common by" if finding.pattern == "common" else "scatter by"
+    size, noise = _metres(result, finding), f"{significant(finding.sigmas, 2)} times the noise"
+    text = f"{PLACE[finding.level].format(printable(finding.name))}: {n} readings {how} "
+    text += noise if size is None else f"{length(size)} ({noise})"
+    if beyond < n:
+        text += f", {beyond or 'none'} of them beyond the noise alone"
+    return f"{text}{_influence(result, finding)}."
+
+
+def _metres(result: Calibration, finding: FaultyGroup) -> float | None:
+    """Typical error in m, None where most of the readings are not listed one by one.
+
+    The median where they err in common, which those that do not leave alone; else the rms.  Where
+    they bend the fit, the listed errors are smaller than those found.  Of a pose the list has the
+    position's error only, and the finding may be one of rotation.
+    """
+    if result.observations.kind == "pose" or _bends(result, finding):
+        return None
+    lines = set(finding.lines)
+    listed = [o.residual for o in result.faulty if o.line in lines]
+    if not listed or 2 * len(listed) < len(lines):
+        return None
+    if finding.pattern == "common":
+        return median(listed)
+    return math.sqrt(sum(r * r for r in listed) / len(listed))
+
+
+def _influence(result: Calibration, finding: FaultyGroup) -> str:
+    """What they do, or would do if fitted along, to the parameter that they move most."""
+    names = () if result.faulty_report is None else result.faulty_report.names
+    name = printable(names[finding.column]) if names else "a parameter"
+    if not math.isfinite(finding.influence):
+        return f"; the other readings leave {name} undetermined"
+    how = "in the fit they move" if _bends(result, finding) else "fitted along they would move"
+    count = significant(finding.influence, 2)
+    return f"; {how} {name} by {count} standard deviation{'' if count == '1.0' else 's'}"
+
+
+def _bends(result: Calibration, finding: FaultyGroup) -> bool:
+    """Whether the readings have their full weight in the fit."""
+    apart = {o.line for o in result.excluded} & set(finding.lines)
+    return method_of(result) in FULL_WEIGHT and not apart

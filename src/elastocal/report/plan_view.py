@@ -1,0 +1,279 @@
+"""What a measurement plan says: its rows and its sentences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from elastocal.design.plan import Plan
+from elastocal.design.reasons import Predicted, Reason
+from elastocal.errors import option
+from elastocal.planning.criteria import CRITERIA
+from elastocal.report.formatting import TextTable, Tone, counted, display, printable, significant
+
+TOLD = 2  # parameters that a pose serves, in the table
+SERVES = "serves (standard deviation without it)"
+
+
+def joint_text(value: float, kind: str, decimals: int = 2) -> str:
+    """A joint's position in ° or mm."""
+    return f"{np.degrees(value) if kind == 'revolute' else value * 1e3:.{decimals}f}"
+
+
+def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> TextTable:
+    """Joint values, load, place in the order of execution, and what the pose is there for."""
+    kinds = plan.model.chain.kinds
+    loads = len(plan.forces) > 1 and bool((plan.load >= 0).any())
+    heads = ["pose"]
+    heads += [f"q{i + 1} {'°' if kind == 'revolute' else 'mm'}" for i, kind in enumerate(kinds)]
+    heads += [*(["load N"] if loads else []), "order", *([SERVES] if reasons else [])]
+    order = first_stops(plan)
+    rows: list[tuple[str, ...]] = []
+    for k, reason in enumerate(plan.reasons):
+        row = [plan.configurations[k]]
+        row += [joint_text(v, kind, decimals) for v, kind in zip(plan.q[k], kinds, strict=True)]
+        if loads:
+            row.append(force_text(plan, int(plan.load[k])))
+        rows.append((*row, str(order[k]), *([served(reason)] if reasons else [])))
+    return TextTable(tuple(heads), rows, (len(heads) - 1,) if reasons else ())
+
+
+def first_stops(plan: Plan) -> dict[int, int]:
+    """Pose → its first place in the order of execution, from 1."""
+    return {stop.pose: k + 1 for k, stop in reversed(list(enumerate(plan.execution.stops)))}
+
+
+def force_text(plan: Plan, load: int) -> str:
+    return " ".join(f"{f:g}" for f in plan.forces[load])
+
+
+def reason_rows(plan: Plan) -> TextTable:
+    """What each pose is there for."""
+    rows: list[tuple[str, ...]] = [
+        (name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)
+    ]
+    return TextTable(("pose", SERVES), rows, (1,))
+
+
+def served(reason: Reason) -> str:
+    """The parameters that a pose serves most: "joint3.compliance +38 %"."""
+    parts = [
+        f"{printable(name)} {'lost' if math.isinf(growth) else f'+{100 * (growth - 1):.0f} %'}"
+        for name, growth in reason.serves[:TOLD]
+    ]
+    return ", ".join(parts) or "all a little"
+
+
+def interval_rows(plan: Plan) -> TextTable:
+    """Predicted half widths of the 95 % intervals."""
+    combined = any(p.combined_with for p in plan.predicted)
+    rows: list[tuple[str, ...]] = []
+    for p in plan.predicted:
+        shown, unit = display(p.half_width, p.unit)
+        row = (printable(p.name), significant(shown, 2), unit)
+        rows.append((*row, _partners(p)) if combined else row)
+    heads = ("parameter", "± 95 %", "unit")
+    return TextTable((*heads, "together with") if combined else heads, rows, (0, 2, 3))
+
+
+def _partners(p: Predicted) -> str:
+    names = [printable(name) for name in p.combined_with]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def curve_rows(plan: Plan) -> TextTable:
+    """The criterion against the number of poses."""
+    heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
+    rows: list[tuple[str, ...]] = [
+        (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
+        for s in plan.curve
+    ]
+    return TextTable(heads, rows, ())
+
+
+def removal_rows(plan: Plan) -> TextTable:
+    """Which rule of the cell removed how many candidates, the hardest rule first."""
+    c = plan.candidates
+    removed = sorted(c.removed_by.items(), key=lambda item: -item[1])
+    rows: list[tuple[str, ...]] = [
+        (name.replace("_", " "), str(n), f"{100 * n / max(c.tried, 1):.1f} %")
+        for name, n in removed
+        if n
+    ]
+    rows.append(("feasible", str(c.feasible), f"{100 * c.feasible / max(c.tried, 1):.1f} %"))
+    return TextTable(("rule", "candidates", "share"), rows)
+
+
+def stop_rows(plan: Plan) -> TextTable:
+    """The stops in the order of execution: pose, load, how it is reached, what it takes."""
+    kinds = plan.model.chain.kinds
+    rows: list[tuple[str, ...]] = []
+    for k, stop in enumerate(plan.execution.stops):
+        rows.append(
+            (
+                str(k + 1),
+                plan.configurations[stop.pose],
+                force_text(plan, stop.load),
+                "by hand" if stop.change_after is not None else "",
+                str(len(stop.via)),
+                f"{stop.travel:.1f}",
+                *(joint_text(v, kind) for v, kind in zip(stop.q, kinds, strict=True)),
+            )
+        )
+    joints = tuple(f"q{i + 1} {'°' if k == 'revolute' else 'mm'}" for i, k in enumerate(kinds))
+    heads = ("stop", "pose", "load N", "load change", "points in between", "travel s", *joints)
+    return TextTable(heads, rows, (2, 3))
+
+
+CLOSE = 0.95  # efficiency from which a plan is called near the best
+
+
+def plan_lead(plan: Plan) -> str:
+    n, forces = len(plan.q), len(plan.forces)
+    readings = f"{counted(n, 'pose')}, {counted(forces, 'load state')}"
+    return f"{readings}, {counted(len(plan.model.cell.tool.markers), 'marker')}"
+
+
+def plan_headline(plan: Plan) -> str:
+    """What the plan is worth and how far from the best it is, in one sentence."""
+    n = counted(len(plan.q), "pose")
+    if plan.criterion == "test_pose":
+        text = (
+            f"{n} leave a position error of ρ₀ = {plan.reported:.3g} µm rms at the test poses "
+            "after compensation"
+        )
+    else:
+        text = f"{n} reach {plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
+    found = plan.certificate.efficiency_pool
+    if found is None:
+        return f"{text}; how far that is from the best, no bound says."
+    away = 100 * (1 - found)
+    text += "; no plan from these candidates is "
+    text += "better" if away < 0.05 else f"more than {away:.1f} % better"
+    if (beyond := _beyond(plan)) is not None:
+        return f"{text} (certified), but poses between them may be, by up to {beyond:.0f} %."
+    return f"{text} (certified)."
+
+
+def _beyond(plan: Plan) -> float | None:
+    """How much better (%) a plan from all of the joint space may be, where that is much."""
+    found = plan.certificate.efficiency_continuum
+    return None if found is None or found >= CLOSE else 100 * (1 - found)
+
+
+def plan_tone(plan: Plan) -> Tone:
+    found = plan.certificate.efficiency_pool
+    close = found is not None and found >= CLOSE and _beyond(plan) is None
+    return "good" if close and not plan.warnings else "care"
+
+
+def plan_steps(plan: Plan) -> list[str]:
+    steps = ["Measure the poses in the order given: it is short, and every move was checked."]
+    if plan.criterion == "test_pose":
+        steps.append(
+            f"If ρ₀ is not small enough: {option('target')} finds the fewest poses that reach a "
+            f"value, {option('curve')} compares numbers of poses."
+        )
+    if _beyond(plan) is not None:
+        steps.append(
+            f"For a better plan: more {option('candidates')}, or {option('effort', 'thorough')}, "
+            "which polishes poses between them."
+        )
+    together = sum(bool(p.combined_with) for p in plan.predicted)
+    if together:
+        steps.append(
+            f"{counted(together, 'parameter')} will be known only together with others: more "
+            "markers or load states separate them, more poses like these do not."
+        )
+    steps.append("Then: elastocal identify with the same cell and the measurements.")
+    return steps
+
+
+def plan_lines(plan: Plan) -> list[tuple[str, str]]:
+    """What the plan is worth, as (label, sentence)."""
+    lines = [_criterion_line(plan), *_chance_lines(plan), _candidate_line(plan)]
+    lines += _certificate_lines(plan)
+    lines.append(_execution_line(plan))
+    if plan.polished:
+        text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
+        lines.append(("Polish", f"{text} candidates."))
+    return lines + [("Warning", printable(text)) for text in plan.warnings]
+
+
+def _criterion_line(plan: Plan) -> tuple[str, str]:
+    if plan.criterion == "test_pose":
+        return "Criterion", (
+            f"ρ₀ = {plan.reported:.4g} µm, the rms position error that remains at the test poses "
+            f"after compensation ({printable(plan.targets)})."
+        )
+    return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+
+
+def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
+    """What as many random poses would have given."""
+    c = plan.chance
+    if c is None:
+        return []
+    whole = f"{c.drawn} random plans of as many feasible poses"
+    open_ = c.drawn - c.determined
+    lost = f"{open_} of {whole} leave parameters open that this plan determines"
+    if c.median is None or c.best is None:
+        return [("Chance", f"{lost}.")]
+    name = "ρ₀" if plan.criterion == "test_pose" else plan.criterion
+    unit = f" {plan.unit}" if plan.unit else ""
+    worst = "no value" if c.worst is None else f"{c.worst:.4g}"
+    text = (
+        f"the median of {whole} has {name} = {c.median:.4g}{unit} (best {c.best:.4g}, worst "
+        f"{worst})"
+    )
+    if c.efficiency is not None:
+        text += f", an efficiency of {c.efficiency:.2f} against this plan"
+    return [("Chance", f"{text}; {lost}." if open_ else f"{text}.")]
+
+
+def _candidate_line(plan: Plan) -> tuple[str, str]:
+    c = plan.candidates
+    removed = sorted(c.removed_by.items(), key=lambda item: -item[1])
+    told = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in removed if n)
+    text = f"{c.feasible} feasible of {c.tried} tried"
+    return "Candidates", text + (f"; removed by {told}." if told else "; no rule removed any.")
+
+
+def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
+    c = plan.certificate
+    if c.efficiency_pool is None:
+        reason = CRITERIA[plan.criterion].without_bound
+        return [("Certificate", f"none: {plan.criterion} {reason}, so no bound is known.")]
+    told = "" if plan.bound_reported is None else f" (bound {plan.bound_reported:.4g} {plan.unit})"
+    lines = [
+        (
+            "Certificate",
+            f"certified on the pool: efficiency {c.efficiency_pool:.4f} against the best plan "
+            f"of these shares from {c.pool} candidates{told.replace(' )', ')')}.",
+        )
+    ]
+    if c.efficiency_continuum is not None:
+        lines.append(
+            (
+                "Certificate",
+                f"estimated on the continuum: efficiency {c.efficiency_continuum:.4f}, after "
+                f"{c.searched} more poses and {c.ascents} local searches; a better pose may "
+                "have been missed.",
+            )
+        )
+    return lines
+
+
+def _execution_line(plan: Plan) -> tuple[str, str]:
+    e = plan.execution
+    stops, changes = len(e.stops), e.load_changes
+    text = f"{stops} stops, {e.travel:.0f} s of travel"
+    if e.gap > 5e-4:
+        text += f" (at most {100 * e.gap:.1f} % above the shortest order)"
+    if changes:
+        text += f", {changes} load change{'s' if changes > 1 else ''} by hand"
+    via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
+    if via:
+        text += f", {via} points in between to get around obstacles"
+    return "Execution", f"{text}, {e.total / 60:.0f} min in all; every move checked."

@@ -1,0 +1,453 @@
+"""The figures of the identification report, each an SVG element."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from elastocal.identification.error_budget import ErrorBudget
+from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
+from elastocal.identification.result import Calibration
+from elastocal.manipulator.observation import Observations
+from elastocal.report.arm_view import Space
+from elastocal.report.figures import FAINT, INK, SERIES, dots, drawn
+from elastocal.report.formatting import length, short_name, significant
+from elastocal.report.identification_view import rms_by_kind
+from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH = 9.9
+MOST_LABELS = 30
+MOST_JOINT_DOTS = 2000  # per joint; the running mean uses every reading
+
+
+def by_configuration(residuals: Residuals) -> str:
+    """Residual of every reading over its configuration, a panel per direction."""
+    n = len(residuals.components)
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
+        for k, axes in enumerate(panels):
+            _configuration_panel(axes, residuals, k)
+        panels[-1].set_xlabel("configuration")
+        every = range(0, len(residuals.labels), -(-len(residuals.labels) // MOST_LABELS))
+        names = [short_name(residuals.labels[i]) for i in every]
+        turn = 90 if max(map(len, names)) > 3 else 0
+        panels[-1].set_xticks(list(every), names, rotation=turn)
+        if 1 < len(residuals.markers) <= len(SERIES):
+            figure.legend(
+                *panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=6
+            )
+
+    return drawn(draw, WIDTH, 0.6 + 1.5 * n, "Residuals by configuration, marker and direction")
+
+
+def _configuration_panel(axes: Axes, residuals: Residuals, k: int) -> None:
+    many = len(residuals.markers)
+    values = residuals.value[:, k]
+    size = 2.6 if len(residuals.shown) <= 1500 else 1.6
+    shift = 0.6 * (np.arange(many) - (many - 1) / 2) / many
+    axes.axhline(0, color=FAINT, linewidth=0.8)
+    if many > len(SERIES):
+        at = residuals.shown
+        x = residuals.pose[at] + shift[residuals.marker[at]]
+        dots(axes, x, values[at], SERIES[0], size)
+    else:
+        for m, name in enumerate(residuals.markers):
+            at = residuals.shown[residuals.marker[residuals.shown] == m]
+            dots(axes, residuals.pose[at] + shift[m], values[at], SERIES[m], size, short_name(name))
+    axes.grid(axis="x", visible=False)
+    axes.set_xlim(-0.7, len(residuals.labels) - 0.3)
+    axes.set_ylabel(f"{residuals.components[k]} in {residuals.units[k]}")
+    alike = [i for i, unit in enumerate(residuals.units) if unit == residuals.units[k]]
+    _limit(axes, values, reach(residuals.value[:, alike]))
+
+
+def against_joints(kinds: Sequence[str], residuals: Residuals) -> str:
+    """Residual over the position of each joint, of `kinds`, with the running mean by direction."""
+    rows = -(-len(kinds) // 3)
+    n = residuals.positions
+    values = residuals.value[:, :n]
+    shown = residuals.shown
+    if len(shown) * n > MOST_JOINT_DOTS:
+        shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
+    height = reach(values)
+
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(rows, min(3, len(kinds)), sharey=True, squeeze=False).ravel()
+        for j, (axes, kind) in enumerate(zip(grid, kinds, strict=False)):
+            q = np.degrees(residuals.q[:, j]) if kind == "revolute" else residuals.q[:, j] * 1e3
+            axes.axhline(0, color=FAINT, linewidth=0.8)
+            for k in range(n):
+                dots(axes, q[shown], values[shown, k], SERIES[k], 1.3)
+            for k in range(n):
+                middle, mean, error = running_mean(q, values[:, k])
+                axes.errorbar(middle, mean, 2 * error, color=SERIES[k], linewidth=1.4,
+                              elinewidth=0.8, label=residuals.components[k])  # fmt: skip
+            axes.set_xlabel(f"joint {j + 1} in {'°' if kind == 'revolute' else 'mm'}")
+            axes.set_ylim(-height, height)
+        for axes in grid[len(kinds) :]:
+            axes.set_visible(False)
+        figure.supylabel("residual in µm", fontsize=9)
+        handles = grid[0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside upper right", ncols=n)
+
+    return drawn(draw, WIDTH, 0.4 + 2.0 * rows, "Residuals against joint positions")
+
+
+def errors(result: Calibration) -> str:
+    """Nominal, fitted, held-out and test rms on one axis, logarithmic where they differ much."""
+    rows = [(name, v) for name, v in rms_by_kind(result) if np.isfinite(v) and v > 0]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for k, (name, v) in enumerate(rows):
+            colour = SERIES[0] if name.startswith("nominal") else SERIES[1]
+            axes.plot([v * 1e6], [-k], "o", color=colour, markersize=8)
+            axes.annotate(length(v), (v * 1e6, -k), (0, 7), textcoords="offset points", ha="center")
+        names = [name.replace(" (", "\n(") for name, _ in rows]
+        axes.set_yticks([-k for k in range(len(rows))], names)
+        axes.set_ylim(0.6 - len(rows), 0.7)
+        sizes = [v for _, v in rows]
+        if max(sizes, default=1.0) > 8 * min(sizes, default=1.0):
+            axes.set_xscale("log")
+            axes.margins(x=0.25)
+        else:
+            axes.set_xlim(0, 1.25e6 * max(sizes, default=1.0))
+        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g} µm" if x < 1e3 else f"{x / 1e3:g} mm")
+        axes.xaxis.set_minor_formatter(lambda x, _: "")
+        axes.set_xlabel("rms error")
+        axes.grid(axis="y", visible=False)
+
+    return drawn(draw, WIDTH / 2, 2.9, "Nominal, fitted, held-out and test error")
+
+
+def held_out(result: Calibration, residuals: Residuals) -> str:
+    """Held-out against fitted rms of every configuration: far above the line, few others help."""
+    fitted, held = rms_by_pose(result, residuals)
+    finite = np.isfinite(held)
+    unit, factor = ("mm", 1e-3) if fitted.max(initial=0.0) > 5e3 else ("µm", 1.0)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        top = 1.08 * factor * max([*fitted, *held[finite], 1e-9])
+        axes.plot([0, top], [0, top], color=FAINT, linewidth=1.0, label="no difference")
+        dots(axes, fitted * factor, held * factor, SERIES[2], 4.0, "a configuration")
+        axes.set_xlim(0, top)
+        axes.set_ylim(0, top)
+        axes.set_xlabel(f"fitted rms in {unit}")
+        axes.set_ylabel(f"held-out rms in {unit}")
+        axes.legend(loc="lower right", fontsize=8)
+        if not finite.all():
+            _remark(axes, f"{int((~finite).sum())} without held-out error")
+
+    return drawn(draw, WIDTH / 2, 2.9, "Held-out against fitted error by configuration")
+
+
+def _limit(axes: Axes, values: np.ndarray, height: float) -> None:
+    axes.set_ylim(-height, height)
+    if beyond := int((np.abs(values) > height).sum()):
+        _remark(axes, f"{beyond} beyond this axis")
+
+
+def _remark(axes: Axes, text: str) -> None:
+    axes.text(0.01, 0.97, text, transform=axes.transAxes, va="top", fontsize=8)
+
+
+ACROSS = 6  # small histograms beside each other
+MOST_PANELS = 18  # small histograms, of the most conspicuous groups
+
+
+def histogram(summary: ResidualSummary) -> str:
+    """Standardised residuals beside what the noise model expects in each bin."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        _histogram_bars(axes, summary.whole, summary.edges, "residual / its standard deviation")
+        axes.set_ylabel("values")
+        axes.legend(loc="upper right", fontsize=8)
+
+    return drawn(draw, WIDTH / 2, 2.9, "Histogram of standardised residuals beside the expected")
+
+
+def scores(summary: ResidualSummary) -> str:
+    """Ordered residuals against normal order statistics, with the simultaneous 95 % band."""
+    s = summary.whole.scores
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.fill_between(s.expected, s.low, s.high, color=FAINT, alpha=0.3, linewidth=0,
+                          label="95 % band for all together")  # fmt: skip
+        ends = s.expected[[0, -1]]
+        axes.plot(ends, ends, color=INK, linewidth=1.0, label="normal")
+        outside = (s.observed < s.low) | (s.observed > s.high)
+        axes.plot(s.expected[~outside], s.observed[~outside], "o", color=SERIES[0], markersize=2.6,
+                  label="inside")  # fmt: skip
+        if outside.any():
+            axes.plot(s.expected[outside], s.observed[outside], "D", color=SERIES[1],
+                      markersize=4.0, label="outside")  # fmt: skip
+        axes.set_xlabel("expected of a normal distribution")
+        axes.set_ylabel("observed")
+        axes.legend(loc="upper left", fontsize=8)
+
+    return drawn(draw, WIDTH / 2, 2.9, "Normal scores of the residuals with a 95 % band")
+
+
+def scatter_by_group(summary: ResidualSummary) -> str:
+    """Observed over expected standard deviation of every listed group, with its chance band."""
+    shown = [g for g in summary.groupings if g.groups]
+
+    def draw(figure: Figure) -> None:
+        if not shown:
+            figure.text(0.5, 0.5, "no groups of at least 8 values", ha="center")
+            return
+        widths = [max(len(g.groups), 2) for g in shown]
+        panels = figure.subplots(1, len(shown), sharey=True, squeeze=False, width_ratios=widths)[0]
+        for axes, grouping in zip(panels, shown, strict=True):
+            _scatter_panel(axes, grouping.groups)
+            left_out = grouping.n_groups - len(grouping.groups)
+            title = grouping.by + (f" ({left_out} more)" if left_out else "")
+            axes.set_title(title)
+        panels[0].set_ylabel("observed / expected scatter")
+        largest = max(group.mean_square for g in shown for group in g.groups)
+        panels[0].set_ylim(0, 1.12 * max(np.sqrt(largest), 1.6))
+        handles: dict[str, Artist] = {}
+        for axes in panels:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                handles.setdefault(label, handle)
+        figure.legend(list(handles.values()), list(handles), loc="outside lower right", ncols=3)
+
+    return drawn(draw, WIDTH, 3.4, "Scatter of each group of readings over the expected one")
+
+
+def _scatter_panel(axes: Axes, groups: tuple[GroupSummary, ...]) -> None:
+    x = np.arange(len(groups))
+    f = np.array([g.dof for g in groups])
+    low, high = (np.sqrt(stats.chi2.ppf(q, f) / f) for q in (0.025, 0.975))
+    axes.axhline(1, color=INK, linewidth=0.8)
+    axes.bar(x, high - low, 0.7, low, color=FAINT, alpha=0.3, label="chance alone, 95 % of each")
+    value = np.sqrt([g.mean_square for g in groups])
+    deviates = np.array([g.deviates for g in groups])
+    for chosen, mark, colour, size, name in (
+        (~deviates, "o", SERIES[0], 4.5, "as the noise model says"),
+        (deviates, "D", SERIES[1], 5.5, "unlike the noise model"),
+    ):
+        if chosen.any():
+            axes.plot(x[chosen], value[chosen], mark, color=colour, markersize=size, label=name)
+    axes.set_xlim(-0.6, max(len(groups), 2) - 0.4)
+    names = [short_name(g.name, 16) for g in groups]
+    turn = 90 if max(map(len, names)) > 2 else 0
+    axes.set_xticks(x.tolist(), names, rotation=turn)
+    axes.grid(axis="x", visible=False)
+
+
+def histograms_by_group(summary: ResidualSummary) -> str:
+    """A small histogram of each of the most conspicuous groups, beside the expected one."""
+    every = [(g, group) for g in summary.groupings for group in g.groups]
+    least = sorted(group.p for _, group in every)[:MOST_PANELS]
+    panels = [
+        (f"{g.by} {short_name(group.name)}", group, g.edges)
+        for g, group in every
+        if group.p <= least[-1]
+    ][:MOST_PANELS]
+    rows = max(-(-len(panels) // ACROSS), 1)
+
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(rows, ACROSS, squeeze=False).ravel()
+        for axes, (title, group, edges) in zip(grid, panels, strict=False):
+            _histogram_bars(axes, group, edges, "")
+            axes.set_title(title, fontsize=7.5)
+            axes.xaxis.label.set_fontsize(7)
+            axes.tick_params(labelsize=7)
+        for axes in grid[len(panels) :]:
+            axes.set_visible(False)
+
+    return drawn(draw, WIDTH, 0.2 + 1.45 * rows, "Histograms of standardised residuals by group")
+
+
+def _histogram_bars(axes: Axes, group: GroupSummary, edges: np.ndarray, label: str) -> None:
+    axes.stairs(group.counts, edges, fill=True, color=SERIES[0], alpha=0.5, label="observed")
+    axes.stairs(group.expected, edges, color=INK, linewidth=1.1, baseline=None, label="expected")
+    beyond = f"{group.beyond} beyond this axis" if group.beyond else ""
+    axes.set_xlabel("; ".join(text for text in (label, beyond) if text))
+
+
+Array = NDArray[np.float64]
+CELLS = 6  # of the work space's longest side
+FEWEST = 3  # readings from which on a cell is told
+MOST_IN_MATRIX = 48  # of the correlation matrix
+MOST_WRITTEN = 16  # parameters up to which the numbers are written into it
+STRONG = 0.9
+
+
+def over_time(seen: Observations, residuals: Residuals) -> str:
+    """Residual of every reading over time, or over the table's order where no time was recorded."""
+    table, lead = seen.table, seen.lead
+    n = residuals.positions
+    if table.time is None:
+        at, label = np.arange(len(lead), dtype=float), "reading, in the order of the table"
+    else:
+        seconds = table.time[lead]
+        hours = float(np.ptp(seconds)) > 3 * 3600
+        at, label = seconds / (3600 if hours else 60), f"time in {'h' if hours else 'min'}"
+    values = residuals.value[:, :n]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.axhline(0, color=FAINT, linewidth=0.8)
+        for k in range(n):
+            dots(axes, at[residuals.shown], values[residuals.shown, k], SERIES[k], 1.5)
+        for k in range(n):
+            middle, mean, error = running_mean(at, values[:, k])
+            axes.errorbar(middle, mean, 2 * error, color=SERIES[k], linewidth=1.4, elinewidth=0.8,
+                          linestyle=("-", "--", ":")[k % 3],
+                          label=residuals.components[k])  # fmt: skip
+        height = reach(values)
+        axes.set_ylim(-height, height)
+        axes.set_xlabel(label)
+        axes.set_ylabel("residual in µm")
+        figure.legend(loc="outside upper right", ncols=n)
+
+    return drawn(draw, WIDTH, 2.6, "Residuals over time")
+
+
+def by_region(position: Array, residual: Array) -> str:
+    """3-D rms residual (µm) of the readings in each part of the work space, from two sides.
+
+    `position` (N, 3) m where the markers were, `residual` (N, 3) or (N, 1) in µm.
+    """
+    squared = (residual**2).sum(axis=1)
+    views = ((0, 1, "from above"), (0, 2, "from the side"))
+    side = max(float(np.ptp(position, axis=0).max()) / CELLS, 1e-3)
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(1, 2)
+        for axes, (a, b, title) in zip(panels, views, strict=True):
+            _map(axes, position[:, [a, b]], squared, side)
+            axes.set_title(title)
+            axes.set_xlabel(f"{'xyz'[a]} in m")
+            axes.set_ylabel(f"{'xyz'[b]} in m")
+
+    return drawn(draw, WIDTH, 3.9, "Rms residual by region of the work space")
+
+
+def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
+    from matplotlib.patches import Rectangle
+
+    low = at.min(axis=0)
+    cell = np.floor((at - low) / side).astype(np.int64)
+    keys, code = np.unique(cell, axis=0, return_inverse=True)
+    count = np.bincount(code.ravel())
+    rms = np.sqrt(np.bincount(code.ravel(), squared) / count)
+    told = count >= FEWEST
+    largest = float(rms[told].max(initial=0.0)) or 1.0
+    for key, size, enough in zip(keys, rms, told, strict=True):
+        if not enough:
+            continue
+        corner = low + side * key
+        shade = 0.75 * size / largest
+        axes.add_patch(Rectangle((float(corner[0]), float(corner[1])), side, side,
+                                 facecolor=SERIES[0], alpha=shade, linewidth=0))  # fmt: skip
+        middle = corner + side / 2
+        axes.text(float(middle[0]), float(middle[1]), significant(float(size), 2), ha="center",
+                  va="center", fontsize=8)  # fmt: skip
+    high = low + side * (keys.max(axis=0) + 1)
+    axes.set_xlim(float(low[0]) - 0.05 * side, float(high[0]) + 0.05 * side)
+    axes.set_ylim(float(low[1]) - 0.05 * side, float(high[1]) + 0.05 * side)
+    axes.set_aspect("equal")
+
+
+def correlation_matrix(result: Calibration) -> str:
+    """Correlations of the parameters that the data determine; empty where there are fewer than two.
+
+    Size by the shade, sign by hatching or number, so that no colour has to be told apart.
+    """
+    names, r = correlations(result)
+    n = len(names)
+    if n < 2:
+        return ""
+    size = min(WIDTH, 2.2 + 0.32 * n)
+
+    def draw(figure: Figure) -> None:
+        from matplotlib.patches import Rectangle
+
+        axes = figure.subplots()
+        for i in range(n):
+            for j in range(i):
+                value = float(r[i, j])
+                look: dict[str, Any] = {"hatch": "//////", "edgecolor": FAINT} if value < 0 else {}
+                axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, linewidth=0,
+                                         facecolor=SERIES[0] if value > 0 else SERIES[1],
+                                         alpha=0.8 * abs(value), **look))  # fmt: skip
+                if n <= MOST_WRITTEN:
+                    text = f"{value:+.2f}".replace("-", "−")
+                    axes.text(j, i, text, ha="center", va="center", fontsize=7)
+                elif abs(value) > STRONG:
+                    axes.text(j, i, "+" if value > 0 else "−", ha="center", va="center", fontsize=8)
+        shown = [short_name(name, MOST_LABELS) for name in names]
+        axes.set_yticks(range(1, n), shown[1:], fontsize=8 if n < 30 else 6.5)
+        axes.set_xticks(range(n - 1), shown[:-1], rotation=90, fontsize=8 if n < 30 else 6.5)
+        axes.set_xlim(-0.5, n - 1.5)
+        axes.set_ylim(n - 0.5, 0.5)
+        axes.grid(False)
+        axes.set_aspect("equal")
+
+    return drawn(draw, size, 0.92 * size, "Correlations between the parameters")
+
+
+def correlations(result: Calibration) -> tuple[list[str], Array]:
+    """Names and correlations (n, n) of the determined parameters with a finite variance; of many,
+    those that correlate most."""
+    variance = np.diag(result.covariance)
+    good = np.flatnonzero(np.isfinite(variance) & (variance > 0))
+    sd = np.sqrt(variance[good])
+    r = result.covariance[np.ix_(good, good)] / np.outer(sd, sd)
+    names = [result.determined[k] for k in good]
+    if len(names) > MOST_IN_MATRIX:
+        strongest = np.abs(r - np.eye(len(r))).max(axis=1)
+        kept = np.sort(np.argsort(-strongest, kind="stable")[:MOST_IN_MATRIX])
+        names, r = [names[k] for k in kept], r[np.ix_(kept, kept)]
+    return names, np.clip(r, -1.0, 1.0)
+
+
+def drawn_for(
+    result: Calibration,
+    residuals: Residuals,
+    summary: ResidualSummary | None,
+    budget: ErrorBudget | None,
+    space: Space,
+) -> dict[str, str]:
+    """Name → SVG."""
+    from elastocal.report.arm_view import marker_positions, space_picture
+    from elastocal.report.figures import waterfall_of_steps
+    from elastocal.report.identification_view import budget_steps
+
+    distribution = {} if summary is None else {
+        "histogram": histogram(summary),
+        "scores": scores(summary),
+        "groups": scatter_by_group(summary),
+        "histograms": histograms_by_group(summary),
+    }  # fmt: skip
+    positions = marker_positions(result.model, result.observations, result.x)
+    return {
+        **distribution,
+        "waterfall": "" if budget is None else waterfall_of_steps(
+            budget_steps(result, budget), budget.floor, budget.floor_name
+        ),
+        "errors": errors(result),
+        "held_out": held_out(result, residuals),
+        "by_configuration": by_configuration(residuals),
+        "against_joints": against_joints(result.model.chain.kinds, residuals),
+        "over_time": over_time(result.observations, residuals),
+        "by_region": by_region(positions, residuals.value[:, : residuals.positions]),
+        "matrix": correlation_matrix(result),
+        "space": space_picture(space, "Residuals as arrows on the posed arm"),
+    }  # fmt: skip
