@@ -234,14 +234,10 @@ class RecordTable(Table):
     record: ClassVar[Any]
 
 
-def keys_of(*records: Any, without: Sequence[str] = (), optional: bool = False) -> list[Key]:
+def keys_of(*records: Any, without: Sequence[str] = ()) -> list[Key]:
     """The keys that state records in a cell file, each with its type there."""
     return [
-        replace(
-            known,
-            form=known.form or _form(get_type_hints(one, include_extras=True)[name]),
-            required=known.required and not optional,
-        )
+        replace(known, form=known.form or _form(get_type_hints(one, include_extras=True)[name]))
         for one in records
         for name, keys in fields_of(one).items()
         for known in keys
