@@ -30,6 +30,7 @@ from typing import (
 
 import numpy as np
 from pydantic import (
+    AllowInfNan,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -421,6 +422,7 @@ def _path(value: object) -> object:
 
 
 TUPLE = BeforeValidator(_tuple)
+AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]
 File = Annotated[Path, BeforeValidator(_path), FromFile(Text, existing_file)]
 Rotation = Annotated[Array, matrix(3, 3), FromFile(Vector3, rotation_from_rpy)]
