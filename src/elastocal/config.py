@@ -80,7 +80,8 @@ def numbers(
             right = len(found) == count if count else len(found) > 0
             if right and (found >= least).all() and (found > above).all():
                 return found
-        raise PydanticCustomError("numbers", f"{count or 'a list of'} numbers")
+        sign = "positive " if above == 0 else ""
+        raise PydanticCustomError("numbers", f"{count or 'a list of'} {sign}numbers")
 
     return PlainValidator(check)
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from elastocal.cell.file_keys import (
-    TUPLE,
+    AnyFloat,
     File,
     Many,
     Rotation,
@@ -39,6 +39,7 @@ from elastocal.units import to_si
 Observe = Literal["position", "deflection", "pose", "distance"]
 Convention = Literal["standard", "modified"]
 Sigma = Annotated[Array, numbers(3, above=0, one_for_all=True)]
+Compliances = Annotated[Many[NonNegative], Field(min_length=1)]
 JointName = Annotated[str, Field(pattern=r"^joint[1-9][0-9]{0,2}$")]
 POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
 
@@ -260,8 +261,8 @@ class Nominal:
     `settings`: place → key → value of the constants that effects do not fit, in the key's unit.
     """
 
-    joint_compliance: Annotated[tuple[NonNegative, ...], TUPLE, Field(min_length=1)] | None = keyed(
-        "one number >= 0 per joint, in rad/(N m)", default=None
+    joint_compliance: Many[NonNegative] | None = keyed(
+        "one number >= 0 per joint, in rad/(N m)", form=Compliances, default=None
     )
     base_position: Vector3 | None = keyed("three numbers in m", "base_position_m", default=None)
     base_rotation: Rotation | None = keyed(
@@ -273,8 +274,10 @@ class Nominal:
         into=lambda table, *_: table.model_dump(exclude_none=True),
         default=None,
     )
-    settings: dict[str, dict[str, float]] = keyed(
-        "a table per place, as in settings.joint2 = { jump_time_s = 720.0 }", default_factory=dict
+    settings: dict[str, dict[str, AnyFloat]] = keyed(
+        "a table per place, as in settings.joint2 = { jump_time_s = 720.0 }",
+        form=dict[str, dict[str, float]],
+        default_factory=dict,
     )
 
 

@@ -30,6 +30,7 @@ from typing import (
 
 import numpy as np
 from pydantic import (
+    AllowInfNan,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -234,14 +235,10 @@ class RecordTable(Table):
     record: ClassVar[Any]
 
 
-def keys_of(*records: Any, without: Sequence[str] = (), optional: bool = False) -> list[Key]:
+def keys_of(*records: Any, without: Sequence[str] = ()) -> list[Key]:
     """The keys that state records in a cell file, each with its type there."""
     return [
-        replace(
-            known,
-            form=known.form or _form(get_type_hints(one, include_extras=True)[name]),
-            required=known.required and not optional,
-        )
+        replace(known, form=known.form or _form(get_type_hints(one, include_extras=True)[name]))
         for one in records
         for name, keys in fields_of(one).items()
         for known in keys
@@ -425,6 +422,7 @@ def _path(value: object) -> object:
 
 
 TUPLE = BeforeValidator(_tuple)
+AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]
 File = Annotated[Path, BeforeValidator(_path), FromFile(Text, existing_file)]
 Rotation = Annotated[Array, matrix(3, 3), FromFile(Vector3, rotation_from_rpy)]

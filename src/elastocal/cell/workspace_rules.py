@@ -10,10 +10,11 @@ import re
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AllowInfNan, Field
+from pydantic import Field
 
 from elastocal.cell.file_keys import (
     TUPLE,
+    AnyFloat,
     Direction,
     File,
     Key,
@@ -55,7 +56,6 @@ Angle = Annotated[
 Edges = Annotated[Array, numbers(3, above=0)]
 Scale = Annotated[Array, numbers(3, above=0, one_for_all=True)]
 Radii = Positive | Annotated[Array, numbers(least=0)]
-Reach = Annotated[float, AllowInfNan(True)]
 # shape → keys that it needs; `scale` alone may be left out.
 NEEDED = {
     "box": ("size_m",),
@@ -213,7 +213,7 @@ class Visibility:
         default_factory=dict,
     )
     max_incidence: float | None = keyed(ANGLE, "max_incidence_deg", form=Angle, default=None)
-    range: Annotated[tuple[Reach, Reach], TUPLE] = keyed(
+    range: Annotated[tuple[AnyFloat, AnyFloat], TUPLE] = keyed(
         "two numbers in m, [nearest, farthest]", "range_m", form=Vector2, default=(0.0, np.inf)
     )
     beam_radius: NonNegative = keyed("a number >= 0 in mm", "beam_radius_mm", default=0.005)

@@ -225,12 +225,11 @@ def test_a_pose_that_only_the_load_keeps_apart_is_named_with_the_load():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"motion": Motion(speed=np.array([1.0, -1.0]))}, "2 positive joint speeds"),
+        ({"motion": Motion(speed=np.ones(3))}, "2 positive joint speeds"),
         ({"motion": Motion(home=np.zeros(3))}, "home needs 2"),
         ({"load": np.array([0, 2])}, "load must be one of 2"),
         ({"load": np.array([0])}, "load must be one of 2"),
         ({"motion": Motion(both_directions=True)}, "joint limits"),
-        ({"motion": Motion(both_directions=True, overshoot=0.0), "limits": LIMITS}, "overshoot"),
         ({"motion": Motion(both_directions=True, overshoot=4.0), "limits": LIMITS}, "no room"),
         ({"q": np.zeros((0, 2))}, "no pose"),
     ],
