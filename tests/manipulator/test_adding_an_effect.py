@@ -10,8 +10,9 @@ from support.cells import kr270_chain, random_table
 from support.registered import forgotten, write_example
 
 from elastocal.cell import Cell, EffectChoice, ModelSpec, Robot, Tool
+from elastocal.errors import InputError
 from elastocal.identification.identify import identify
-from elastocal.manipulator.effects import CATALOGUE
+from elastocal.manipulator.effects import CATALOGUE, register
 from elastocal.manipulator.model import Model
 from elastocal.plugin_loader import load_plugins
 
@@ -67,3 +68,13 @@ def test_identification_knows_it_at_once() -> None:
     for value, estimate in zip(truth, found.estimates, strict=True):
         assert estimate.std < 1e-5
         assert abs(estimate.value - value) < 4 * estimate.std
+
+
+def test_two_effects_with_a_parameter_of_one_name_are_refused() -> None:
+    class Alike(type(CATALOGUE["three_lobes"])):  # type: ignore[misc]
+        name = "alike"
+
+    register(Alike())
+    told = r"three_lobes and alike both have a parameter 'joint2\.lobes_sin'"
+    with pytest.raises(InputError, match=told):
+        model_with(["three_lobes:joint2", "alike"])

@@ -8,6 +8,7 @@ from functools import cached_property
 import casadi as ca
 
 from elastocal.cell import Cell
+from elastocal.errors import require
 from elastocal.manipulator import rigid
 from elastocal.manipulator.arm import Arm
 from elastocal.manipulator.backend import BackendReport
@@ -49,6 +50,7 @@ class SymbolicArm:
                               spec.nominal, spec.typical, spec.lower, spec.upper)
                 )  # fmt: skip
             bound.append((effect, place, own))
+        _check_names(parameters, cell)
         for effect, place, own in bound:
             effect.shape(arm, place, own)
         arm.assemble()
@@ -178,3 +180,15 @@ class SymbolicArm:
         adjoint = ca.SX.sym("adjoint", h.shape[0], self.arm.theta.shape[0] if self.implicit else 0)
         lagrangian = h - adjoint @ self.residual if self.implicit else h
         return adjoint, ca.jacobian(lagrangian, self.p)
+
+
+def _check_names(parameters: Sequence[Parameter], cell: Cell) -> None:
+    """InputError where two effects call a parameter at a place alike."""
+    known: dict[str, Parameter] = {}
+    for p in parameters:
+        other = known.setdefault(p.name, p)
+        require(
+            other is p,
+            f"{cell.path or cell.name}: the effects {other.effect} and {p.effect} both have a "
+            f"parameter '{p.name}'; give the one that you registered a key of its own",
+        )
