@@ -10,6 +10,7 @@ from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.chunked import each, regressor
+from elastocal.identification.outlier import FALSE_ALARM
 from elastocal.identification.partition import Part
 from elastocal.identification.solve import Solution
 from elastocal.identification.triangle import Triangle, merge
@@ -17,7 +18,6 @@ from elastocal.identification.triangle import Triangle, merge
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FALSE_ALARM = 0.01  # chance that a clean table yields any outlier at all
 ROUNDS = 12
 ALONE = 1e-9  # share of an observation's direction that the other observations must see
 

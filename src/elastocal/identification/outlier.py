@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
+
 
 @dataclass(frozen=True)
 class Outlier:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.chunked import evaluate, residual_at
-from elastocal.identification.judgement import FALSE_ALARM, Visit, judge, verdict
-from elastocal.identification.outlier import Outlier, blocks
+from elastocal.identification.judgement import Visit, judge, verdict
+from elastocal.identification.outlier import FALSE_ALARM, Outlier, blocks
 from elastocal.identification.partition import part_of, sample
 from elastocal.identification.selection import WORTH_A_COLUMN, choose
 from elastocal.identification.solve import SAMPLE, Solution, is_placed, settle

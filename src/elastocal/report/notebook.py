@@ -23,6 +23,7 @@ from elastocal.report.diagnosis_view import (
     BUDGET_HEADS,
     CANDIDATE_HEADS,
     diagnosis_lines,
+    diagnosis_steps,
     effect_at,
     error_steps,
     gap_rows,
@@ -30,7 +31,12 @@ from elastocal.report.diagnosis_view import (
     name_of,
 )
 from elastocal.report.formatting import display, length, printable
-from elastocal.report.identification_view import combination_rows, parameter_rows, summary_lines
+from elastocal.report.identification_view import (
+    combination_rows,
+    judgement,
+    parameter_rows,
+    summary_lines,
+)
 from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
 from elastocal.report.plan_view import plan_lines
 from elastocal.report.residual_view import residuals_of
@@ -319,8 +325,11 @@ def _identification_html(result: Calibration) -> str:
     rows = [(r.name, r.value, r.interval, r.unit, r.nominal) for r in known]
     rows += [(r.name, r.value, r.interval, r.unit, "") for r in combination_rows(result, None)]
     heads = ("parameter", "value", "95 %", "unit", "nominal")
-    lines = [line.partition(": ") for line in summary_lines(result)]
-    return _table("Identification", heads, rows) + _lines([(a, c) for a, _, c in lines])
+    lines = [(label, text) for label, _, text in (x.partition(": ") for x in summary_lines(result))]
+    judged = judgement(result)
+    lines += [("Verdict", printable(judged.headline))]
+    lines += [("Next", printable(step)) for step in judged.steps]
+    return _table("Identification", heads, rows) + _lines(lines)
 
 
 def _plan_html(plan: Plan) -> str:
@@ -331,7 +340,7 @@ def _plan_html(plan: Plan) -> str:
 
 def _diagnosis_html(d: Diagnosis) -> str:
     return (
-        _lines(diagnosis_lines(d))
+        _lines(diagnosis_lines(d) + [("Next", step) for step in diagnosis_steps(d)])
         + _table("Gap budget (3-D rms error on held-out poses)", BUDGET_HEADS, gap_rows(d))
         + _table("Candidates", CANDIDATE_HEADS, hypothesis_rows(d, MOST_CANDIDATES_SHOWN))
     )

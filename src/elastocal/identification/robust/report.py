@@ -23,14 +23,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.errors import require
+from elastocal.identification.outlier import FALSE_ALARM
 from elastocal.identification.robust.design import Design, design
 from elastocal.identification.robust.grouping import Group, Level, accepted_groups, groups_of
 from elastocal.identification.robust.mm_estimate import mm_of
 from elastocal.identification.robust.screening import CleanFit, Mask, screened
 
 Array = NDArray[np.float64]
-
-FALSE_ALARM = 0.01  # chance that a clean table yields any finding at all
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from elastocal.errors import ElastocalError
+from elastocal.identification.outlier import FALSE_ALARM
 from elastocal.identification.variance.choose import NoiseFit, estimate_noise
 from elastocal.identification.variance.judge import beyond_noise, own_noise
 from elastocal.identification.variance.readings import Readings
@@ -16,7 +17,6 @@ from elastocal.identification.variance.readings import Readings
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
 ROUNDS = 12
 FEWEST_GOOD = 0.5
 

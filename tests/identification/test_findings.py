@@ -1,0 +1,113 @@
+"""Findings: each judgement made once, with one threshold wherever it is told."""
+
+from __future__ import annotations
+
+import ast
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table_at, true_values
+from support.cells import random_poses
+
+from elastocal.cell import CartesianNoise, Tracker
+from elastocal.diagnosis import result as diagnosis_result
+from elastocal.errors import options_as_flags
+from elastocal.identification import findings as module
+from elastocal.identification.findings import judged, next_steps, warning_sentences
+from elastocal.identification.identify import identify
+from elastocal.identification.lack_of_fit import LackOfFit
+from elastocal.identification.result import Finding, TestErrors
+from elastocal.manipulator.model import Model
+
+SIGMA = 5e-5
+PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"
+
+
+@pytest.fixture(scope="module")
+def result():
+    """A clean, adequate identification with its noise stated."""
+    tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
+    model = Model(planar_chain(), cell_of(GEOMETRY, tracker=tracker))
+    rng = np.random.default_rng(0)
+    plan = table_at(random_poses(model.chain, 40, 0), [[0, 0, 0]])
+    return identify(model, measured(model, plan, true_values(model, rng), SIGMA, rng))
+
+
+def with_noise(result, **changed):
+    return judged(replace(result, noise=replace(result.noise, **changed)))
+
+
+def test_trust_comes_first_and_is_as_severe_as_the_worst(result):
+    assert result.findings[0].kind == "trust" and result.findings[0].severity == "good"
+    careful = with_noise(result, ratio_to_stated=3.0)
+    assert careful.findings[0].severity == "care"
+    assert careful.findings[0].numbers["because"] == ("residual_above_stated_noise",)
+    lost = replace(careful, converged=False, reason="100 steps")
+    assert judged(lost).findings[0].numbers["because"] == ("not_converged",)
+    assert judged(lost).findings[0].severity == "poor"
+
+
+@pytest.mark.parametrize("above", [False, True])
+def test_residual_and_stated_noise_have_one_threshold(result, above):
+    """Finding, doubt and warning begin at the same ratio, the end of what chance allows."""
+    limit = result.finding("residual_agrees_with_stated_noise").number("by_chance_to")
+    found = with_noise(result, ratio_to_stated=limit * (1 + (1e-6 if above else -1e-6)))
+    assert (found.finding("residual_above_stated_noise") is not None) == above
+    assert (found.findings[0].severity == "care") == above
+    assert any("times the stated noise" in w for w in warning_sentences(found)) == above
+
+
+@pytest.mark.parametrize("above", [False, True])
+def test_lack_of_fit_has_one_threshold(result, above):
+    p = module.LACK_OF_FIT * (1 - 1e-6 if above else 1 + 1e-6)
+    found = with_noise(result, kind="axis", lack_of_fit=LackOfFit(2.0, p, 30, 200))
+    assert (found.finding("lack_of_fit") is not None) == above
+    assert (found.finding("repeats_agree") is None) == above
+    assert any("scatter more than their repeats" in w for w in warning_sentences(found)) == above
+
+
+@pytest.mark.parametrize(
+    ("kind", "intervals"), [("axis+configuration", "classical"), ("axis", "CR2"), ("axis", "wild")]
+)
+def test_scatter_that_is_counted_with_warns_of_no_narrow_interval(result, kind, intervals):
+    misfit = LackOfFit(9.0, 1e-6, 30, 200)
+    found = with_noise(result, kind=kind, interval_kind=intervals, lack_of_fit=misfit)
+    assert found.finding("lack_of_fit").numbers["counted_by"] != "nothing"
+    assert not any("too narrow" in w for w in warning_sentences(found))
+
+
+def test_findings_of_the_solver_stay_when_test_data_are_added(result):
+    own = Finding("ill_conditioned", "note", {"condition_number": 1e5, "parameters": ("a",)})
+    whole = replace(result, findings=(*result.findings, own))
+    tested = judged(replace(whole, test=TestErrors(result.heldout_rms, 0.0, 0.0, 9)))
+    assert tested.finding("ill_conditioned") == own
+    assert tested.finding("untested") is None and result.finding("untested") is not None
+
+
+def test_remedies_are_told_once_and_name_flags_on_the_command_line_only(result):
+    steps = [f.remedy for f in next_steps(result)]
+    assert len(set(steps)) == len(steps) and all(steps)
+    assert "--" not in " ".join(steps) and "`test`" in " ".join(steps)
+    with options_as_flags():
+        assert "--test" in " ".join(f.remedy for f in next_steps(judged(result)))
+
+
+def test_numbers_that_are_not_finite_are_null():
+    found = Finding("untested", "note", {"a": float("inf"), "b": (1.0, 2.0), "c": None}, "Do.")
+    text = json.dumps(found.to_json(), allow_nan=False)
+    assert json.loads(text)["numbers"] == {"a": None, "b": [1.0, 2.0], "c": None}
+
+
+def test_every_kind_is_on_the_page():
+    text = PAGE.read_text(encoding="utf-8")
+    kinds = set()
+    for source in (module, diagnosis_result):
+        for node in ast.walk(ast.parse(Path(source.__file__).read_text(encoding="utf-8"))):
+            called = isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding"
+            if called and isinstance(node.args[0], ast.Constant):
+                kinds.add(node.args[0].value)
+    assert len(kinds) > 20
+    assert not {kind for kind in kinds if f"`{kind}`" not in text}
