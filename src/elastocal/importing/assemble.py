@@ -23,7 +23,7 @@ UNLOADED = ("none", "unloaded", "0")
 
 
 def forces_of(
-    where: str, points: PooledRecords, loads: Mapping[str, Sequence[float] | LoadTable] | None
+    where: str, points: PooledRecords, loads: Mapping[str, NDArray[np.float64] | LoadTable] | None
 ) -> NDArray[np.float64] | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
 
