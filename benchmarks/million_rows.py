@@ -25,7 +25,7 @@ import numpy as np
 from elastocal.cell_reader import read_cell
 from elastocal.identification import partition
 from elastocal.identification.identify import identify
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
@@ -90,7 +90,7 @@ def truth(model: Model) -> np.ndarray:
 
 def write_readings(cell_path: Path, path: Path, n: int, loaded: bool) -> None:
     """A CSV of n readings, simulated and written a few at a time."""
-    model = Model.from_cell(read_cell(cell_path))
+    model = Model(read_cell(cell_path))
     x, piece = truth(model), path.with_suffix(".piece.csv")
     with path.open("wb") as whole:
         for first in range(0, n, AT_A_TIME):
@@ -102,7 +102,7 @@ def write_readings(cell_path: Path, path: Path, n: int, loaded: bool) -> None:
 
 def load(cell_path: Path, data: Path) -> tuple[Model, Measurements]:
     cell = read_cell(cell_path, known_effects=tuple(CATALOGUE))
-    model = Model.from_cell(cell)
+    model = Model(cell)
     table = read_measurements(
         data, joint_kinds=model.chain.kinds, marker_names=tuple(cell.tool.markers)
     )
@@ -150,7 +150,7 @@ def compared(cell_path: Path, data: Path) -> None:
     """The same table whole and in parts: seconds, and the largest differences."""
     model, table = load(cell_path, data)
 
-    def run(large: int) -> tuple[IdentificationResult, float]:
+    def run(large: int) -> tuple[Calibration, float]:
         partition.LARGE = large
         start = time.perf_counter()
         return identify(model, table), time.perf_counter() - start

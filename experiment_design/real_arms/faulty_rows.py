@@ -11,7 +11,7 @@ from prepare import HERE, prepare
 from elastocal.cell_reader import read_cell
 from elastocal.identification.identify import Options, identify
 from elastocal.identification.outliers import blocks
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import observe
 from elastocal.measurement_reader import read_measurements
@@ -20,7 +20,7 @@ from elastocal.measurements import Measurements
 SPLITS, TEST_SHARE = 5, 0.2
 
 
-def rmse(model: Model, result: IdentificationResult, rows: Measurements) -> float:
+def rmse(model: Model, result: Calibration, rows: Measurements) -> float:
     """Root mean square error in mm of the predicted cable length."""
     error = observe(rows, model.observe).value - model.predict(rows, result.x)
     return float(np.sqrt(np.mean(error**2))) * 1e3
@@ -29,9 +29,9 @@ def rmse(model: Model, result: IdentificationResult, rows: Measurements) -> floa
 def main() -> None:
     cell = read_cell(HERE / "irb120.toml")
     data = prepare() / "irb120.csv"
-    model = Model.from_cell(cell)
+    model = Model(cell)
     table = read_measurements(data, joint_kinds=model.chain.kinds, observe="distance")
-    model = Model.from_cell(cell, table.marker_names)
+    model = Model(cell, table.marker_names)
     whole = identify(model, table, Options(faulty="drop"))
     faulty = np.isin(table.row, [o.line for o in whole.excluded])
     error = observe(table, "distance").value - model.predict(table, whole.x)

@@ -33,7 +33,7 @@ POSES = random_poses(CHAIN, 120, seed=1)
 
 def stacked(cell: Cell, q: NDArray, chain: Any = CHAIN) -> tuple[Model, NDArray]:
     """B of all parameters, scaled to columns of equal length."""
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     n = len(model.names)
     found = PoseInformation(
         model, load_states(cell), model.nominal[None], np.arange(n), np.ones(n)

@@ -17,7 +17,7 @@ from elastocal.manipulator.model import Model
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return Model(kr270_chain(), kr270_cell(("base_frame",)))
+    return Model.assembled(kr270_chain(), kr270_cell(("base_frame",)))
 
 
 @pytest.mark.parametrize("name", VERDICTS)

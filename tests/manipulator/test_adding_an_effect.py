@@ -37,7 +37,9 @@ def effect(tmp_path, monkeypatch):
 def model_with(effects):
     markers = {"M1": np.array([0.2, 0.05, 0.1])}
     spec = ModelSpec(effects=tuple(EffectChoice(*e.split(":")) for e in effects))
-    return Model(kr270_chain(), Cell("kr", None, Robot(), Tool(markers=markers), model=spec))
+    return Model.assembled(
+        kr270_chain(), Cell("kr", None, Robot(), Tool(markers=markers), model=spec)
+    )
 
 
 def test_it_is_one_more_entry_of_the_catalogue(effect):

@@ -11,7 +11,7 @@ from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_
 from elastocal.cell import CartesianNoise, Tracker
 from elastocal.identification.identify import Options, identify
 from elastocal.identification.options import Method
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.model import Model
 from elastocal.report import identification_figures
 from elastocal.simulation.simulate import simulate, values_from
@@ -26,7 +26,7 @@ SIGMA = 3e-5
 class Case:
     """A result and the true values behind it."""
 
-    result: IdentificationResult
+    result: Calibration
     truth: dict[str, float]
 
 
@@ -50,7 +50,7 @@ def make_case(
         tool=replace(cell.tool, markers=points),
         tracker=Tracker(noise=noise, rotation_sigma=3e-5 if observe == "pose" else None),
     )
-    model = Model(kr270_chain(), cell)
+    model = Model.assembled(kr270_chain(), cell)
     rng = np.random.default_rng(7)
     table = table_of(
         random_poses(model.chain, poses, 3), np.array([0.0, 0.0, -2600.0]), names, both=True

@@ -20,7 +20,7 @@ from elastocal.report.diagnosis_page import diagnosis_page, write_diagnosis_repo
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return Model(kr270_chain(), kr270_cell(("base_frame",)))
+    return Model.assembled(kr270_chain(), kr270_cell(("base_frame",)))
 
 
 @pytest.fixture(scope="module")

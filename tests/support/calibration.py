@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import choices
 
 from elastocal.cell import Array, Cell, ModelSpec, Robot, Tool, Tracker
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.chain import Chain, Joint, LinkMass
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
@@ -142,31 +142,31 @@ def with_values(model: Model, values: dict[str, float]) -> Array:
     return x
 
 
-def combination_truth(result: IdentificationResult, truth: Array, first: str) -> float:
+def combination_truth(result: Calibration, truth: Array, first: str) -> float:
     """True value of a determined parameter or combination: X_k + Σ f (X_d − held_d)."""
     names = result.model.names
     value = truth[names.index(first)]
-    if result.estimate(first).combined_with:
+    if result[first].combined_with:
         for name, factor in result.combination(first).terms.items():
             if name != first:
-                value += factor * (truth[names.index(name)] - result.estimate(name).held)
+                value += factor * (truth[names.index(name)] - result[name].held)
     return float(value)
 
 
-def z_scores(result: IdentificationResult, truth: Array, names: Sequence[str] = ()) -> Array:
+def z_scores(result: Calibration, truth: Array, names: Sequence[str] = ()) -> Array:
     """(estimate − truth)/std of every determined parameter or combination (or of `names`)."""
     std = np.sqrt(np.diag(result.covariance))
     chosen = names or result.determined
     return np.array(
         [
-            (result.estimate(name).held - combination_truth(result, truth, name))
+            (result[name].held - combination_truth(result, truth, name))
             / std[result.determined.index(name)]
             for name in chosen
         ]
     )
 
 
-def covered(result: IdentificationResult, truth: Array, names: Sequence[str] = ()) -> Array:
+def covered(result: Calibration, truth: Array, names: Sequence[str] = ()) -> Array:
     """Whether each 95 % t interval covers the truth (determined,)."""
     return np.abs(z_scores(result, truth, names)) < stats.t.ppf(0.975, result.dof)
 

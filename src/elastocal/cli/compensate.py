@@ -26,7 +26,7 @@ from elastocal.json_text import json_text
 if TYPE_CHECKING:
     from elastocal.cell import Array
     from elastocal.compensation.targets import Targets
-    from elastocal.manipulator.calibrated import Calibrated
+    from elastocal.manipulator.calibrated import CalibratedArm
 
 Progress = Callable[[str], None]
 
@@ -182,7 +182,7 @@ def _check_grid(table: Path | None, grid: str, box: str | None, rotation: str | 
 
 
 def _targets(
-    arm: Calibrated, path: Path | None, target: str | None, frame: str, force: Array | None
+    arm: CalibratedArm, path: Path | None, target: str | None, frame: str, force: Array | None
 ) -> Targets | None:
     from elastocal.compensation.targets import one_target, read_targets
 

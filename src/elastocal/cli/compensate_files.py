@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from elastocal.cell import Array
     from elastocal.compensation.compensate import Compensation
     from elastocal.compensation.table import CorrectionTable, Grid
-    from elastocal.manipulator.calibrated import Calibrated
+    from elastocal.manipulator.calibrated import CalibratedArm
 
 REMEDIES = {
     "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of "
@@ -33,7 +33,7 @@ GRID_REMEDIES = {
 NAMED = 8  # rows that a message names
 
 
-def read_near(arm: Calibrated, text: str | None) -> Array | None:
+def read_near(arm: CalibratedArm, text: str | None) -> Array | None:
     """--near as joints (n,) in rad or m."""
     import numpy as np
 
@@ -54,7 +54,7 @@ def read_near(arm: Calibrated, text: str | None) -> Array | None:
     return values
 
 
-def read_table_grid(arm: Calibrated, grid: str, box: str | None, rotation: str | None) -> Grid:
+def read_table_grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) -> Grid:
     """The grid that --grid, --box and --rotation ask for."""
     import numpy as np
     from scipy.spatial.transform import Rotation
@@ -79,7 +79,7 @@ def read_table_grid(arm: Calibrated, grid: str, box: str | None, rotation: str |
 
 
 def commands_of(
-    found: Compensation, arm: Calibrated, listed: bool, partial: bool
+    found: Compensation, arm: CalibratedArm, listed: bool, partial: bool
 ) -> tuple[dict[str, Any], str]:
     """Summary of the commands, with each of them where `listed`, and their table as CSV.
 
@@ -116,7 +116,9 @@ def _refuse(
     )
 
 
-def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[dict[str, Any], str]:
+def table_of(
+    found: CorrectionTable, arm: CalibratedArm, partial: bool
+) -> tuple[dict[str, Any], str]:
     """Summary of the correction table, and the table as CSV; refused as `commands_of` is."""
     import numpy as np
 

@@ -228,7 +228,7 @@ def _prior(
     from elastocal.manipulator.model import Model
 
     known = read_knowledge(path)
-    prior = known.of(Model.from_cell(cell, markers))[1]
+    prior = known.of(Model(cell, markers))[1]
     if prior is None:
         raise InputError(
             f"{path}: states no prior, and only priors count for a plan; add "

@@ -175,7 +175,7 @@ def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurem
         for path in data
     ]
     names: tuple[str, ...] = tuple(dict.fromkeys(m for t in tables for m in t.marker_names))
-    return Model.from_cell(cell, names), tables
+    return Model(cell, names), tables
 
 
 def _read_knowledge(path: Path | None, physical: bool) -> Knowledge | None:

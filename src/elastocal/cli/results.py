@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from elastocal.files import atomic_write_text
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def write_results(
-    result: IdentificationResult,
+    result: Calibration,
     output: Path | None,
     report: Path | None,
     residuals: Path | None,

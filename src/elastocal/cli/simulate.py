@@ -74,7 +74,7 @@ def simulate(
         f"--draw takes a factor of the typical sizes, 0 or more; found {draw:g}",
     )
     check_outputs(output, truth)
-    model = Model.from_cell(read_cell(cell, known_effects=tuple(CATALOGUE)))
+    model = Model(read_cell(cell, known_effects=tuple(CATALOGUE)))
     check_apart([output, truth], [cell, plan, *files_of(model.cell)])
     poses = read_plan(plan, joint_kinds=model.chain.kinds)
     check_limits(model, poses)

@@ -18,7 +18,7 @@ from elastocal.compensation.tool import CalibratedTool
 from elastocal.compensation.uncertainty import Uncertainty, position_uncertainty, undetermined
 from elastocal.identification.checks import check_limits
 from elastocal.manipulator import rigid
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.inverse_kinematics import inverse_kinematics
 from elastocal.manipulator.limits import joint_limits
@@ -69,7 +69,7 @@ class Compensation(ForNotebooks):
 
 
 def compensate(
-    arm: Calibrated,
+    arm: CalibratedArm,
     targets: Targets,
     point: ToolPoint,
     near: Array | None = None,

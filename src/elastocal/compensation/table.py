@@ -14,7 +14,7 @@ from elastocal.compensation.point import ToolPoint
 from elastocal.compensation.targets import Targets, targets_at
 from elastocal.compensation.tool import CalibratedTool
 from elastocal.errors import InputError
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array
 from elastocal.manipulator.limits import finite_ranges, joint_limits
 from elastocal.manipulator.reaching import Reaching
@@ -66,7 +66,7 @@ class CorrectionTable:
     between: Array
 
 
-def joint_grid(arm: Calibrated, counts: tuple[int, ...]) -> Grid:
+def joint_grid(arm: CalibratedArm, counts: tuple[int, ...]) -> Grid:
     """`counts` levels per joint (one number for all) over the joint limits; one level: the middle.
 
     Raises InputError for a wrong number of counts or too many points.
@@ -105,7 +105,7 @@ def _levels(low: float, high: float, count: int) -> Array:
 
 
 def correction_table(
-    arm: Calibrated,
+    arm: CalibratedArm,
     grid: Grid,
     point: ToolPoint,
     force: Array | None = None,

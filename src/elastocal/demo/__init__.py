@@ -12,7 +12,7 @@ import numpy as np
 
 from elastocal.errors import InputError
 from elastocal.files import atomic_write_text
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 
 LOAD_N = (0.0, 0.0, -2600.0)  # 265 kg: the paper hung 250 to 280 kg
 REPEATS = 6
@@ -31,7 +31,7 @@ class Demo:
     data: Path
     truth: dict[str, float]
     published: dict[str, tuple[float, float]]
-    result: IdentificationResult
+    result: Calibration
 
 
 def run_demo(
@@ -54,7 +54,7 @@ def run_demo(
     progress("copying the example")
     cell_path, plan_path = _copy_example(folder)
     cell = read_cell(cell_path)
-    model = Model.from_cell(cell)
+    model = Model(cell)
     plan = read_plan(plan_path, joint_kinds=model.chain.kinds)
     rows = expand_plan(plan, tuple(cell.tool.markers), REPEATS, np.array(LOAD_N))
     rows = replace(rows, sigma=reading_sigma(folder)[rows.configuration])

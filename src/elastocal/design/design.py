@@ -73,7 +73,7 @@ class _Design:
             )
         self.cell, self.options = cell, options
         self.checkpoint, self.progress = checkpoint, progress
-        self.model = Model.from_cell(cell, options.done.marker_names if options.done else ())
+        self.model = Model(cell, options.done.marker_names if options.done else ())
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)

@@ -25,7 +25,7 @@ from elastocal.export.urdf import Frames, calibrated_urdf
 from elastocal.export.urdf_new import BASE, FLANGE, new_urdf
 from elastocal.export.yaml_text import to_yaml
 from elastocal.json_text import json_text
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array, Chain
 
 SCHEMA = "elastocal/export/1"
@@ -76,7 +76,7 @@ class Exported:
 
 
 def export(
-    calibrated: Calibrated, wish: Wish, progress: Callable[[str], None] = lambda _: None
+    calibrated: CalibratedArm, wish: Wish, progress: Callable[[str], None] = lambda _: None
 ) -> Exported:
     """The calibrated arm as the text of a file.
 
@@ -108,7 +108,7 @@ Written = tuple[str, float | None, str, list[str], float | None]
 
 
 def _written(
-    calibrated: Calibrated,
+    calibrated: CalibratedArm,
     wish: Wish,
     kept: Kept,
     pieces: Pieces,
@@ -128,7 +128,7 @@ def _written(
     return json_text(document) + "\n", None, "", [], None
 
 
-def _note(calibrated: Calibrated, wish: Wish) -> str:
+def _note(calibrated: CalibratedArm, wish: Wish) -> str:
     """One line for a comment in the file: where its numbers come from, what they hold for."""
     cell = calibrated.model.cell
     source = Path(calibrated.source).name
@@ -140,7 +140,7 @@ def _note(calibrated: Calibrated, wish: Wish) -> str:
     return told
 
 
-def _urdf(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
+def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
     from elastocal.manipulator.urdf import read_urdf
 
     robot = calibrated.model.cell.robot
@@ -160,7 +160,7 @@ def _urdf(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Wri
     return text, check_chain(text, ".urdf", read, chain, kept, wish.seed), "pinocchio", [], None
 
 
-def _mjcf(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
+def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
     cell = calibrated.model.cell
     inertias: tuple[Array, ...] = ()
     if pieces.masses and cell.robot.urdf is not None:
@@ -202,7 +202,7 @@ def _compensator(part: Valued) -> dict[str, float] | None:
     return {name.partition(".")[2]: v for name, v in values.items()} | {"joint": joint}
 
 
-def _dh(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
+def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
     from elastocal.manipulator.dh import read_dh
 
     convention = CONVENTIONS[wish.format]
@@ -224,7 +224,7 @@ def _dh(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Writt
     return text, checked, "elastocal's own reader of DH tables", [], beta
 
 
-def _warnings(calibrated: Calibrated, cost: Cost) -> list[str]:
+def _warnings(calibrated: CalibratedArm, cost: Cost) -> list[str]:
     found = []
     spec = calibrated.model.cell.model
     elastic = {"joint_compliance", "off_axis_compliance", "link_bending", "base_compliance"}

@@ -11,14 +11,14 @@ from elastocal.export.cost import Cost
 from elastocal.export.pieces import Pieces
 from elastocal.export.rigid_text import rpy
 from elastocal.files import read_text
-from elastocal.manipulator.calibrated import MOST_BYTES, Calibrated
+from elastocal.manipulator.calibrated import MOST_BYTES, CalibratedArm
 from elastocal.manipulator.chain import Array
 
 SCHEMA = "elastocal/parameters/1"
 KEYS = ("value", "unit", "std", "ci95", "identifiable", "combined_with", "nominal", "held", "note")
 
 
-def read_estimates(calibrated: Calibrated) -> list[dict[str, Any]]:
+def read_estimates(calibrated: CalibratedArm) -> list[dict[str, Any]]:
     """Per parameter of the result file, in the model's order: name and what identify says of it.
 
     What an older file does not have is null.
@@ -38,7 +38,7 @@ def held_values(estimates: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def parameter_document(
-    calibrated: Calibrated, estimates: list[dict[str, Any]], pieces: Pieces, cost: Cost
+    calibrated: CalibratedArm, estimates: list[dict[str, Any]], pieces: Pieces, cost: Cost
 ) -> dict[str, Any]:
     """Everything to be written: estimates, the geometry they make, and that geometry's cost.
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import linalg
 
 from elastocal.identification.outliers import blocks
-from elastocal.identification.result import IdentificationResult, Outlier
+from elastocal.identification.result import Calibration, Outlier
 from elastocal.identification.solve import Solution
 from elastocal.identification.variance.choose import SHARED
 
@@ -19,7 +19,7 @@ MANY = 0.05
 LACK_OF_FIT = 0.001  # false-alarm rate of a sentence that calls intervals too narrow
 
 
-def warnings_for(result: IdentificationResult, solution: Solution) -> IdentificationResult:
+def warnings_for(result: Calibration, solution: Solution) -> Calibration:
     """The same result with its warnings."""
     found = [
         *_convergence(result),
@@ -33,7 +33,7 @@ def warnings_for(result: IdentificationResult, solution: Solution) -> Identifica
     return replace(result, warnings=tuple(found))
 
 
-def _convergence(result: IdentificationResult) -> list[str]:
+def _convergence(result: Calibration) -> list[str]:
     if result.converged:
         return []
     return [
@@ -42,7 +42,7 @@ def _convergence(result: IdentificationResult) -> list[str]:
     ]
 
 
-def _few_poses(result: IdentificationResult) -> list[str]:
+def _few_poses(result: Calibration) -> list[str]:
     found, n = [], len(result.determined)
     if result.dof < FEW_DOF_PER_PARAMETER * n:
         found.append(
@@ -57,7 +57,7 @@ def _few_poses(result: IdentificationResult) -> list[str]:
     return found
 
 
-def _conditioning(result: IdentificationResult, solution: Solution) -> list[str]:
+def _conditioning(result: Calibration, solution: Solution) -> list[str]:
     kept = solution.reduction.kept
     # Unit columns: what is judged is how far they are from parallel, not their units.
     scaled = solution.fit.triangle.R
@@ -74,7 +74,7 @@ def _conditioning(result: IdentificationResult, solution: Solution) -> list[str]
     ]
 
 
-def _noise(result: IdentificationResult) -> list[str]:
+def _noise(result: Calibration) -> list[str]:
     ratio = result.noise["ratio_to_stated"]
     if ratio is None or ratio < FAR_ABOVE_STATED:
         return []
@@ -85,7 +85,7 @@ def _noise(result: IdentificationResult) -> list[str]:
     ]
 
 
-def _lack_of_fit(result: IdentificationResult) -> list[str]:
+def _lack_of_fit(result: Calibration) -> list[str]:
     found = result.noise["lack_of_fit"]
     if found is None or found["p"] > LACK_OF_FIT or str(result.noise["kind"]).endswith(SHARED):
         return []  # shared effects in the noise model: the intervals count with them
@@ -99,7 +99,7 @@ def _lack_of_fit(result: IdentificationResult) -> list[str]:
     ]
 
 
-def _bounds(result: IdentificationResult, solution: Solution) -> list[str]:
+def _bounds(result: Calibration, solution: Solution) -> list[str]:
     found = []
     at_bound = {result.model.names[c] for c in solution.reduction.at_bound}
     for e, p in zip(result.estimates, result.model.parameters, strict=True):
@@ -133,7 +133,7 @@ def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
     return f"1 reading {one}" if n == 1 else f"{n} readings {many}"
 
 
-def _outliers(result: IdentificationResult) -> list[str]:
+def _outliers(result: Calibration) -> list[str]:
     found = []
     if result.outliers:
         lines = _lines(result.outliers)

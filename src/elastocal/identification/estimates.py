@@ -16,9 +16,9 @@ from elastocal.identification.methods import Found, is_exact
 from elastocal.identification.noise_summary import noise_summary
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
 from elastocal.identification.result import (
+    Calibration,
     Combination,
     Estimate,
-    IdentificationResult,
     Outlier,
 )
 from elastocal.identification.solve import Solution, residual_sigma
@@ -31,7 +31,7 @@ CORRELATED = 0.9
 
 def summarise(
     model: Model, whole: Solution, clean: Solution, found: Found, beyond: tuple[Outlier, ...]
-) -> IdentificationResult:
+) -> Calibration:
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
     `whole` holds all readings, `clean` the fit to those that agree.  `beyond` are the readings
@@ -46,7 +46,7 @@ def summarise(
     seen = solution.problem.observations
     set_apart = len(seen.lead) < len(whole.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
-    result = IdentificationResult(
+    result = Calibration(
         model=model,
         method=found.method,
         noise=noise_summary(found, sigma),

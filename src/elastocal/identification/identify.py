@@ -16,7 +16,7 @@ from elastocal.identification.noise import Weights, scaled_by_component, weights
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
 from elastocal.identification.partition import partition
-from elastocal.identification.result import IdentificationResult, TestErrors
+from elastocal.identification.result import Calibration, TestErrors
 from elastocal.identification.solve import Problem, Progress, Solution, solve
 from elastocal.identification.start import start_values
 from elastocal.manipulator.model import Model
@@ -34,7 +34,7 @@ def identify(
     options: Options | None = None,
     test: Measurements | None = None,
     progress: Progress = lambda message: None,
-) -> IdentificationResult:
+) -> Calibration:
     """Parameters with intervals from nothing but the nominal arm and a table.
 
     Start by registration, a first fit weakly tied to it, choice of a minimal complete set of

@@ -97,7 +97,7 @@ class TestErrors:
 
 
 @dataclass(frozen=True)
-class IdentificationResult(ForNotebooks):
+class Calibration(ForNotebooks):
     """What `identify` found.
 
     `x` (parameters,) are the values the model uses; `covariance` (determined, determined) goes

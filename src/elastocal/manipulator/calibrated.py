@@ -25,7 +25,7 @@ MOST_BYTES = 200_000_000  # a covariance of 3000 parameters
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class CalibratedArm:
     """`model` and the values x (parameters,) it predicts with; `source` is the result file.
 
     `covariance` (determined, determined) belongs to the parameters `determined`; what the data
@@ -44,7 +44,7 @@ class Calibrated:
         return dict(zip(self.model.names, map(float, self.x), strict=True))
 
 
-def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrated:
+def read_calibrated(cell_path: str | Path, result_path: str | Path) -> CalibratedArm:
     """The model of a cell file with the values of a result file (`identify -o`).
 
     Raises InputError where either file is invalid, or where the result belongs to another
@@ -61,11 +61,11 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
             if where.startswith("marker:")
         )
     )
-    model = Model.from_cell(cell, markers)
+    model = Model(cell, markers)
     _check_same(model, held, cell_path, result_path)
     _check_robot(model, result.get("nominal_flange"), cell_path, result_path)
     determined, covariance = _covariance(result, held, result_path)
-    return Calibrated(
+    return CalibratedArm(
         model,
         np.array([held[name] for name in model.names]),
         determined,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from statistics import median
 
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.identification.robust.report import Finding
 from elastocal.report.method import method_of
 from elastocal.report.units import length, significant
@@ -20,7 +20,7 @@ PLACE = {
 }
 
 
-def fault_lines(result: IdentificationResult, most: int | None = None) -> list[str]:
+def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
     """A sentence per group of readings beyond the noise, the largest first; of more, how many."""
     report = result.faulty_report
     groups = [] if report is None else [f for f in report.findings if f.level != "reading"]
@@ -29,7 +29,7 @@ def fault_lines(result: IdentificationResult, most: int | None = None) -> list[s
     return [*lines, f"And {more} more."] if more else lines
 
 
-def false_alarm_line(result: IdentificationResult) -> str | None:
+def false_alarm_line(result: Calibration) -> str | None:
     """How often the search would accuse readings of a table in which nothing is wrong."""
     report = result.faulty_report
     if report is None or not fault_lines(result):
@@ -38,7 +38,7 @@ def false_alarm_line(result: IdentificationResult) -> str | None:
     return f"Of tables in which nothing is wrong, at most {share:g} % would yield any finding."
 
 
-def _sentence(result: IdentificationResult, finding: Finding) -> str:
+def _sentence(result: Calibration, finding: Finding) -> str:
     n, beyond = len(finding.lines), finding.beyond
     how = "err in common by" if finding.pattern == "common" else "scatter by"
     size, noise = _metres(result, finding), f"{significant(finding.sigmas, 2)} times the noise"
@@ -49,7 +49,7 @@ def _sentence(result: IdentificationResult, finding: Finding) -> str:
     return f"{text}{_influence(result, finding)}."
 
 
-def _metres(result: IdentificationResult, finding: Finding) -> float | None:
+def _metres(result: Calibration, finding: Finding) -> float | None:
     """Typical error in m, None where most of the readings are not listed one by one.
 
     The median where they err in common, which those that do not leave alone; else the rms.  Where
@@ -67,7 +67,7 @@ def _metres(result: IdentificationResult, finding: Finding) -> float | None:
     return math.sqrt(sum(r * r for r in listed) / len(listed))
 
 
-def _influence(result: IdentificationResult, finding: Finding) -> str:
+def _influence(result: Calibration, finding: Finding) -> str:
     """What they do, or would do if fitted along, to the parameter that they move most."""
     names = () if result.faulty_report is None else result.faulty_report.names
     name = printable(names[finding.column]) if names else "a parameter"
@@ -78,7 +78,7 @@ def _influence(result: IdentificationResult, finding: Finding) -> str:
     return f"; {how} {name} by {count} standard deviation{'' if count == '1.0' else 's'}"
 
 
-def _bends(result: IdentificationResult, finding: Finding) -> bool:
+def _bends(result: Calibration, finding: Finding) -> bool:
     """Whether the readings have their full weight in the fit."""
     apart = {o.line for o in result.excluded} & set(finding.lines)
     return method_of(result) in FULL_WEIGHT and not apart

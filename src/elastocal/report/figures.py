@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.report.residuals import (
     Residuals,
     reach,
@@ -102,7 +102,7 @@ def against_joints(kinds: Sequence[str], residuals: Residuals) -> str:
     return drawn(draw, WIDTH, 0.4 + 2.0 * rows, "Residuals against joint positions")
 
 
-def errors(result: IdentificationResult) -> str:
+def errors(result: Calibration) -> str:
     """Nominal, fitted, held-out and test rms on one axis, logarithmic where they differ much."""
     rows = [(name, v) for name, v in rms_by_kind(result) if np.isfinite(v) and v > 0]
 
@@ -129,7 +129,7 @@ def errors(result: IdentificationResult) -> str:
     return drawn(draw, WIDTH / 2, 2.9, "Nominal, fitted, held-out and test error")
 
 
-def held_out(result: IdentificationResult, residuals: Residuals) -> str:
+def held_out(result: Calibration, residuals: Residuals) -> str:
     """Held-out against fitted rms of every configuration: far above the line, few others help."""
     fitted, held = rms_by_pose(result, residuals)
     finite = np.isfinite(held)

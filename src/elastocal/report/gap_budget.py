@@ -12,7 +12,7 @@ from elastocal.diagnosis.heldout import resampled_rms
 from elastocal.errors import ElastocalError
 from elastocal.identification.heldout import held_out_residual
 from elastocal.identification.noise import weights_for
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.report.verdict import nominal_arm
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ class Budget:
     floor_name: str
 
 
-def gap_budget(result: IdentificationResult) -> Budget | None:
+def gap_budget(result: Calibration) -> Budget | None:
     """Held-out 3-D errors as the model gains base and markers, geometry, compliance.
 
     Each step fits the parameters of its stages that the whole fit determined, the later ones held
@@ -71,7 +71,7 @@ def gap_budget(result: IdentificationResult) -> Budget | None:
 
 
 def _fitted(
-    result: IdentificationResult, columns: NDArray[np.int64], held: NDArray[np.bool_]
+    result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
 ) -> Array | None:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
     model, seen = result.model, result.observations
@@ -100,9 +100,7 @@ def _fitted(
     return found if np.isfinite(found).all() else None
 
 
-def _step(
-    name: str, result: IdentificationResult, residual: Array, rng: np.random.Generator
-) -> ErrorStep:
+def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> ErrorStep:
     seen = result.observations
     squared = (residual.reshape(-1, seen.size)[:, :3] ** 2).sum(axis=1)
     _, code = np.unique(seen.configuration, return_inverse=True)
@@ -110,7 +108,7 @@ def _step(
     return ErrorStep(name, rms, ci95)
 
 
-def _floor(result: IdentificationResult) -> tuple[float | None, str]:
+def _floor(result: Calibration) -> tuple[float | None, str]:
     """What repeats scatter, else what the stated noise gives."""
     seen = result.observations
     force = np.round(seen.table.force[seen.lead], 3)

@@ -9,7 +9,7 @@ from typing import Any
 
 from elastocal.files import atomic_write_text
 from elastocal.identification.residual_summary import ResidualSummary
-from elastocal.identification.result import IdentificationResult, Outlier
+from elastocal.identification.result import Calibration, Outlier
 from elastocal.report import identification_figures
 from elastocal.report.faults import false_alarm_line, fault_lines
 from elastocal.report.gap_budget import Budget, gap_budget
@@ -48,7 +48,7 @@ Published = Mapping[str, tuple[float, float]]
 
 
 def write_report(
-    result: IdentificationResult,
+    result: Calibration,
     path: str | Path,
     truth: Truth | None = None,
     command: str | None = None,
@@ -68,7 +68,7 @@ def write_report(
 
 
 def report_page(
-    result: IdentificationResult,
+    result: Calibration,
     truth: Truth | None = None,
     command: str | None = None,
     inputs: Inputs = None,
@@ -84,9 +84,7 @@ def report_page(
     )
 
 
-def _contents(
-    result: IdentificationResult, truth: Truth | None, published: Published
-) -> dict[str, Any]:
+def _contents(result: Calibration, truth: Truth | None, published: Published) -> dict[str, Any]:
     from markupsafe import Markup
 
     residuals, summary, budget = residuals_of(result), summary_of(result), gap_budget(result)
@@ -141,14 +139,14 @@ def _floor(budget: Budget | None) -> str:
     return f"The dashed line is what noise alone gives ({budget.floor_name})."
 
 
-def _endless(result: IdentificationResult) -> str:
+def _endless(result: Calibration) -> str:
     """A sentence for bars that run off, empty where every interval has two ends."""
     intervals = [e.ci95 for e in result.estimates] + [c.ci95 for c in result.combinations]
     endless = any(math.isinf(end) for ci95 in intervals for end in ci95 or ())
     return " An interval without an end runs to the edge." if endless else ""
 
 
-def _noise(result: IdentificationResult, summary: ResidualSummary | None) -> dict[str, Any]:
+def _noise(result: Calibration, summary: ResidualSummary | None) -> dict[str, Any]:
     """Sentences and rows of the section on noise."""
     sentences = [text for label, text in noise_lines(result) if label != "Residuals"]
     deviating = () if summary is None else summary.deviating
@@ -170,7 +168,7 @@ def _held_out_scatter(summary: ResidualSummary | None) -> str:
     return f"In held-out configurations the scatter is {size} times that of the noise model."
 
 
-def _thinning(result: IdentificationResult, residuals: Residuals) -> dict[str, str]:
+def _thinning(result: Calibration, residuals: Residuals) -> dict[str, str]:
     """Sentences on how many readings the scatter plots show, empty where it is all."""
     from elastocal.report.figures import MOST_JOINT_DOTS
     from elastocal.report.place_figures import MOST_PARAMETERS

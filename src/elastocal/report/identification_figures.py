@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from elastocal.identification.residual_summary import ResidualSummary
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.report.gap_budget import Budget
 from elastocal.report.residuals import Residuals
 from elastocal.report.space import Space
 
 
 def drawn_for(
-    result: IdentificationResult,
+    result: Calibration,
     residuals: Residuals,
     summary: ResidualSummary | None,
     budget: Budget | None,

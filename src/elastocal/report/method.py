@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from elastocal.identification.constrained.minimise import ActiveConstraint
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.report.units import display, plain
 from elastocal.report.words import printable
 
@@ -102,11 +102,11 @@ HELD = {
 ROBUST = "asymptotic covariance of the robust estimate ({}); assumes independent readings"
 
 
-def method_of(result: IdentificationResult) -> str:
+def method_of(result: Calibration) -> str:
     return str(result.method).replace("_", "-")
 
 
-def method_and_weights(result: IdentificationResult) -> str:
+def method_and_weights(result: Calibration) -> str:
     """The method, and the weights where the method does not say them."""
     method, noise = method_of(result), result.noise
     if method == "constrained":
@@ -117,7 +117,7 @@ def method_and_weights(result: IdentificationResult) -> str:
     return f"{text}, {printable(str(noise['description']))}"
 
 
-def _constrained(result: IdentificationResult) -> str:
+def _constrained(result: Calibration) -> str:
     """What was known besides the readings, and the weights that the method before it gave these."""
     prior, active = bool(result.prior_share), bool(result.active)
     text = "fit with a prior" if prior else "fit under constraints"
@@ -129,18 +129,18 @@ def _constrained(result: IdentificationResult) -> str:
     return f"{text}, {how}{printable(str(noise['description']))}"
 
 
-def interval_kind(result: IdentificationResult) -> str:
+def interval_kind(result: Calibration) -> str:
     found: dict[str, Any] = result.noise.get("intervals") or {"kind": "classical"}
     return str(found["kind"]).lower()
 
 
-def takes_configurations_as_a_whole(result: IdentificationResult) -> bool:
+def takes_configurations_as_a_whole(result: Calibration) -> bool:
     """Whether the intervals hold where the readings of a configuration are correlated."""
     kind = interval_kind(result)
     return kind in ("wild", "clustered") or kind.startswith("cr")
 
 
-def intervals_line(result: IdentificationResult) -> str:
+def intervals_line(result: Calibration) -> str:
     """Which kind of interval, and what it assumes."""
     kind = interval_kind(result)
     if kind in INTERVALS:
@@ -154,7 +154,7 @@ def intervals_line(result: IdentificationResult) -> str:
     return printable(f"{kind}: {description}" if description else kind)
 
 
-def constraints_line(result: IdentificationResult) -> str | None:
+def constraints_line(result: Calibration) -> str | None:
     """Which constraints hold with equality, and what the intervals make of them."""
     active = result.active
     if not active:
@@ -181,7 +181,7 @@ def _in_words(a: ActiveConstraint, units: dict[str, str]) -> str:
     return f"{printable(a.names[0])} {SIGNS[a.kind]} {plain(value)} {unit}"
 
 
-def prior_line(result: IdentificationResult) -> str | None:
+def prior_line(result: Calibration) -> str | None:
     """Parameters that owe more than half of their information to the prior."""
     shares = result.prior_share
     if not shares:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.identification.variance.choose import SHARED
 from elastocal.report.method import method_of, takes_configurations_as_a_whole
 from elastocal.report.units import length, significant
@@ -31,7 +31,7 @@ KINDS = {
 }
 
 
-def does_noise_explain_it(result: IdentificationResult) -> str:
+def does_noise_explain_it(result: Calibration) -> str:
     """Residual against stated noise, judged by the χ² distribution of its mean square."""
     ratio = result.noise.get("ratio_to_stated")
     if ratio is None:
@@ -59,12 +59,12 @@ def does_noise_explain_it(result: IdentificationResult) -> str:
     return text
 
 
-def _is_estimated(result: IdentificationResult) -> bool:
+def _is_estimated(result: Calibration) -> bool:
     """Whether the weights come from a noise model with estimated variances."""
     return method_of(result) in ("reml", "constrained") and bool(result.noise.get("variances"))
 
 
-def _why_not_judged(result: IdentificationResult) -> str:
+def _why_not_judged(result: Calibration) -> str:
     """What is missing for a comparison of the residual with stated noise."""
     seen, tracker = result.observations, result.model.cell.tracker
     stated = available_noise(seen.table, tracker) != "none"
@@ -79,7 +79,7 @@ def _why_not_judged(result: IdentificationResult) -> str:
     return f"No noise was stated, {nothing_says}"
 
 
-def noise_model_line(result: IdentificationResult) -> str | None:
+def noise_model_line(result: Calibration) -> str | None:
     """The estimated noise model with its sizes, and why it was chosen."""
     noise = result.noise
     sizes, reason = size_rows(noise), noise.get("reason")
@@ -132,7 +132,7 @@ def kind_in_words(kind: str) -> str:
     return f"{text} + deviations of a configuration" if kind.endswith(SHARED) else text
 
 
-def repeats_line(result: IdentificationResult) -> str | None:
+def repeats_line(result: Calibration) -> str | None:
     """The lack-of-fit test, and what follows from it for the intervals; None without repeats."""
     found = result.noise.get("lack_of_fit")
     if found is None:

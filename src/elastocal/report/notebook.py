@@ -15,7 +15,7 @@ from elastocal.compensation.compensate import Compensation
 from elastocal.design.plan import Plan
 from elastocal.diagnosis.result import Diagnosis
 from elastocal.errors import InputError
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.nearest import did_you_mean, listed, quoted
 from elastocal.report import notebook_figures as figures
 from elastocal.report.diagnosis_rows import BUDGET, CANDIDATES, budget_rows, candidate_rows
@@ -60,7 +60,7 @@ def view_of(result: object) -> View:
     raise TypeError(type(result).__name__)
 
 
-def _identification(result: IdentificationResult) -> str:
+def _identification(result: Calibration) -> str:
     known = [row for row in parameter_rows(result, None) if row.determined]
     rows = [(r.name, r.value, r.interval, r.unit, r.nominal) for r in known]
     rows += [(r.name, r.value, r.interval, r.unit, "") for r in combination_rows(result, None)]
@@ -130,7 +130,7 @@ def _lines(lines: Sequence[tuple[str, str]]) -> str:
     return "".join(f"<p><b>{escape(label)}:</b> {escape(text)}</p>" for label, text in lines)
 
 
-def _estimates(result: IdentificationResult) -> pd.DataFrame:
+def _estimates(result: Calibration) -> pd.DataFrame:
     """One row per parameter, SI units: NaN where the data do not determine it alone."""
     import pandas as pd
 
@@ -204,7 +204,7 @@ def _commands(c: Compensation) -> pd.DataFrame:
 
 
 VIEWS: dict[type, View] = {
-    IdentificationResult: View(
+    Calibration: View(
         _identification,
         _estimates,
         {"residuals": figures.residuals, "parameters": figures.parameters},

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from elastocal.compensation.compensate import Compensation
 from elastocal.design.plan import Plan
 from elastocal.diagnosis.result import Diagnosis
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.report.diagnosis_rows import error_steps
 from elastocal.report.diagnosis_words import effect_at, name_of
 from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
@@ -36,7 +36,7 @@ class Bars:
     axis: str
 
 
-def residuals(result: IdentificationResult, interactive: bool) -> Any:
+def residuals(result: Calibration, interactive: bool) -> Any:
     """Residual of every reading (at most 5000) over its configuration, one panel a component."""
     found = residuals_of(result)
     panels = [f"{c} in {u}" for c, u in zip(found.components, found.units, strict=True)]
@@ -83,7 +83,7 @@ def residuals(result: IdentificationResult, interactive: bool) -> Any:
     return _figure(draw, (9.0, 0.8 + 1.5 * len(panels)))
 
 
-def parameters(result: IdentificationResult, interactive: bool) -> Any:
+def parameters(result: Calibration, interactive: bool) -> Any:
     """Deviation of each identified parameter from nominal in units of its 95 % half width."""
     kept = [e for e in result.estimates if e.value is not None and e.ci95 is not None]
     kept = [e for e in kept if np.isfinite(e.ci95).all()][:MOST_BARS]  # type: ignore[arg-type]

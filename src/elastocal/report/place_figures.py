@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.observation import Observations
 from elastocal.report.figures import MOST_LABELS, WIDTH
 from elastocal.report.residuals import Residuals, reach, running_mean
@@ -105,7 +105,7 @@ def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
     axes.set_aspect("equal")
 
 
-def correlation_matrix(result: IdentificationResult) -> str:
+def correlation_matrix(result: Calibration) -> str:
     """Correlations of the parameters that the data determine; empty where there are fewer than two.
 
     Size by the shade, sign by hatching or number, so that no colour has to be told apart.
@@ -143,7 +143,7 @@ def correlation_matrix(result: IdentificationResult) -> str:
     return drawn(draw, size, 0.92 * size, "Correlations between the parameters")
 
 
-def correlations(result: IdentificationResult) -> tuple[list[str], Array]:
+def correlations(result: Calibration) -> tuple[list[str], Array]:
     """Names and correlations (n, n) of the determined parameters with a finite variance; of many,
     those that correlate most."""
     variance = np.diag(result.covariance)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from elastocal.identification.noise import weights_for
 from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.manipulator.observation import COMPONENTS, Observations
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Residuals:
         return self.units.count("µm")
 
 
-def residuals_of(result: IdentificationResult) -> Residuals:
+def residuals_of(result: Calibration) -> Residuals:
     return residuals_by(result.observations, result.residual)
 
 
@@ -72,7 +72,7 @@ def residuals_by(seen: Observations, residual: Array) -> Residuals:
     )
 
 
-def summary_of(result: IdentificationResult) -> ResidualSummary | None:
+def summary_of(result: Calibration) -> ResidualSummary | None:
     """The result's own summary of its whitened residuals, else one of the standardised ones."""
     own: ResidualSummary | None = getattr(result, "residual_summary", None)
     if own is not None:
@@ -80,7 +80,7 @@ def summary_of(result: IdentificationResult) -> ResidualSummary | None:
     return summarise_residuals(result.observations, standardised(result), absolute=False)
 
 
-def standardised(result: IdentificationResult) -> Array:
+def standardised(result: Calibration) -> Array:
     """Weighted residuals (rows,) over their standard deviation; unweighted where the result does
     not hold the weights: those of a given matrix or of an estimated noise."""
     seen, kind = result.observations, result.noise["kind"]
@@ -94,7 +94,7 @@ def standardised(result: IdentificationResult) -> Array:
     return (parts / np.where(spread > 0, spread, 1.0)).ravel()
 
 
-def rms_by_pose(result: IdentificationResult, residuals: Residuals) -> tuple[Array, Array]:
+def rms_by_pose(result: Calibration, residuals: Residuals) -> tuple[Array, Array]:
     """Fitted and held-out 3-D rms (configurations,) in µm; infinite where nothing is held out."""
     size = result.observations.size
     count = np.bincount(residuals.pose)

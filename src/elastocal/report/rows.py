@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from elastocal.identification.result import (
     LOPSIDED,
+    Calibration,
     Combination,
     Estimate,
-    IdentificationResult,
 )
 from elastocal.report.gap_budget import Budget
 from elastocal.report.page import Table
@@ -73,7 +73,7 @@ class Row:
 
 
 def parameter_rows(
-    result: IdentificationResult,
+    result: Calibration,
     truth: Truth | None,
     published: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[Row]:
@@ -124,7 +124,7 @@ def signed_change(change: float) -> str:
     return f"{'−' if change < 0 else '+'}{length(abs(change))}"
 
 
-def combination_rows(result: IdentificationResult, truth: Truth | None) -> list[Row]:
+def combination_rows(result: Calibration, truth: Truth | None) -> list[Row]:
     rows = []
     for c in result.combinations:
         true = None if truth is None else combination_truth(result, c, truth)

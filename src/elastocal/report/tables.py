@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from elastocal.identification.result import Combination, Estimate, IdentificationResult
+from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.report.console_table import titled
 from elastocal.report.noise import candidate_rows, size_rows
 from elastocal.report.rows import any_lopsided, half_head, signed_half, texts
@@ -41,7 +41,7 @@ STYLE = {"inside": "green", "outside": "bold red"}
 
 
 def parameter_table(
-    result: IdentificationResult,
+    result: Calibration,
     truth: Truth | None = None,
     undetermined: bool = True,
     brief: bool = False,
@@ -77,7 +77,7 @@ def parameter_table(
 
 
 def combination_table(
-    result: IdentificationResult, truth: Truth | None = None, brief: bool = False
+    result: Calibration, truth: Truth | None = None, brief: bool = False
 ) -> Table:
     """Sums of parameters that the data determine although their members they do not."""
     lopsided = any_lopsided(result.combinations)
@@ -89,7 +89,7 @@ def combination_table(
     return table
 
 
-def noise_tables(result: IdentificationResult) -> list[Table]:
+def noise_tables(result: Calibration) -> list[Table]:
     """Sizes of the estimated noise, and the noise models tried with their criterion over the best.
 
     A table that would have a single row is left out: the summary says it.
@@ -111,9 +111,7 @@ def noise_tables(result: IdentificationResult) -> list[Table]:
     return tables
 
 
-def print_result(
-    console: Console, result: IdentificationResult, truth: Truth | None = None
-) -> None:
+def print_result(console: Console, result: Calibration, truth: Truth | None = None) -> None:
     """Single estimates, combinations, what is not determined, and the summary in words."""
     brief = console.width < NARROW
     alone = len(names_of(result, ALONE))

@@ -9,7 +9,7 @@ from typing import Literal
 from scipy import stats
 
 from elastocal.identification.advice import MANY
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.report.noise import LACK_OF_FIT
 from elastocal.report.units import length, significant
 from elastocal.report.verdict import FLATTERS, counted
@@ -39,7 +39,7 @@ def without_sections(step: str) -> str:
     return step
 
 
-def judgement(result: IdentificationResult) -> Judgement:
+def judgement(result: Calibration) -> Judgement:
     """How good the calibration is and what follows from it."""
     if (why := _spoilt(result)) is not None:
         return Judgement("poor", f"Do not use this calibration: {why}.", _steps(result, False))
@@ -52,7 +52,7 @@ def judgement(result: IdentificationResult) -> Judgement:
     return Judgement("good", text, _steps(result, True))
 
 
-def _spoilt(result: IdentificationResult) -> str | None:
+def _spoilt(result: Calibration) -> str | None:
     """What makes the result worthless; None where nothing does."""
     if not result.converged:
         return f"the fit did not converge ({result.reason})"
@@ -65,7 +65,7 @@ def _spoilt(result: IdentificationResult) -> str | None:
     return None
 
 
-def _accuracy(result: IdentificationResult) -> str:
+def _accuracy(result: Calibration) -> str:
     what = {"deflection": "deflections", "distance": "distances"}.get(
         result.observations.kind, "positions"
     )
@@ -78,7 +78,7 @@ def _accuracy(result: IdentificationResult) -> str:
     return text
 
 
-def larger_than_noise(result: IdentificationResult) -> float | None:
+def larger_than_noise(result: Calibration) -> float | None:
     """Residual over stated noise where chance does not explain the excess; else None."""
     ratio = result.noise.get("ratio_to_stated")
     if ratio is None or ratio <= math.sqrt(stats.chi2.ppf(0.975, result.dof) / result.dof):
@@ -86,13 +86,13 @@ def larger_than_noise(result: IdentificationResult) -> float | None:
     return float(ratio)
 
 
-def lacks_fit(result: IdentificationResult) -> bool:
+def lacks_fit(result: Calibration) -> bool:
     """Whether configurations scatter more than the repeats of one explain."""
     found = result.noise.get("lack_of_fit")
     return found is not None and float(found["p"]) < LACK_OF_FIT
 
 
-def _worse_than_held_out(result: IdentificationResult) -> float | None:
+def _worse_than_held_out(result: Calibration) -> float | None:
     """Rms error (m) of the test data where it is larger than that of held-out poses; else None.
 
     An F-test of the two mean squares; the components of a reading count as one.
@@ -104,7 +104,7 @@ def _worse_than_held_out(result: IdentificationResult) -> float | None:
     return test.rms if test.rms > max(WORSE, allowed) * held else None
 
 
-def _doubts(result: IdentificationResult) -> list[str]:
+def _doubts(result: Calibration) -> list[str]:
     doubts = []
     held = result.heldout_rms
     if not math.isfinite(held) and result.test is None:
@@ -130,7 +130,7 @@ def _doubts(result: IdentificationResult) -> list[str]:
     return doubts
 
 
-def _steps(result: IdentificationResult, fine: bool) -> tuple[str, ...]:
+def _steps(result: Calibration, fine: bool) -> tuple[str, ...]:
     steps = []
     if larger_than_noise(result) is not None or lacks_fit(result):
         steps.append(

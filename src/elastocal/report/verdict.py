@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from elastocal.identification.result import IdentificationResult
+from elastocal.identification.result import Calibration
 from elastocal.report.faults import MOST_TOLD, fault_lines
 from elastocal.report.method import (
     constraints_line,
@@ -48,7 +48,7 @@ def counted(n: int, one: str, many: str | None = None) -> str:
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
-def what_was_identified(result: IdentificationResult) -> str:
+def what_was_identified(result: Calibration) -> str:
     alone, n = len(names_of(result, ALONE)), len(result.combinations)
     text = f"{alone} of {counted(len(result.estimates), 'parameter')} known on their own"
     if n:
@@ -64,7 +64,7 @@ def what_was_identified(result: IdentificationResult) -> str:
     return text + "."
 
 
-def how_well_it_predicts(result: IdentificationResult) -> str:
+def how_well_it_predicts(result: Calibration) -> str:
     """Held-out error beside the nominal one, and the error on test data."""
     what = {"deflection": "deflection", "distance": "distance"}.get(
         result.observations.kind, "position"
@@ -99,12 +99,12 @@ def how_well_it_predicts(result: IdentificationResult) -> str:
     return text
 
 
-def nominal_arm(result: IdentificationResult) -> str:
+def nominal_arm(result: Calibration) -> str:
     placed = any(p.effect in ("base_frame", "marker_position") for p in result.model.parameters)
     return "nominal arm (base and markers placed)" if placed else "nominal arm"
 
 
-def rms_by_kind(result: IdentificationResult) -> list[tuple[str, float]]:
+def rms_by_kind(result: Calibration) -> list[tuple[str, float]]:
     """What the errors are with the nominal arm, fitted, held out and on test data (3-D rms, m)."""
     rows = [
         (nominal_arm(result), result.nominal_rms),
@@ -114,7 +114,7 @@ def rms_by_kind(result: IdentificationResult) -> list[tuple[str, float]]:
     return rows if result.test is None else [*rows, ("test data", result.test.rms)]
 
 
-def rotation_rms(result: IdentificationResult) -> tuple[float, float] | None:
+def rotation_rms(result: Calibration) -> tuple[float, float] | None:
     """Fitted and held-out rms length of the rotation error in rad; None where none was read."""
     if result.observations.kind != "pose":
         return None
@@ -123,7 +123,7 @@ def rotation_rms(result: IdentificationResult) -> tuple[float, float] | None:
     return fitted, held
 
 
-def error_line(result: IdentificationResult) -> str:
+def error_line(result: Calibration) -> str:
     """All rms errors in one line."""
     text = ", ".join(f"{name} {length(value)}" for name, value in rms_by_kind(result))
     if (turns := rotation_rms(result)) is not None:
@@ -132,7 +132,7 @@ def error_line(result: IdentificationResult) -> str:
     return text
 
 
-def readings(result: IdentificationResult) -> str:
+def readings(result: Calibration) -> str:
     seen = result.observations
     poses = len(np.unique(seen.configuration))
     markers = len(np.unique(seen.table.marker[seen.lead]))
@@ -142,7 +142,7 @@ def readings(result: IdentificationResult) -> str:
     )
 
 
-def correlation_lines(result: IdentificationResult, most: int = MOST_CORRELATIONS) -> list[str]:
+def correlation_lines(result: Calibration, most: int = MOST_CORRELATIONS) -> list[str]:
     lines = []
     for a, b, r in result.correlations[:most]:
         number = f"{r:+.3f}" if abs(r) < 0.9995 else f"{r:+.6f}"
@@ -151,12 +151,12 @@ def correlation_lines(result: IdentificationResult, most: int = MOST_CORRELATION
     return [*lines, f"and {more} more"] if more else lines
 
 
-def coverage_line(result: IdentificationResult, truth: Truth) -> str:
+def coverage_line(result: Calibration, truth: Truth) -> str:
     hit, n = coverage(result, truth)
     return f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
 
 
-def noise_lines(result: IdentificationResult) -> list[tuple[str, str]]:
+def noise_lines(result: Calibration) -> list[tuple[str, str]]:
     """Label and sentence: estimated noise model, repeats, shape of the residuals."""
     summary = getattr(result, "residual_summary", None)
     found = [
@@ -167,13 +167,13 @@ def noise_lines(result: IdentificationResult) -> list[tuple[str, str]]:
     return [(label, text) for label, text in found if text is not None]
 
 
-def held_lines(result: IdentificationResult) -> list[tuple[str, str]]:
+def held_lines(result: Calibration) -> list[tuple[str, str]]:
     """Label and sentence: what constraints and prior put into the estimates."""
     found = [("Constraints", constraints_line(result)), ("Prior", prior_line(result))]
     return [(label, text) for label, text in found if text is not None]
 
 
-def summary_lines(result: IdentificationResult, truth: Truth | None = None) -> list[str]:
+def summary_lines(result: Calibration, truth: Truth | None = None) -> list[str]:
     """The result in words, one statement per line, warnings last."""
     lines = [
         f"Readings: {readings(result)}",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from elastocal.identification.result import (
+    Calibration,
     Combination,
     Estimate,
-    IdentificationResult,
     deviation,
 )
 from elastocal.report.units import significant
@@ -28,7 +28,7 @@ def short_name(name: str, most: int = 12) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
-def standings(result: IdentificationResult) -> dict[str, str]:
+def standings(result: Calibration) -> dict[str, str]:
     """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, INVISIBLE or FIXED."""
     first = {next(iter(c.terms)) for c in result.combinations}
 
@@ -44,7 +44,7 @@ def standings(result: IdentificationResult) -> dict[str, str]:
     return {e.name: standing(e) for e in result.estimates}
 
 
-def names_of(result: IdentificationResult, standing: str) -> list[str]:
+def names_of(result: Calibration, standing: str) -> list[str]:
     return [printable(name) for name, s in standings(result).items() if s == standing]
 
 
@@ -62,7 +62,7 @@ def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     return f"{text} + {more} more" if more else text
 
 
-def short_note(result: IdentificationResult, e: Estimate) -> str:
+def short_note(result: Calibration, e: Estimate) -> str:
     """Why a parameter has no number of its own, in a few words; empty where it has one."""
     standing = standings(result)[e.name]
     if standing == COMBINED:
@@ -76,21 +76,19 @@ def short_note(result: IdentificationResult, e: Estimate) -> str:
     return "fixed by the user" if standing == FIXED else printable(e.note)
 
 
-def held_where(result: IdentificationResult, names: list[str]) -> str:
+def held_where(result: Calibration, names: list[str]) -> str:
     """Where all of `names` are held: at nominal, or at a start value that is none."""
     chosen = [e for e in result.estimates if printable(e.name) in names]
     at_nominal = all(e.held == e.nominal and nominal_known(result, e.name) for e in chosen)
     return "held at nominal" if at_nominal else "held at the start value"
 
 
-def combination_truth(
-    result: IdentificationResult, combination: Combination, truth: Truth
-) -> float | None:
+def combination_truth(result: Calibration, combination: Combination, truth: Truth) -> float | None:
     """True value X_k + Σ f·(X_d − held_d), None where a member's true value is not known."""
     (first, _), *rest = combination.terms.items()
     if any(name not in truth for name in combination.terms):
         return None
-    shift = sum(f * (truth[name] - result.estimate(name).held) for name, f in rest)
+    shift = sum(f * (truth[name] - result[name].held) for name, f in rest)
     return truth[first] + shift
 
 
@@ -101,20 +99,20 @@ def inside(value: float | None, ci95: tuple[float, float] | None) -> str:
     return "inside" if ci95[0] <= value <= ci95[1] else "outside"
 
 
-def coverage(result: IdentificationResult, truth: Truth) -> tuple[int, int]:
+def coverage(result: Calibration, truth: Truth) -> tuple[int, int]:
     """How many 95 % intervals hold the true value, of how many that could be compared."""
     found = [inside(truth.get(e.name), e.ci95) for e in result.estimates]
     found += [inside(combination_truth(result, c, truth), c.ci95) for c in result.combinations]
     return found.count("inside"), len(found) - found.count("")
 
 
-def nominal_known(result: IdentificationResult, name: str) -> bool:
+def nominal_known(result: Calibration, name: str) -> bool:
     """False for a zero that only stands for "no nominal value stated", as of a compliance."""
     parameter = result.model.parameters[result.model.names.index(name)]
     return parameter.nominal != 0 or parameter.typical is not None
 
 
-def undetermined_lines(result: IdentificationResult) -> list[str]:
+def undetermined_lines(result: Calibration) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason."""
     lines = []
     if names := names_of(result, INVISIBLE):

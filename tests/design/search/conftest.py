@@ -112,6 +112,6 @@ def case() -> Callable[..., Case]:
             workspace=workspace or Workspace(),
             design=DesignSpec(**{"loads": LOAD} | (design or {})),
         )
-        return Case(Model(chain, cell))
+        return Case(Model.assembled(chain, cell))
 
     return build

@@ -231,7 +231,7 @@ def test_a_cell_without_room_says_which_rule_is_in_the_way(narrow) -> None:
     model, table = narrow
     weak = replace(model.cell, workspace=Workspace(torque_limits=(1e-3,) * 6))
     pair = diagnosis_of({ECCENTRIC: 0.7, SCALE: 0.3})
-    extra = plan_extra(Model(model.chain, weak), table, pair)
+    extra = plan_extra(Model.assembled(model.chain, weak), table, pair)
     assert not extra.separable and extra.plan is None
     assert extra.probability_after == pytest.approx(0.7)
     assert "torque" in extra.advice[0]
