@@ -3,7 +3,23 @@
 A message says what is wrong, where (file, row, column or key), what was found,
 and what to do.  The command line turns `InputError` into exit code 2 and
 `InsufficientDataError` into exit code 1, both without a traceback.
+
+A message that speaks of an option of a verb names it by `option`: in Python the keyword
+argument, on the command line the flag.
 """
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+
+from elastocal.nearest import did_you_mean, listed, quoted
+
+# Keyword arguments whose flag is another word; everywhere else joint1_x is --joint1-x.
+FLAGS = {"fixed": "--fix"}
+LISTS = ("fixed", "without")  # keyword arguments that take a list, and flags that are repeated
+
+_flags = False
 
 
 class ElastocalError(Exception):
@@ -22,6 +38,46 @@ class InsufficientDataError(ElastocalError):
     """The input is well formed, but the data do not support an answer."""
 
     exit_code = 1
+
+
+class UnknownNameError(InputError, KeyError):
+    """A name that is not there, looked up in a result or a model.  It is a KeyError too."""
+
+    __str__ = Exception.__str__  # a KeyError would show its message in quotes
+
+    @classmethod
+    def of(cls, what: str, name: object, there: Collection[str]) -> UnknownNameError:
+        """The error for `name`, which is no `what`: with the nearest name, and what there is."""
+        hint = did_you_mean(str(name), there)
+        return cls(f"no {what} {quoted(name)}{hint}; there are {listed(there)}")
+
+
+def option(keyword: str, value: object = None) -> str:
+    """An option of a verb as a message names it.
+
+    In Python its keyword argument, `seed` or outliers='drop'; within `options_as_flags`, on the
+    command line, its flag: --seed or --outliers drop.  It is worded where the message is made,
+    since messages end in results, their files and reports as well as in exceptions.
+    """
+    if _flags:
+        flag = FLAGS.get(keyword, "--" + keyword.replace("_", "-"))
+        if value is False:
+            return f"--no-{flag[2:]}"
+        return flag if value is None or value is True else f"{flag} {value}"
+    if value is None:
+        return f"`{keyword}`"
+    return f"{keyword}=[{value!r}]" if keyword in LISTS else f"{keyword}={value!r}"
+
+
+@contextmanager
+def options_as_flags() -> Iterator[None]:
+    """Within it messages name options by their flags, as the command line has them."""
+    global _flags
+    before, _flags = _flags, True
+    try:
+        yield
+    finally:
+        _flags = before
 
 
 def require(condition: bool, message: str) -> None:

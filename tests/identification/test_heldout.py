@@ -112,8 +112,9 @@ def test_a_level_measured_once_has_no_held_out_residual():
     """Joint 2's compliance at a level that only one configuration visits."""
     chain = planar_chain()
     levels = {"joint2": (-0.5, 0.7)}
-    model = Model.assembled(chain, cell_of(("base_frame", "joint_compliance"), compliance_levels=levels,
-                                 nominal=Nominal(joint_compliance=(1e-5,) * 3)))  # fmt: skip
+    nominal = Nominal(joint_compliance=(1e-5,) * 3)
+    effects = ("base_frame", "joint_compliance")
+    model = Model.assembled(chain, cell_of(effects, compliance_levels=levels, nominal=nominal))
     q = random_poses(chain, 12, 1)
     q[:, 1] = -0.5
     q[4, 1] = 0.7

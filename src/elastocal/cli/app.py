@@ -14,12 +14,10 @@ import typer
 from typer.core import TyperGroup
 
 from elastocal import __version__
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import ElastocalError, InputError, options_as_flags
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from elastocal.cell import Array
 
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 
@@ -77,7 +75,7 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
         try:
-            with _telling_of_ctrl_c():
+            with _telling_of_ctrl_c(), options_as_flags():
                 command(*args, **kwargs)
         except ElastocalError as error:
             _complain(str(error))
@@ -142,16 +140,6 @@ def options(
     if backend is not None:
         os.environ[VARIABLE] = backend
     chosen_backend()
-
-
-def checked_force(load: tuple[float, float, float] | None) -> Array | None:
-    """--load as a force (3,) in N, None where it is not given; InputError unless it is finite."""
-    import numpy as np
-
-    if load is not None and not np.isfinite(load).all():
-        found = " ".join(f"{value:g}" for value in load)
-        raise InputError(f"--load takes three finite numbers in N; found {found}")
-    return None if load is None else np.array(load)
 
 
 def check_outputs(*paths: Path | None) -> None:

@@ -14,7 +14,6 @@ from elastocal.cli.app import (
     Seed,
     app,
     check_outputs,
-    checked_force,
     console,
     progress_line,
     reporting_errors,
@@ -106,11 +105,12 @@ def compensate(
     from elastocal.compensation.point import tool_point
     from elastocal.files import atomic_write_text
     from elastocal.manipulator.calibrated import read_calibrated
+    from elastocal.manipulator.inputs import given_force
 
     # What can be wrong with the options is told before any file is read.
     _check_targets(targets, target, frame, output, table)
     _check_grid(table, grid, box, rotation)
-    force = checked_force(load)
+    force = given_force(load)
     written = [path for path in (output, table) if path is not None]
     check_outputs(*written)
     content, texts = {}, {}

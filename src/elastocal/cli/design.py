@@ -137,7 +137,7 @@ def design(
                 checkpoint.drop()
             raise
         interrupts.check()
-        write_all(plan, output, summary, programs, picture)
+        write_all(plan, output, programs, picture)
         if report is not None:
             progress("writing the report")
             write_page(plan, report, files)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -111,13 +111,8 @@ def identify(
     """
     from elastocal.cli.results import write_results
     from elastocal.identification.identify import identify as run
-    from elastocal.identification.noise import WeightKind
     from elastocal.identification.options import Options
 
-    if weights not in get_args(WeightKind):
-        raise InputError(
-            f"--weights takes one of {', '.join(get_args(WeightKind))}; found '{weights}'"
-        )
     # What can be wrong with the options is told before any file is read.
     chosen = Options(
         method=method,  # type: ignore[arg-type]

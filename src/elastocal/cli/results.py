@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shlex
 import sys
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import TYPE_CHECKING
 from elastocal.files import atomic_write_text
 from elastocal.identification.result import Calibration
 from elastocal.json_text import json_text
+from elastocal.saving import save_residuals
 
 if TYPE_CHECKING:
     from elastocal.report.html import Published
@@ -35,12 +34,7 @@ def write_results(
     if output is not None:
         atomic_write_text(output, json_text(result.to_json()) + "\n")
     if residuals is not None:
-        rows = result.residual_table()
-        text = io.StringIO()
-        writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        atomic_write_text(residuals, text.getvalue())
+        save_residuals(result, residuals)
     if report is not None:
         from elastocal.report.html import write_report
 

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.above import Result
 from elastocal.compensation.nominal import jumps, nominal_path
 from elastocal.compensation.notices import notices_of
 from elastocal.compensation.point import ToolPoint
@@ -24,14 +25,13 @@ from elastocal.manipulator.inverse_kinematics import inverse_kinematics
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.reaching import Reaching
 from elastocal.manipulator.tape import Tape
-from elastocal.notebook import ForNotebooks
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
 
 
-@dataclass(frozen=True)
-class Compensation(ForNotebooks):
+@dataclass(frozen=True, repr=False)
+class Compensation(Result):
     """Commands for n targets.
 
     `q` and `nominal` (n, joints) rad or m; `before` and `after` (n,) m: predicted distance of the
@@ -61,6 +61,15 @@ class Compensation(ForNotebooks):
     nominal_miss: Array
     uncertainty: Uncertainty
     warnings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return (
+            f"<Compensation {self.chain.name}: {int(self.reached.sum())} of {len(self)} targets "
+            "reached>"
+        )
+
+    def __len__(self) -> int:
+        return len(self.q)
 
     @property
     def reached(self) -> NDArray[np.bool_]:

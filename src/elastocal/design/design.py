@@ -28,7 +28,7 @@ from elastocal.design.select import Selection, select
 from elastocal.design.setup import Known, Pool, Setup, set_up
 from elastocal.design.shares import check_available, most_poses, shares_of
 from elastocal.design.target_poses import test_poses
-from elastocal.errors import InsufficientDataError, require
+from elastocal.errors import InsufficientDataError, option, require
 from elastocal.manipulator.model import Model
 from elastocal.nearest import did_you_mean, listed, quoted
 
@@ -199,7 +199,8 @@ class _Design:
         require(
             unit == "µm",
             f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria test_pose, "
-            f"I and G, not with {self.cell.design.criterion}; drop it, or compare by --curve",
+            f"I and G, not with {self.cell.design.criterion}; drop it, or "
+            f"compare by {option('curve')}",
         )
         return (target * 1e6 / unit_value) ** 2
 

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.above import Result
 from elastocal.design.criteria.base import Criterion
 from elastocal.design.order.execution import Execution
+from elastocal.design.plan_file import plan_rows
 from elastocal.design.random_plans import RandomPlans
 from elastocal.design.reasons import Predicted, Reason
 from elastocal.manipulator.model import Model
-from elastocal.notebook import ForNotebooks
+from elastocal.measurements import Measurements
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -87,8 +89,8 @@ class SizePoint:
     bound: float | None
 
 
-@dataclass(frozen=True)
-class Plan(ForNotebooks):
+@dataclass(frozen=True, repr=False)
+class Plan(Result):
     """q (N, n) in SI units, numbered by configuration; `load` (N,) the load state or −1 for all;
     `group` (N,) into `levels`.  `value` is Φ, `reported` what the user knows it by, in `unit`;
     `first` is the number of the first configuration: after those that were measured already."""
@@ -118,8 +120,25 @@ class Plan(ForNotebooks):
     first: int = 1
     chance: Chance | None = None
 
+    def __repr__(self) -> str:
+        sure = self.certificate.efficiency_pool
+        told = "" if sure is None else f", at least {100 * sure:.1f} % of the best of its pool"
+        return (
+            f"<Plan {self.model.chain.name}: {len(self)} poses by {self.criterion}, "
+            f"{self.reported:.4g} {self.unit}{told}>"
+        )
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def table(self) -> Measurements:
+        """The poses as a table for `simulate`, as the plan's file has them."""
+        rows = plan_rows(self.execution, self.configurations, self.group + 1, self.stated_forces)
+        return rows.table(self.model.chain.kinds)
+
     @property
     def configurations(self) -> tuple[str, ...]:
+        """Their names: numbers from `first` on."""
         return tuple(str(self.first + k) for k in range(len(self.q)))
 
     @property
@@ -137,7 +156,7 @@ class Plan(ForNotebooks):
         """The load states where the plan must state them row by row.
 
         Not where every pose is measured unloaded, or unloaded and under one load, which is what
-        `simulate --load` does to a plan without forces.
+        `simulate` does with a load to a plan without forces.
         """
         loaded = np.any(self.forces != 0, axis=1)
         usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from elastocal.above import Result
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.manipulator.effects.base import Stage
-from elastocal.notebook import ForNotebooks
+from elastocal.manipulator.model import Model
 
 Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
 Interval = tuple[float, float]
@@ -173,8 +174,8 @@ class NoiseFloor:
     faulty: tuple[FaultyReading, ...] = ()
 
 
-@dataclass(frozen=True)
-class Diagnosis(ForNotebooks):
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Result):
     """The whole answer.  `p_value`: of what was found, against the whole family of hypotheses."""
 
     verdict: Verdict
@@ -197,5 +198,13 @@ class Diagnosis(ForNotebooks):
     extra: ExtraPlan | None = field(default=None)
     # Keys of [model] that the effects found rest on, beyond their own names.
     model_keys: dict[str, str] = field(default_factory=dict)
+    # What was diagnosed: the model as it was given, and the name of its measurements.
+    model: Model | None = field(default=None, repr=False, compare=False)
+    data: str = ""
     # The arm as it was fitted before any effect was added, and its residuals.
     calibrated: Baseline | None = field(default=None, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{f.effect} at {f.where}" for f in self.effects)
+        robot = "" if self.model is None else f" {self.model.chain.name}"
+        return f"<Diagnosis{robot}: {self.verdict}{', ' + found if found else ''}>"

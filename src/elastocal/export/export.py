@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from elastocal.errors import option
 from elastocal.export.check import check_chain, check_rest
 from elastocal.export.cost import Cost, cost_of
 from elastocal.export.dh import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
@@ -16,9 +17,9 @@ from elastocal.export.kept import Conditions, Kept, Valued, keep
 from elastocal.export.mjcf import RIGID, calibrated_mjcf
 from elastocal.export.parameters import (
     cost_json,
+    estimates_of,
     held_values,
     parameter_document,
-    read_estimates,
 )
 from elastocal.export.pieces import Pieces, evaluate_pieces
 from elastocal.export.urdf import Frames, calibrated_urdf
@@ -84,7 +85,7 @@ def export(
     where no random pose has an equilibrium under the load, and ElastocalError where the text,
     read back, is another arm than the model.
     """
-    estimates = read_estimates(calibrated)
+    estimates = estimates_of(calibrated)
     kept = keep(calibrated, elastic=wish.format == "mjcf", conditions=wish.conditions)
     pieces = evaluate_pieces(kept.exported, wish.conditions)
     progress("what the format cannot hold")
@@ -231,7 +232,7 @@ def _warnings(calibrated: CalibratedArm, cost: Cost) -> list[str]:
     active = {choice.name for choice in spec.effects}
     if active & elastic and not cost.force.any() and not spec.link_gravity:
         found.append(
-            "no load is given, so compliances cost nothing here: state one with --load "
+            f"no load is given, so compliances cost nothing here: state one with {option('load')} "
             "(N, in the tracker's axes)"
         )
     if spec.torque == "measured":

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from elastocal.cell import Array, Cell
+from elastocal.errors import option
 from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
@@ -149,7 +150,7 @@ def _of_the_measurement(name: str) -> bool:
 
 
 def _option(need: str) -> str:
-    return {"time": "--time-s", "temperature": "--temperature-c"}[need]
+    return option({"time": "time_s", "temperature": "temperature_c"}[need])
 
 
 def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:

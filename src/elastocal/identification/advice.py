@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
+from elastocal.errors import option
 from elastocal.identification.outliers import blocks
 from elastocal.identification.result import Calibration, Outlier
 from elastocal.identification.solve import Solution
@@ -139,7 +140,7 @@ def _outliers(result: Calibration) -> list[str]:
         lines = _lines(result.outliers)
         found.append(
             f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains ({lines}) "
-            "and had a part in the fit. Check them; --outliers drop leaves them out."
+            f"and had a part in the fit. Check them; {option('outliers', 'drop')} leaves them out."
         )
         if len(result.outliers) > MANY * len(result.observations.lead):
             found.append(
@@ -152,6 +153,6 @@ def _outliers(result: Calibration) -> list[str]:
         found.append(
             f"{_count(result.excluded, 'was', 'were')} left out as faulty ({lines}): the "
             "noise does not explain them. All are listed in the result under 'excluded'; "
-            "--outliers keep fits them too."
+            f"{option('outliers', 'keep')} fits them too."
         )
     return found

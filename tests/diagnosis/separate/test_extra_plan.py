@@ -77,11 +77,11 @@ def test_the_plan_repeats_the_load_states_after_the_campaign(narrow, few) -> Non
 
 
 def test_the_written_plan_can_be_measured(narrow, few, tmp_path) -> None:
-    from elastocal.cli.diagnosis_files import write_extra_poses
+    from elastocal.saving import save_extra_poses
 
     model, _ = narrow
     path = tmp_path / "extra.csv"
-    write_extra_poses(path, few.plan, model.chain.kinds)
+    save_extra_poses(path, few.plan, model.chain.kinds)
     read = read_plan(path, joint_kinds=model.chain.kinds)
     rows = expand_plan(read, tuple(model.cell.tool.markers))
     assert np.isfinite(simulate(model, rows, model.nominal, 0).position).all()
