@@ -37,7 +37,7 @@ class Saved:
         Raises:
             InputError: The file cannot be written, or not in this format.
 
-        Example:
+        Examples:
             >>> arm = ec.identify("cell.toml", "data.csv").arm
             >>> arm.save("calibrated.urdf")
             >>> arm.save("modified_dh.csv", format="mdh")
@@ -68,9 +68,10 @@ class Result(Saved):
         Raises:
             InputError: An input cannot be read, or the page not written.
 
-        Example:
+        Examples:
             >>> fit = ec.identify("cell.toml", "data.csv")
-            >>> fit.report("report.html")
+            >>> commands = ec.compensate(fit, [1.8, 0.0, 0.9], load=[0, 0, -2600])
+            >>> commands.report("commands.html", inputs=["cell.toml", "data.csv"])
         """
         import_module(PAGES).write_page(self, Path(path), inputs, command, seed)
 
@@ -89,7 +90,7 @@ class Result(Saved):
         Raises:
             InputError: There is no such figure; the message names those that there are.
 
-        Example:
+        Examples:
             >>> figure = ec.identify("cell.toml", "data.csv").plot("parameters")
             >>> figure.savefig("parameters.png")
         """
@@ -98,7 +99,7 @@ class Result(Saved):
     def to_dataframe(self) -> pd.DataFrame:
         """The result's main table as a pandas data frame; units stand in the column names.
 
-        Example:
+        Examples:
             >>> frame = ec.identify("cell.toml", "data.csv").to_dataframe()
             >>> list(frame.columns[:4])
             ['parameter', 'unit', 'value', 'std']

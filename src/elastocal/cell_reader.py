@@ -49,10 +49,21 @@ POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
 def read_cell(path: str | Path, known_effects: tuple[str, ...] | None = None) -> Cell:
     """The cell that a TOML file describes, in SI units.
 
-    Paths in it are relative to the file; the robot's files must exist.  `known_effects`: the
-    names that `[model] effects` may use; None leaves them unchecked.
+    Args:
+        path: The cell file.  Paths in it are relative to it; the robot's files must exist.
+        known_effects: The names that `[model] effects` may use; None leaves them unchecked.
 
-    Raises InputError that names file, key, what the key takes and the nearest valid name.
+    Returns:
+        The `Cell`.
+
+    Raises:
+        InputError: The file is wrong; the message names file, key, what the key takes and the
+            nearest valid name.
+
+    Examples:
+        >>> cell = ec.read_cell("cell.toml")
+        >>> cell.model.observe, list(cell.tool.markers)
+        ('deflection', ['M1', 'M2', 'M3'])
     """
     path = Path(path)
     data = _parse(path)

@@ -48,7 +48,6 @@ Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
 Progress: TypeAlias = Callable[[str], None]
 T = TypeVar("T")
 
-MOST_EXTRA_POSES = 10
 OPEN = ("ambiguous", "unknown_effect")  # verdicts whose rivals more poses may tell apart
 
 
@@ -133,10 +132,10 @@ def design(
             keyword or the cell's key.
         InsufficientDataError: No pose is feasible, or none shows a parameter that counts.
 
-    Example:
+    Examples:
         >>> plan = ec.design(
-        ...     "cell.toml", poses=6, criterion="D", loads=[[0, 0, -2600]], levels={"joint2": np.radians([-25.24, -99.85])},
-        ...     candidates=100, effort="quick",
+        ...     "cell.toml", poses=6, criterion="D", candidates=100, effort="quick",
+        ...     loads=[[0, 0, -2600]], levels={"joint2": np.radians([-25.24, -99.85])},
         ... )
         >>> plan
         <Plan kuka_kr270_2: 6 poses by D, ...>
@@ -309,13 +308,13 @@ def simulate(
     Raises:
         InputError: A name is unknown, a pose beyond the limits, or without static equilibrium.
 
-    Example:
+    Examples:
         >>> truth = {"joint3.compliance": 3.4e-7}
         >>> data = ec.simulate("cell.toml", "plan.csv", values=truth, load=[0, 0, -2600])
         >>> len(data), data.position.shape
         (90, (90, 3))
         >>> ec.identify("cell.toml", data)["joint3.compliance"].ci95
-        (3...e-07, 3...e-07)
+        (3.3...e-07, 3.4...e-07)
     """
     from elastocal.identification.checks import check_limits
     from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
@@ -324,7 +323,7 @@ def simulate(
     force = given_force(load)
     factor = np.asarray(draw, dtype=float)
     require(
-        factor.shape == () and 0 <= factor < np.inf,
+        factor.shape == () and bool(0 <= factor < np.inf),
         f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw}",
     )
     repeats = _whole("repeats", repeats, 1)
@@ -417,7 +416,7 @@ def identify(
         InsufficientDataError: The data cannot determine the model; the message says what to
             measure.
 
-    Example:
+    Examples:
         >>> model = ec.Model("cell.toml")
         >>> fit = ec.identify(model, model.read("data.csv"), fixed=["joint1.compliance"])
         >>> fit["joint2.compliance_level1"].identifiable
@@ -491,12 +490,14 @@ def diagnose(
         InputError: Data contradict robot or cell, or an option is wrong.
         InsufficientDataError: There are too few configurations to tell an effect from noise.
 
-    Example:
+    Examples:
         >>> why = ec.diagnose("cell.toml", "data.csv")
-        >>> why.verdict, why.effects
-        ('nothing_significant', ())
+        >>> why
+        <Diagnosis kuka_kr270_2: explained, link_bending at link4>
         >>> [step.step for step in why.budget]
-        ['nominal', ...]
+        ['base_frame', 'compliance', 'link_bending:link4', 'noise_floor']
+        >>> why.effects[0].probability > 0.9
+        True
     """
     from elastocal.diagnosis.diagnose import diagnose as run
     from elastocal.diagnosis.options import DiagnosisOptions
@@ -562,12 +563,12 @@ def compensate(
         InputError: Targets or an option are wrong; the message names the keyword, or file and
             line.
 
-    Example:
+    Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
         >>> down = [[1.8, 0.0, 0.9], [1.8, 0.2, 0.9]]
         >>> commands = ec.compensate(fit.arm, down, load=[0, 0, -2600])
         >>> commands
-        <Compensation KR270_2: 2 of 2 targets reached>
+        <Compensation kuka_kr270_2: 2 of 2 targets reached>
         >>> bool(commands.before.max() > 1e-3), bool(commands.after.max() < 1e-9)
         (True, True)
     """
@@ -588,7 +589,7 @@ def compensate(
     start = None if near is None else np.asarray(near, dtype=float)
     require(
         start is None or (start.shape == (chain.n_joints,) and bool(np.isfinite(start).all())),
-        f"{option('near')} takes {chain.n_joints} joints in rad or m; found {near}",
+        f"{option('near')} takes {chain.n_joints} joints in rad or m; found {near!r}",
     )
     where = _tool_point(arm.model.cell, point)
     wanted = _targets(targets, chain.kinds, frame, force)

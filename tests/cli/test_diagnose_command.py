@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from elastocal.cell_reader import read_cell
 from elastocal.cli import app
-from elastocal.saving import save_extra_poses
 from elastocal.errors import InsufficientDataError
 from elastocal.measurement_reader import read_plan
+from elastocal.saving import save_extra_poses
 
 KINDS = ("revolute",) * 6
 

@@ -202,7 +202,7 @@ def test_fixed_names_places_and_effects(model):
 def test_an_unknown_fixed_name(model, name, hint):
     with pytest.raises(InputError) as caught:
         identify(model, table_for(model), Options(fixed=(name,)))
-    message = f"cannot fix '{name}': the model has no such parameter, place or effect {hint}"
+    message = f"fixed=['{name}']: the model has no such parameter, place or effect {hint}"
     assert str(caught.value) == message
 
 

@@ -43,7 +43,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "file-formats.md"
 def bearings() -> Model:
     """Six drives and the bearing of joint 2, whose true compliance is zero."""
     effects = ("joint_compliance", "off_axis_compliance:joint2")
-    return Model.assembled(kr270_cell(effects, observe="deflection"))
+    return Model(kr270_cell(effects, observe="deflection"))
 
 
 @lru_cache
@@ -58,7 +58,7 @@ def drives(deflection_model: str = "equilibrium") -> Model:
 @lru_cache
 def placed() -> Model:
     """An arm at a free base with an unknown marker: base.rz and joint 1 turn alike."""
-    return Model.assembled(kr270_cell(("base_frame", "joint_offset")))
+    return Model(kr270_cell(("base_frame", "joint_offset")))
 
 
 def readings(model: Model, seed: int, force=DOWN, **values: float) -> Measurements:

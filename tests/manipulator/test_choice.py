@@ -195,7 +195,7 @@ def without_markers(*effects: str) -> Cell:
 
 
 def test_markers_are_the_tables_where_the_cell_lists_none() -> None:
-    model = Model.assembled(without_markers("marker_position"), ("front", "back"))
+    model = Model(without_markers("marker_position"), ("front", "back"))
     assert model.names[::3] == ("marker:front.x", "marker:back.x")
     assert not model.nominal.any()
     table = random_table(model.chain, 2, seed=0, markers=("back", "front"))
@@ -205,11 +205,11 @@ def test_markers_are_the_tables_where_the_cell_lists_none() -> None:
 
 
 def test_without_any_names_there_is_one_marker() -> None:
-    assert Model.assembled(without_markers("marker_position")).names[0] == "marker:M1.x"
+    assert Model(without_markers("marker_position")).names[0] == "marker:M1.x"
 
 
 def test_the_cells_markers_win_over_the_tables() -> None:
-    model = Model.assembled(kr270_cell(("marker_position",)), ("front",))
+    model = Model(kr270_cell(("marker_position",)), ("front",))
     assert model.names[::3] == ("marker:M1.x", "marker:M2.x", "marker:M3.x")
     np.testing.assert_array_equal(model.nominal, np.concatenate(list(MARKERS.values())))
 

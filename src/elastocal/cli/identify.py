@@ -23,7 +23,6 @@ from elastocal.errors import InputError
 from elastocal.json_text import json_text
 
 if TYPE_CHECKING:
-    from elastocal.identification.knowledge import Knowledge
     from elastocal.manipulator.model import Model
     from elastocal.measurements import Measurements
 
@@ -112,6 +111,7 @@ def identify(
     from elastocal.cli.results import write_results
     from elastocal.identification.identify import identify as run
     from elastocal.identification.options import Options
+    from elastocal.verbs import knowledge_of
 
     # What can be wrong with the options is told before any file is read.
     chosen = Options(
@@ -126,7 +126,7 @@ def identify(
         seed=seed,
         jobs=jobs,
     )
-    known = _read_knowledge(knowledge, physical)
+    known = knowledge_of(knowledge, physical)
     check_outputs(output, report, residuals)
     inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
     written = [p for p in (output, report, residuals) if p is not None]
@@ -152,35 +152,11 @@ def identify(
 
 def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]:
     """Model and tables; every file is checked before anything is computed."""
-    from elastocal.cell_reader import read_cell
-    from elastocal.manipulator.choice import load_chain
-    from elastocal.manipulator.effects import CATALOGUE
     from elastocal.manipulator.model import Model
-    from elastocal.measurement_reader import read_measurements
 
-    cell = read_cell(cell_path, known_effects=tuple(CATALOGUE))
-    chain = load_chain(cell)
-    tables = [
-        read_measurements(
-            path,
-            joint_kinds=chain.kinds,
-            marker_names=tuple(cell.tool.markers),
-            observe=cell.model.observe,
-        )
-        for path in data
-    ]
-    names: tuple[str, ...] = tuple(dict.fromkeys(m for t in tables for m in t.marker_names))
-    return Model(cell, names), tables
-
-
-def _read_knowledge(path: Path | None, physical: bool) -> Knowledge | None:
-    """What the file and the flag state together; None where neither was given."""
-    from elastocal.identification.knowledge import Knowledge, read_knowledge
-
-    if path is None:
-        return Knowledge(physical=True, source="--physical") if physical else None
-    known = read_knowledge(path)
-    return replace(known, physical=known.physical or physical)
+    model = Model(cell_path)
+    tables = [model.read(path) for path in data]
+    return model.with_markers_of(*tables), tables
 
 
 def _read_covariance(path: Path) -> Any:

@@ -91,9 +91,41 @@ class SizePoint:
 
 @dataclass(frozen=True, repr=False)
 class Plan(Result):
-    """q (N, n) in SI units, numbered by configuration; `load` (N,) the load state or −1 for all;
-    `group` (N,) into `levels`.  `value` is Φ, `reported` what the user knows it by, in `unit`;
-    `first` is the number of the first configuration: after those that were measured already."""
+    """A measurement plan: poses in their order, what they promise, how far from the best they are.
+
+    Attributes:
+        model: The `Model` that it is for.
+        criterion: What was made small; `value` is it as the search has it (Φ), `reported` as people
+            know it, in `unit`.
+        q: Commanded joints (N, joints), in rad or m.
+        load: (N,), each pose's load state, an index into `forces`; −1 for all of them.
+        forces: Load states (L, 3), in N.
+        group: (N,), the level of each pose, an index into `levels` of the joint `level_joint`.
+        execution: The order of execution, with the points in between.
+        candidates: How many poses were tried, and which rule removed how many.
+        certificate: How far the plan is from the best: certified on the pool of candidates,
+            estimated on the continuum.
+        predicted: How far each parameter will be known.
+        reasons: What each pose is for.
+        targets: What the test poses were, in words.
+        seed: Of all random draws.
+        polished: How many poses were moved from their candidate.
+        curve: The criterion against the number of poses, where it was asked for.
+        bound_reported: The certificate's bound, in `unit`.
+        warnings: What to know before one measures, in sentences.
+        first: Number of the first configuration: after those that were measured already.
+        chance: What as many random poses would reach.
+
+    Examples:
+        >>> plan = ec.design(
+        ...     "cell.toml", poses=4, criterion="D", candidates=60, effort="quick",
+        ...     loads=[[0, 0, -2600]], levels={"joint2": np.radians([-25.24, -99.85])},
+        ... )
+        >>> len(plan), plan.q.shape, plan.unit
+        (4, (4, 6), 'log det')
+        >>> data = ec.simulate("cell.toml", plan, load=[0, 0, -2600])
+        >>> plan.save("plan4.csv")
+    """
 
     model: Model
     criterion: str

@@ -176,7 +176,38 @@ class NoiseFloor:
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis(Result):
-    """The whole answer.  `p_value`: of what was found, against the whole family of hypotheses."""
+    """Why the real arm still differs from the model.
+
+    Attributes:
+        verdict: "explained", "nothing_significant", "unknown_effect" or "ambiguous".
+        gap: 3-D rms marker errors on held-out poses, in m: nominal, calibrated, explained, floor.
+        budget: The waterfall from the nominal arm to the noise floor, `Step` by step.
+        effects: What is held to be real, each a `Finding`.
+        candidates: Every hypothesis that was tried, best first.
+        indistinguishable: Sets that these data cannot tell apart.
+        location: Where the gap lies.
+        noise: The noise that the data themselves show.
+        structure: What the residual depends on, without naming an effect.
+        probability_nothing: That no effect is missing.
+        probability_unknown: That something without a name is at work.
+        p_value: Of what was found, against the whole family of hypotheses.
+        curves: The shape of an unknown dependence.
+        untested: Effects that the data cannot test, and what to record so that they can.
+        warnings: What to know before one relies on it, in sentences.
+        n_readings: Number of readings; `n_configurations` that of configurations.
+        extra: Poses that tell rivals apart, where they were asked for.
+        model_keys: Keys of [model] that the effects found rest on.
+        model: The model that was diagnosed; `data` names its measurements.
+        calibrated: The arm as it was fitted before any effect was added.
+
+    Examples:
+        >>> why = ec.diagnose("cell.toml", "data.csv")
+        >>> why.verdict, why.effects[0].effect, why.location.where
+        ('explained', 'link_bending', 'link4')
+        >>> why.gap.calibrated > why.gap.noise_floor
+        True
+        >>> why.save("diagnosis.json")
+    """
 
     verdict: Verdict
     gap: Gap

@@ -140,15 +140,15 @@ class Calibration(Result):
         prior_share: By parameter the share of its information that the prior gave, 0 to 1; empty
             without a prior.
 
-    Example:
+    Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
         >>> fit
-        <Calibration KR270_2: 9 of 10 parameters, held-out 12.1 µm>
+        <Calibration kuka_kr270_2: 9 of 10 parameters, held-out 124 µm>
         >>> stiff = fit["joint3.compliance"]
         >>> stiff.value, stiff.std, stiff.ci95, stiff.unit
-        (3.2...e-07, ...e-09, (3...e-07, 3...e-07), 'rad/(N·m)')
+        (4.1...e-07, 1...e-09, (4.1...e-07, 4.1...e-07), 'rad/(N*m)')
         >>> fit["joint1.compliance"].identifiable, len(fit), fit.covariance.shape, fit.B.shape
-        (False, 10, (9, 9), (270, 10))
+        (False, 10, (9, 9), (810, 10))
         >>> [name for name in fit if not fit[name].identifiable]
         ['joint1.compliance']
     """

@@ -42,12 +42,12 @@ class CalibratedArm(Saved):
         source: What it came from: the result file, or the table it was identified with.
         entries: What identify says of each parameter, as in its JSON, in the model's order.
 
-    Example:
+    Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
         >>> arm.pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600]).shape
         (4, 4)
         >>> arm.values["joint3.compliance"]
-        3.2...e-07
+        4.1...e-07
     """
 
     model: Model
@@ -81,11 +81,11 @@ class CalibratedArm(Saved):
         Raises:
             InputError: A shape does not fit, or an effect needs more than joints and force.
 
-        Example:
+        Examples:
             >>> arm = ec.identify("cell.toml", "data.csv").arm
             >>> q = [0.0, -1.0, 1.0, 0.0, 0.5, 0.0]
             >>> sag = arm.pose(q, force=[0, 0, -2600])[2, 3] - arm.pose(q)[2, 3]
-            >>> -0.01 < sag < 0
+            >>> bool(-0.01 < sag < 0)
             True
         """
         return self.model.pose(q, self.x, force)
@@ -102,10 +102,10 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
         InputError: A file is invalid, or the result belongs to another model than the cell
             describes; the message names the parameters that differ.
 
-    Example:
+    Examples:
         >>> ec.identify("cell.toml", "data.csv").save("result.json")
         >>> ec.read_calibrated("cell.toml", "result.json")
-        <CalibratedArm KR270_2: 9 of 10 parameters determined, from result.json>
+        <CalibratedArm kuka_kr270_2: 9 of 10 parameters determined, from result.json>
     """
     cell = cell_of(cell_path)
     result = _read_result(Path(result_path))

@@ -65,17 +65,17 @@ class Model:
     Raises:
         InputError: The cell, or a file that it names, is wrong; the message says where.
 
-    Example:
+    Examples:
         >>> model = ec.Model("cell.toml")
         >>> model
-        <Model cell: KR270_2, 6 joints, 10 parameters of joint_compliance; observes deflection>
+        <Model ...: kuka_kr270_2, 6 joints, 10 parameters of joint_compliance; observes deflection>
         >>> model.names[:2]
         ('joint1.compliance', 'joint2.compliance_level1')
         >>> plan = model.read_plan("plan.csv")
         >>> model.pose(plan.q[0])[:3, 3].round(3)
         array([...])
         >>> model.B(model.read("data.csv")).shape
-        (180, 10)
+        (810, 10)
     """
 
     def __init__(
@@ -132,10 +132,10 @@ class Model:
         Raises:
             InputError: The table is wrong; the message names file, line, column and the text.
 
-        Example:
+        Examples:
             >>> data = ec.Model("cell.toml").read("data.csv")
             >>> len(data), data.q.shape, data.marker_names
-            (180, (180, 6), ('M1',))
+            (540, (540, 6), ('M1', 'M2', 'M3'))
         """
         markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
         return read_measurements(
@@ -148,7 +148,7 @@ class Model:
         Raises:
             InputError: As `read` does.
 
-        Example:
+        Examples:
             >>> len(ec.Model("cell.toml").read_plan("plan.csv"))
             15
         """
@@ -167,9 +167,9 @@ class Model:
         Raises:
             InputError: A shape does not fit.
 
-        Example:
+        Examples:
             >>> model = ec.Model("cell.toml")
-            >>> table = model.table([0.1, -1.2, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600])
+            >>> table = model.table([0.1, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600])
             >>> model.deflection(table).shape
             (1, 6)
         """
@@ -209,7 +209,7 @@ class Model:
             InputError: A shape does not fit, or an active effect needs more than joints and
                 force (a time, a temperature): then `flange_poses` takes a table.
 
-        Example:
+        Examples:
             >>> ec.Model("cell.toml").pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0]).shape
             (4, 4)
         """
@@ -292,9 +292,9 @@ class Model:
             (n_rows, springs) in rad or m, one column per spring of the active effects; NaN where
             no equilibrium is found.
 
-        Example:
+        Examples:
             >>> model = ec.Model("cell.toml")
-            >>> loaded = model.table([0.1, -1.2, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600])
+            >>> loaded = model.table([0.1, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600])
             >>> bool(abs(model.deflection(loaded)).max() < 0.01)
             True
         """
@@ -338,10 +338,10 @@ class Model:
             (rows,), observations × components in m (rad), in the table's order; NaN where there
             is no static equilibrium.
 
-        Example:
+        Examples:
             >>> model = ec.Model("cell.toml")
             >>> model.predict(model.read("data.csv")).shape
-            (270,)
+            (810,)
         """
         x = self.nominal if x is None else np.asarray(x)
         inputs = row_inputs(self._symbolic.arm, table)
@@ -362,10 +362,10 @@ class Model:
             InputError: The table lacks a column that the model needs.
             ElastocalError: A pose has no static equilibrium under its load.
 
-        Example:
+        Examples:
             >>> model = ec.Model("cell.toml")
             >>> model.B(model.read("data.csv")).shape
-            (270, 10)
+            (810, 10)
         """
         return self.regressor(table, x).B
 
