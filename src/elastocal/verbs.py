@@ -197,7 +197,7 @@ def design_request(
         fixed=_names("fixed", fixed),
         prior=_gaussian(prior) if stated is None else stated,
         done=done,
-        curve=tuple(sorted({_whole("curve", n, 1) for n in curve})),
+        curve=tuple(sorted({_whole("curve", n) for n in curve})),
         notes=notes,
     )
     return cell, options
@@ -511,19 +511,18 @@ def diagnose(
     tell = progress or _silent
     found = run(made, table, options, tell)
     if extra_poses is not None and found.verdict in OPEN:
-        found = with_extra_poses(found, table, extra_poses, seed, tell)
+        found = with_extra_poses(made, table, found, extra_poses, seed, tell)
     return found
 
 
 def with_extra_poses(
-    found: Diagnosis, table: Measurements, most: int, seed: int, progress: Progress
+    model: Model, table: Measurements, found: Diagnosis, most: int, seed: int, progress: Progress
 ) -> Diagnosis:
     """The diagnosis with the fewest of at most `most` poses that tell its rivals apart."""
     from elastocal.diagnosis.separate.plan import plan_extra
 
-    assert found.model is not None  # `diagnose` states it
     progress("looking for poses that tell the rivals apart")
-    extra = plan_extra(found.model, table, found, most=most, seed=seed, progress=progress)
+    extra = plan_extra(model, table, found, most=most, seed=seed, progress=progress)
     return replace(found, extra=extra)
 
 
@@ -693,11 +692,12 @@ def _names(name: str, given: str | Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def _whole(name: str, given: Any, least: int) -> int:
+def _whole(name: str, given: Any, least: int | None = None) -> int:
     whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
+    more = "" if least is None else f", {least} or more"
     require(
-        whole and given >= least,
-        f"{option(name)} takes a whole number, {least} or more; found {quoted(given)}",
+        whole and (least is None or given >= least),
+        f"{option(name)} takes a whole number{more}; found {quoted(given)}",
     )
     return int(given)
 

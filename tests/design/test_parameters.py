@@ -165,9 +165,9 @@ def test_base_and_markers_count_where_there_is_nothing_else() -> None:
     ("interest", "error", "told"),
     [
         ("joint2.complience", InputError, ["did you mean 'joint2.compliance'", "interest"]),
-        ("joint1.compliance", InsufficientDataError, ["no feasible pose shows", "--fix joint1"]),
-        ("joint1.offset", InsufficientDataError, ["no set of poses tells", "base.rz", "--fix"]),
-        ("joint4.compliance", InsufficientDataError, ["is held", "drop it from --fix"]),
+        ("joint1.compliance", InsufficientDataError, ["no feasible pose shows", "fixed=['joint1"]),
+        ("joint1.offset", InsufficientDataError, ["no set of poses tells", "base.rz", "fixed=["]),
+        ("joint4.compliance", InsufficientDataError, ["is held", "drop it from `fixed`"]),
     ],
 )
 def test_interest_in_what_cannot_be_known_is_answered(

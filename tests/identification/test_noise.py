@@ -170,7 +170,7 @@ def test_auto_for_distances_and_poses():
         ("axis", POLAR, r"the cell has no \[tracker\] sigma_um"),
         ("axis", Tracker(), r"the cell has no \[tracker\] sigma_um"),
         ("polar", AXIS, r"no \[tracker\] range_um, range_ppm, transverse_um, transverse_ppm"),
-        ("covariance", AXIS, r"'covariance' need a matrix \(--covariance FILE\)"),
+        ("covariance", AXIS, r"'covariance' need a matrix \(`covariance`\)"),
     ],
 )
 def test_noise_that_is_not_stated_is_refused(kind, tracker, message):

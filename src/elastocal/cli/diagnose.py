@@ -81,7 +81,7 @@ def diagnose(
         found = run(model, table, options, progress)
         if plan is not None and found.verdict in OPEN:
             most = MOST_POSES if poses is None else poses
-            found = with_extra_poses(found, table, most, seed, progress)
+            found = with_extra_poses(model, table, found, most, seed, progress)
         content = publish(found, model, str(data))
         told = write_diagnosis(outputs, found, content, model, cell, data, seed)
     if as_json:

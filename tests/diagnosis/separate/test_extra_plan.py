@@ -58,7 +58,7 @@ def test_one_pose_fewer_would_not_do(narrow, few) -> None:
     less = plan_extra(*narrow, diagnosis_of({ECCENTRIC: 0.5, SCALE: 0.5}), most=few.n_poses - 1)
     assert less.n_poses == few.n_poses - 1
     assert less.probability_after < 0.97
-    assert any("--poses" in text for text in less.advice)
+    assert any("`poses`" in text for text in less.advice)
 
 
 def test_the_plan_repeats_the_load_states_after_the_campaign(narrow, few) -> None:
