@@ -128,6 +128,14 @@ def test_every_verb_takes_model_cell_and_path_alike(model):
     assert all(np.array_equal(found[0], other) for other in found)
 
 
+def test_simulate_is_that_of_the_command_line(model):
+    data = ec.simulate(
+        model, "plan.csv", values={"joint3.compliance": 4.1e-7}, load=LOAD, repeats=2, seed=7
+    )
+    read = model.read("kept_back.csv")
+    assert np.array_equal(data.position, read.position) and np.array_equal(data.q, read.q)
+
+
 def test_a_calibration_is_a_mapping_of_estimates(fit):
     found = fit["joint3.compliance"]
     assert found.ci95[0] < found.value < found.ci95[1]

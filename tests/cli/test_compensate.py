@@ -195,7 +195,7 @@ def test_a_damaged_result_is_refused(folder, damage):
 def test_a_result_of_brackets_is_refused(folder):
     (folder / "result.json").write_text("[" * 100_000)
     outcome = run(folder, folder / "targets.csv")
-    assert outcome.exit_code == 2 and "give the file that identify -o wrote" in outcome.stderr
+    assert outcome.exit_code == 2 and "give the file that identify wrote" in outcome.stderr
 
 
 def test_names_of_markers_are_no_markup(folder):

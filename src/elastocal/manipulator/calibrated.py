@@ -96,7 +96,7 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
 
     Args:
         cell_path: The cell file that it was run with.
-        result_path: Its result (`identify -o`, or `Calibration.save`).
+        result_path: Its result (`Calibration.save`, or the command identify).
 
     Raises:
         InputError: A file is invalid, or the result belongs to another model than the cell
@@ -156,7 +156,7 @@ def _check_robot(model: Model, stated: Any, cell: str | Path, result: str | Path
     if there.shape != here.shape or not np.isfinite(there).all():
         raise InputError(
             f"{result}: nominal_flange is no table of 3 rows with 4 numbers; "
-            "write the result anew with identify -o"
+            "write the result anew with identify"
         )
     if np.abs(here - there).max() > SAME:
         off = np.linalg.norm(here[:, 3] - there[:, 3])
@@ -173,17 +173,17 @@ def _read_result(path: Path) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         raise InputError(
             f"{path}, line {error.lineno}: not JSON ({error.msg}); "
-            "give the file that identify -o wrote"
+            "give the file that identify wrote"
         ) from None
     except RecursionError:
         raise InputError(
-            f"{path}: lists within lists without end; give the file that identify -o wrote"
+            f"{path}: lists within lists without end; give the file that identify wrote"
         ) from None
     found = result.get("schema") if isinstance(result, dict) else None
     if found != SCHEMA:
         raise InputError(
             f"{path}: schema is {found!r}, and {SCHEMA!r} is needed; "
-            "give the file that identify -o wrote"
+            "give the file that identify wrote"
         )
     return dict(result)
 
@@ -191,7 +191,7 @@ def _read_result(path: Path) -> dict[str, Any]:
 def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
     entries = result.get("parameters")
     if not isinstance(entries, list):
-        raise InputError(f"{path}: key parameters is no list; write the result with identify -o")
+        raise InputError(f"{path}: key parameters is no list; write the result with identify")
     held = {}
     for k, entry in enumerate(entries):
         try:
@@ -199,7 +199,7 @@ def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
         except (TypeError, KeyError, ValueError):
             raise InputError(
                 f"{path}: parameters[{k}] needs a name and a number under held; "
-                "write the result anew with identify -o"
+                "write the result anew with identify"
             ) from None
         if not np.isfinite(value):
             raise InputError(f"{path}: parameters[{k}] '{name}' holds {value}, no finite number")
@@ -220,12 +220,12 @@ def _covariance(
     except (TypeError, ValueError):
         raise InputError(
             f"{path}: covariance is no table of numbers, or covariance_of no list of names; "
-            "write the result anew with identify -o"
+            "write the result anew with identify"
         ) from None
     if not set(determined) <= set(held) or covariance.size != len(determined) ** 2:
         raise InputError(
             f"{path}: covariance of {covariance.size} numbers for {len(determined)} names "
-            "in covariance_of; write the result anew with identify -o"
+            "in covariance_of; write the result anew with identify"
         )
     return determined, covariance.reshape(len(determined), len(determined))
 
