@@ -24,7 +24,7 @@ def test_the_examples_run(course, monkeypatch, capsys):
     assert len(names["simulated"]) == 8 * 2 * 3 * 3  # poses, load states, repeats, markers
     (example,) = examples(DOCS / "identifying.md")
     exec(compile(example, "identifying", "exec"), names)
-    held = [e.name for e in names["result"].estimates if not e.identifiable]
+    held = [e.name for e in names["fit"].estimates if not e.identifiable]
     assert held == ["joint1.compliance"]
 
 
