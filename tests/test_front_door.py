@@ -1,19 +1,26 @@
 """`import elastocal as ec`: its names, what they cost, and the day's work from plan to commands."""
 
 import ast
+import inspect
 import json
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import elastocal as ec
+from elastocal.cell_design import DesignSpec
 from elastocal.cli import app
 from elastocal.demo import LOAD_N, run_demo
+from elastocal.design.options import DesignOptions
+from elastocal.diagnosis.options import DiagnosisOptions
 from elastocal.errors import option, options_as_flags
+from elastocal.identification.options import Options
 
 HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")
 LOAD = list(LOAD_N)
@@ -299,6 +306,34 @@ def test_arrays_become_tables(model):
 
 
 # Wrong options
+
+
+# What the command line writes, and how it says in text what Python says otherwise.
+OF_FILES = {"output", "report", "residuals", "program", "picture", "plan", "cell_out", "truth"}
+OF_TEXT = {"json", "quiet", "help", "set", "no_noise", "target", "partial", "poses", "fix"}
+OF_A_TABLE = {"table", "grid", "box", "rotation"}
+
+
+@pytest.mark.parametrize("verb", ["design", "simulate", "identify", "diagnose", "compensate"])
+def test_every_flag_of_a_verb_is_a_keyword_of_it(verb):
+    parameters = typer.main.get_command(app).commands[verb].params
+    flags = {p.opts[-1][2:].replace("-", "_") for p in parameters if p.opts[-1].startswith("--")}
+    keywords = set(inspect.signature(getattr(ec, verb)).parameters)
+    assert flags - OF_FILES - OF_TEXT - OF_A_TABLE <= keywords
+
+
+@pytest.mark.parametrize(
+    ("verb", "kind", "renamed"),
+    [
+        ("identify", Options, {"faulty": "outliers"}),
+        ("design", DesignOptions, {"done": "augment", "notes": "knowledge"}),
+        ("design", DesignSpec, {}),
+        ("diagnose", DiagnosisOptions, {}),
+    ],
+)
+def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
+    keywords = set(inspect.signature(getattr(ec, verb)).parameters)
+    assert {renamed.get(f.name, f.name) for f in fields(kind)} <= keywords
 
 
 @pytest.mark.parametrize(
