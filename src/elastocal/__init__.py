@@ -62,7 +62,7 @@ _HOMES = {
     "elastocal.manipulator.model": ("Model",),
     "elastocal.manipulator.parameter": ("Parameter",),
     "elastocal.measurements": ("Measurements",),
-    "elastocal.plugins": ("register_criterion", "register_effect", "register_noise"),
+    "elastocal.plugins": ("register_criterion", "register_effect", "register_noise_model"),
     "elastocal.verbs": ("compensate", "design", "diagnose", "identify", "simulate"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
