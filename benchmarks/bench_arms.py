@@ -30,7 +30,7 @@ def kr270(folder: Path, effects: Sequence[str], more: str = "", markers: int = 1
         + f'[tracker]\nsigma_um = 10\n[model]\nobserve = "position"\neffects = '
         f"{json.dumps(list(effects))}\n{more}"
     )
-    return Model.from_cell(read_cell(path, known_effects=tuple(CATALOGUE)))
+    return Model(read_cell(path, known_effects=tuple(CATALOGUE)))
 
 
 def serial(folder: Path, joints: int, effects: Sequence[str]) -> Model:
@@ -48,7 +48,7 @@ def serial(folder: Path, joints: int, effects: Sequence[str]) -> Model:
         + f'[tracker]\nsigma_um = 10\n[model]\nobserve = "position"\neffects = '
         f"{json.dumps(list(effects))}\n"
     )
-    return Model.from_cell(read_cell(path, known_effects=tuple(CATALOGUE)))
+    return Model(read_cell(path, known_effects=tuple(CATALOGUE)))
 
 
 def _tool(markers: int) -> str:

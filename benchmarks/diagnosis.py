@@ -42,7 +42,7 @@ def simulated(folder: Path, rows: int) -> Path:
     text = text.replace("[tracker]\n", "[tracker]\nsigma_um = 15\n")
     world = folder / "world.toml"
     world.write_text(text)
-    model = Model.from_cell(read_cell(world))
+    model = Model(read_cell(world))
     low, high = joint_limits(model.cell, model.chain)
     n = -(-rows // 6)
     q = np.degrees(np.random.default_rng(rows).uniform(low, high, (n, len(low))))

@@ -123,7 +123,7 @@ def whole_calls(folder: Path, part: Part, sizes: tuple[int, ...]) -> None:
             readings = poses(model, n, load)
             engines = {}
             for backend in ("numpy", "compiled"):
-                own_engine = Model(model.chain, model.cell, backend=backend)
+                own_engine = Model.assembled(model.chain, model.cell, backend=backend)
                 engines[backend] = partial(own_engine.regressor, readings, x)
             for backend, t in race(engines, 5, 1.0).items():
                 what_now = f"{what}, {len(model.parameters)} parameters"

@@ -88,7 +88,7 @@ def truth(model: Model) -> np.ndarray:
 
 def write_readings(cell_path: Path, path: Path, n: int, loaded: bool) -> None:
     """A CSV of n readings, simulated and written a few at a time."""
-    model = Model.from_cell(read_cell(cell_path))
+    model = Model(read_cell(cell_path))
     x, piece = truth(model), path.with_suffix(".piece.csv")
     with path.open("wb") as whole:
         for first in range(0, n, AT_A_TIME):
@@ -100,7 +100,7 @@ def write_readings(cell_path: Path, path: Path, n: int, loaded: bool) -> None:
 
 def load(cell_path: Path, data: Path) -> tuple[Model, Measurements]:
     cell = read_cell(cell_path, known_effects=tuple(CATALOGUE))
-    model = Model.from_cell(cell)
+    model = Model(cell)
     table = read_measurements(
         data, joint_kinds=model.chain.kinds, marker_names=tuple(cell.tool.markers)
     )

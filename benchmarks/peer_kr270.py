@@ -93,7 +93,7 @@ def prepared(folder: Path, seed: int) -> Arm:
     """From the cell to the blocks of the pool, by the steps of `elastocal design`."""
     path = folder / "cell.toml"
     path.write_text(CELL)
-    model = Model.from_cell(read_cell(path, known_effects=tuple(CATALOGUE)))
+    model = Model(read_cell(path, known_effects=tuple(CATALOGUE)))
     rules, states = Feasibility(model.cell, model.chain), load_states(model.cell)
     drawn = draw(model.cell, model.chain, states, rules, POOL, seed)
     assert drawn.tried == drawn.feasible, "joint limits alone remove nothing"

@@ -37,7 +37,7 @@ def test_every_cell_shown_is_a_cell(tmp_path):
     for block in [*blocks, blocks[0] + design]:
         path = tmp_path / "cell.toml"
         path.write_text(block, encoding="utf-8")
-        model = Model.from_cell(read_cell(path, known_effects=tuple(CATALOGUE)))
+        model = Model(read_cell(path, known_effects=tuple(CATALOGUE)))
         assert model.parameters
 
 

@@ -24,12 +24,17 @@ LAYERS = (
     {"manipulator"},
     {"simulation", "identification"},
     {"planning", "diagnosis", "compensation", "export", "importing"},
+    {"saving", "verbs"},
     {"report", "plugins"},
     {"demo"},
     {"cli", "__main__"},
 )
 
 MOST_LINES = 800
+
+# Their work is begun on the command line alone; the pages of `report` tell how it goes on there.
+OF_THE_COMMAND_LINE = ("studies", "importing", "report")
+ELSEWHERE = ("--install", "--version")  # flags of other programs
 
 # In two halves, so that this file does not mention them either.
 NEVER_MENTIONED = tuple(
@@ -204,7 +209,9 @@ def unit(module: str) -> str:
 
 
 def rank(module: str) -> int:
-    """0 at the bottom; the root package, whose version everybody may read, imports nothing."""
+    """0 at the bottom; the root package, which gives the public names, stands above all."""
+    if not module:
+        return len(LAYERS) + 1
     return next((k for k, layer in enumerate(LAYERS, 1) if unit(module) in layer), 0)
 
 
@@ -236,6 +243,48 @@ def _circle(graph: dict[str, set[str]]) -> list[str]:
     except CycleError as error:
         return list(error.args[1])
     return []
+
+
+def test_nobody_within_goes_by_the_front_door() -> None:
+    """From elastocal itself all may take the version; its other names would be circles unseen."""
+    taken = {
+        (module, alias.name)
+        for module, path in MODULES.items()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and node.module == "elastocal"
+        for alias in node.names
+        if alias.name not in ("__version__", *map(unit, MODULES))
+    }
+    assert not taken
+
+
+def test_modules_are_found_by_name_at_two_places_only() -> None:
+    """The public names, loaded when they are used; and what results ask of the layers above."""
+    by_name = {m for m, path in MODULES.items() if "import_module" in path.read_text()}
+    assert by_name == {"", "above"}
+    assert not [m for m, path in MODULES.items() if "__import__" in path.read_text()]
+
+
+def test_no_message_of_the_library_names_a_flag() -> None:
+    """Options are named by `errors.option`: a keyword in Python, a flag on the command line."""
+    named = {
+        f"{module}: {text}"
+        for module, path in MODULES.items()
+        if unit(module) not in ("cli", *OF_THE_COMMAND_LINE)
+        for text in _strings(path)
+        if set(re.findall(r"(?<![\w-])--[a-z-]+", text)) - set(ELSEWHERE)
+    }
+    assert not named
+
+
+def _strings(path: Path) -> Iterator[str]:
+    """Sentences in a module's code: no docstrings, no words that are passed to other programs."""
+    tree = ast.parse(path.read_text())
+    told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        words = isinstance(node, ast.Constant) and isinstance(node.value, str)
+        if words and id(node) not in told and " " in node.value.strip():
+            yield node.value
 
 
 def test_imports_are_recognised() -> None:

@@ -45,7 +45,7 @@ def misfit(model: Model, bent: bool) -> np.ndarray:
 
 
 def figure(colours: Colours) -> Figure:
-    model = Model.from_cell(read_cell(Path(TUTORIAL / "cell.toml")))
+    model = Model(read_cell(Path(TUTORIAL / "cell.toml")))
     fig, axes = plt.subplots(1, 2, figsize=(8.4, 3.9), sharex=True, sharey=True)
     k = np.linspace(0.0, 40.0, 401)
     x, y = np.meshgrid(k, k)

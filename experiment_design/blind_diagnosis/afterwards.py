@@ -35,7 +35,7 @@ def read(model: Model, path: Path) -> Measurements:
 
 def plain_fit(visible: Path) -> Baseline:
     """The cell's own effects fitted to the campaign."""
-    model = Model.from_cell(read_cell(visible / "cell.toml"))
+    model = Model(read_cell(visible / "cell.toml"))
     return fit_baseline(model, read(model, visible / "data.csv"))
 
 
@@ -91,7 +91,7 @@ def true_reduction(base: Baseline, answer: dict[str, Any], extended: Path, fresh
     e₀ of the cell's own model, e₁ of the `extended` cell's from the values that the diagnosis
     published, both fitted to the campaign under the stated noise.
     """
-    model = Model(base.model.chain, read_cell(extended))
+    model = Model.assembled(base.model.chain, read_cell(extended))
     start = dict(zip(base.model.names, base.x, strict=True))
     start |= {p["name"]: p["value"] for e in answer["effects"] for p in e["parameters"]}
     x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])

@@ -146,7 +146,7 @@ def setting(scenario: Scenario) -> Setting:
 def _positions() -> np.ndarray:
     """Where the markers of the 270 readings stand (N, 3) in m in the robot's frame, loaded."""
     cell = read_cell(DEMO / "cell.toml")
-    model = Model.from_cell(cell)
+    model = Model(cell)
     plan = read_plan(DEMO / "plan.csv", joint_kinds=model.chain.kinds)
     rows = expand_plan(plan, tuple(cell.tool.markers), 6, np.array(LOAD_N))
     loaded = rows.take(np.any(rows.force != 0, axis=1))

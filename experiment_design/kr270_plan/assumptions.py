@@ -66,7 +66,7 @@ def main() -> None:
 
 def margins(cell: Cell) -> list[float]:
     """ρ₀ of Table 2 over the bound, for each set of test poses."""
-    model = Model.from_cell(cell)
+    model = Model(cell)
     states, space = load_states(cell), joint_space(cell, model.chain)
     drawn = draw(cell, model.chain, states, Feasibility(cell, model.chain), CANDIDATES, 0)
     shares = shares_of(cell)

@@ -63,7 +63,7 @@ class Tool:
         marker = {"load point": targets.point[0]}
         spec = replace(cell.model, observe="position")
         tool = replace(cell.tool, markers=marker)
-        self.model = Model(study.model.chain, replace(cell, model=spec, tool=tool))
+        self.model = Model.assembled(study.model.chain, replace(cell, model=spec, tool=tool))
         T = len(targets.q)
         self.rows = Measurements(
             source="test poses",

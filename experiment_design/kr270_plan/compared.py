@@ -43,10 +43,10 @@ class Study:
 
     @classmethod
     def of(cls, name: str, candidates: int) -> Study:
-        model = Model.from_cell(read_cell(HERE / f"{name}.toml"))
+        model = Model(read_cell(HERE / f"{name}.toml"))
         cell, chain = model.cell, model.chain
         cell = replace(cell, design=replace(cell.design, candidates=candidates))
-        model = Model(chain, cell)
+        model = Model.assembled(chain, cell)
         states, feasibility = load_states(cell), Feasibility(cell, chain)
         targets = test_poses(cell, chain)
         drawn = draw(cell, chain, states, feasibility, 2000, SEED)

@@ -48,7 +48,7 @@ class Campaign:
 def campaign() -> Campaign:
     """The campaign at the true equilibrium; joint 1, which the load cannot show, is left out."""
     cell = read_cell(DEMO / "cell.toml")
-    model = Model.from_cell(cell)
+    model = Model(cell)
     plan = read_plan(DEMO / "plan.csv", joint_kinds=model.chain.kinds)
     rows = expand_plan(plan, tuple(cell.tool.markers), REPEATS, np.array(LOAD_N))
     named, _ = published_compliances(DEMO)

@@ -28,9 +28,9 @@ def rmse(model: Model, result: Calibration, rows: Measurements) -> float:
 def main() -> None:
     cell = read_cell(HERE / "irb120.toml")
     data = prepare() / "irb120.csv"
-    model = Model.from_cell(cell)
+    model = Model(cell)
     table = read_measurements(data, joint_kinds=model.chain.kinds, observe="distance")
-    model = Model.from_cell(cell, table.marker_names)
+    model = Model(cell, table.marker_names)
     whole = identify(model, table, Options(faulty="drop"))
     faulty = np.isin(table.row, [o.line for o in whole.excluded])
     error = observe(table, "distance").value - model.predict(table, whole.x)

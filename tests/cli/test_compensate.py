@@ -45,7 +45,7 @@ TARGETS = """x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,force_x_N,force_y_N,force_z_N
 def folder(tmp_path):
     (tmp_path / "cell.toml").write_text(CELL)
     (tmp_path / "targets.csv").write_text(TARGETS)
-    model = Model.from_cell(read_cell(tmp_path / "cell.toml", known_effects=tuple(CATALOGUE)))
+    model = Model(read_cell(tmp_path / "cell.toml", known_effects=tuple(CATALOGUE)))
     x = with_values(model, TRUTH)
     entries = [{"name": n, "held": float(v)} for n, v in zip(model.names, x, strict=True)]
     result = {
@@ -158,7 +158,7 @@ def test_a_refused_table_speaks_of_its_grid_and_not_of_targets(folder):
 def test_a_result_of_another_robot_is_refused_although_its_parameters_have_the_same_names(folder):
     path = folder / "result.json"
     result = json.loads(path.read_text())
-    model = Model.from_cell(read_cell(folder / "cell.toml", known_effects=tuple(CATALOGUE)))
+    model = Model(read_cell(folder / "cell.toml", known_effects=tuple(CATALOGUE)))
     result["nominal_flange"] = nominal_flange_rows(model.chain)
     path.write_text(json.dumps(result))
     assert run(folder, folder / "targets.csv").exit_code == 0
@@ -195,7 +195,7 @@ def test_a_damaged_result_is_refused(folder, damage):
 def test_a_result_of_brackets_is_refused(folder):
     (folder / "result.json").write_text("[" * 100_000)
     outcome = run(folder, folder / "targets.csv")
-    assert outcome.exit_code == 2 and "give the file that identify -o wrote" in outcome.stderr
+    assert outcome.exit_code == 2 and "give the file that identify wrote" in outcome.stderr
 
 
 def test_names_of_markers_are_no_markup(folder):

@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from elastocal.cell import read_cell
 from elastocal.cli import app
-from elastocal.cli.diagnosis_files import write_extra_poses
 from elastocal.errors import InsufficientDataError
 from elastocal.measurements import read_plan
+from elastocal.saving import save_extra_poses
 
 KINDS = ("revolute",) * 6
 
@@ -172,7 +172,7 @@ def test_where_no_pose_helps_it_is_said(campaign, engine):
 
 def test_a_pose_visited_again_under_the_same_force_has_its_own_name(tmp_path):
     twice = visits(approach=False, time=False).take(np.array([0, 1, 0, 0]))
-    write_extra_poses(tmp_path / "extra.csv", twice, KINDS)
+    save_extra_poses(tmp_path / "extra.csv", twice, KINDS)
     back = read_plan(tmp_path / "extra.csv", joint_kinds=KINDS)
     names = [back.configuration_labels[k] for k in back.configuration]
     assert names == ["X1", "X1", "X1/2", "X1/3"]

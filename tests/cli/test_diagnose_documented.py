@@ -24,7 +24,7 @@ def named(page: str) -> set[str]:
 
 
 def test_every_key_of_the_json_is_explained():
-    model = Model(kr270_chain(), kr270_cell(("base_frame",)))
+    model = Model.assembled(kr270_chain(), kr270_cell(("base_frame",)))
     content = publish(replace(UNKNOWN, extra=EXTRA, effects=(ECCENTRICITY,)), model, "data.csv")
     inner = ("gap", "location", "noise", "extra_plan")
     lists = ("budget", "effects", "candidates", "structure", "curves", "untested")

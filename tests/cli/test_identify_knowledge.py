@@ -43,7 +43,7 @@ def campaign(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign")
     cell = folder / "cell.toml"
     cell.write_text(CELL, encoding="utf-8")
-    model = Model.from_cell(read_cell(cell))
+    model = Model(read_cell(cell))
     truth = with_values(model, {"joint3.compliance": 5e-7})
     plan = table_of(TABLE_2, SLANTED, both=True)
     table = measured(model, plan, truth, 2e-4 / 2**0.5, np.random.default_rng(0))

@@ -354,7 +354,7 @@ def test_what_no_marker_showed_is_told():
     assert np.all(marker.uncertainty.unknown < 1e-9)
     place = compensate(arm, targets, tool_point(cell, "0.1,0.2,0.3"))
     assert np.all(place.uncertainty.unknown > 1e-3)
-    assert any("link6." in told and "--point" in told for told in place.warnings)
+    assert any("link6." in told and "`point`" in told for told in place.warnings)
 
 
 def test_random_poses_of_the_demo_arm_are_reached_without_joints_given():

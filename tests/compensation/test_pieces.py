@@ -48,7 +48,7 @@ def test_points_are_named_or_given() -> None:
         with pytest.raises(InputError, match=told):
             tool_point(cell, text)
     bare = replace(cell, tool=replace(cell.tool, load_point=np.zeros(3)))
-    with pytest.raises(InputError, match="--point"):
+    with pytest.raises(InputError, match="`point`"):
         tool_point(bare, None)
 
 
@@ -62,7 +62,7 @@ def test_points_are_named_or_given() -> None:
         ("x_mm,y_mm,z_mm\n1,2,three\n", "line 2, column z_mm"),
         ("x_mm,y_mm,z_mm,q1_deg\n1,2,3,4\n", "the robot has 6 joints"),
         ("x_mm,y_mm,z_mm,speed\n1,2,3,4\n", "unknown column 'speed'"),
-        ("x_mm,y_mm,z_mm,marker\n1,2,3,A\n1,2,3,B\n", "--point"),
+        ("x_mm,y_mm,z_mm,marker\n1,2,3,A\n1,2,3,B\n", "`point`"),
         ("x_mm,y_mm,z_mm,qw,qx,qy,qz\n1,2,3,1,1,0,0\n", "norm"),
     ],
 )
@@ -89,7 +89,7 @@ def test_any_target_text_is_a_target_or_told(text) -> None:
     try:
         targets = one_target(text, "base")
     except ElastocalError as error:
-        assert "--target takes" in str(error)
+        assert "`target` takes" in str(error)
     else:
         assert np.isfinite(targets.position).all()
 

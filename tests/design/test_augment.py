@@ -30,7 +30,7 @@ FEW = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
 
 def campaign(cell: Cell, q: NDArray, noise: bool = False, x: NDArray | None = None) -> Measurements:
     """The readings of poses q, each repeated, in the cell's load states."""
-    model = Model(CHAIN, cell)
+    model = Model.assembled(CHAIN, cell)
     table = expand_plan(as_table(q), tuple(cell.tool.markers), cell.design.repeats, DOWN)
     return simulate(model, table, model.nominal if x is None else x, 7, noise=noise)
 
@@ -39,7 +39,7 @@ def gathered(cell: Cell, q: NDArray, x: NDArray) -> NDArray:
     """Σ B_iᵀ Σ_i⁻¹ B_i over poses to come, in the parameters' units."""
     n = len(x)
     found = PoseInformation(
-        Model(CHAIN, cell), load_states(cell), x[None], np.arange(n), np.ones(n)
+        Model.assembled(CHAIN, cell), load_states(cell), x[None], np.arange(n), np.ones(n)
     ).blocks(q, all_loads(q))[0]
     return np.einsum("nri,nrj->ij", found, found)
 
@@ -68,7 +68,7 @@ def test_a_campaign_tells_what_its_poses_would(
     table = campaign(cell, TABLE_2)
     if shuffled:
         table = table.take(np.random.default_rng(0).permutation(len(table)))
-    done = measured(Model(CHAIN, cell), table, ())
+    done = measured(Model.assembled(CHAIN, cell), table, ())
     assert relative(done.information, gathered(cell, TABLE_2, done.x)) < 1e-6
     assert "identified" in done.note
     assert done.numbers == len(table) * {"deflection": 1.5, "position": 3, "pose": 6}[observed]
@@ -78,10 +78,10 @@ def test_markers_noise_of_their_own_counts_for_what_is_done_too() -> None:
     """The cell may state a σ per marker instead of the tracker's."""
     sigmas = {"M1": 10e-6, "M2": 20e-6, "M3": 40e-6}
     cell = plan_cell(noise=None, loads=DOWN[None], marker_sigma=sigmas)
-    done = measured(Model(CHAIN, cell), campaign(cell, TABLE_2), ())
+    done = measured(Model.assembled(CHAIN, cell), campaign(cell, TABLE_2), ())
     assert relative(done.information, gathered(cell, TABLE_2, done.x)) < 1e-6
     stated = replace(campaign(cell, TABLE_2), sigma=np.full((90, 3), 1e-5))
-    own = measured(Model(CHAIN, cell), stated, ())
+    own = measured(Model.assembled(CHAIN, cell), stated, ())
     assert own.information[1, 1] > 1.5 * done.information[1, 1]
 
 
@@ -102,7 +102,7 @@ def test_the_same_campaign_again_halves_the_variances() -> None:
 
 def test_what_is_done_is_linearised_where_it_says_the_arm_is() -> None:
     cell = plan_cell(loads=DOWN[None])
-    model = Model(CHAIN, cell)
+    model = Model.assembled(CHAIN, cell)
     truth = model.nominal * np.array([1, 1.3, 0.8, 1.2, 0.9, 1.1])
     done = measured(model, campaign(cell, TABLE_2, noise=True, x=truth), ())
     assert done.x == pytest.approx(truth, rel=0.02)
@@ -115,7 +115,7 @@ def test_a_campaign_shows_what_no_pose_to_come_would() -> None:
     cell = plan_cell(loads=DOWN[None])
     pulled = campaign(cell, TABLE_2)
     force = np.where(pulled.force.any(axis=1)[:, None], [0.0, 1500.0, -500.0], 0.0)
-    model = Model(CHAIN, cell)
+    model = Model.assembled(CHAIN, cell)
     done = measured(model, simulate(model, replace(pulled, force=force), model.nominal, 0), ())
     setup = setup_of(cell, POSES, known=Known(done=done))
     assert setup.information.names == model.names
@@ -124,7 +124,7 @@ def test_a_campaign_shows_what_no_pose_to_come_would() -> None:
 
 def test_too_few_measurements_count_at_the_nominal_arm() -> None:
     cell = plan_cell(FULL, "position", loads=BOTH)
-    model = Model(CHAIN, cell)
+    model = Model.assembled(CHAIN, cell)
     table = campaign(cell, TABLE_2[:1])
     done = measured(model, table, ())
     assert np.array_equal(done.x, model.nominal)
@@ -135,7 +135,7 @@ def test_too_few_measurements_count_at_the_nominal_arm() -> None:
 
 def test_held_parameters_stay_where_they_are() -> None:
     cell = plan_cell(loads=DOWN[None])
-    model = Model(CHAIN, cell)
+    model = Model.assembled(CHAIN, cell)
     done = measured(model, campaign(cell, TABLE_2, x=model.nominal * 1.2), ("joint4",))
     assert done.x[3] == model.nominal[3]
     assert done.x[5] != pytest.approx(model.nominal[5], rel=0.05)

@@ -30,7 +30,7 @@ def cell_for(observe_: str, noise: object, **design: object) -> Cell:
 
 
 def information_of(cell: Cell, x: np.ndarray | None = None) -> PoseInformation:
-    model = Model(kr270_chain(), cell)
+    model = Model.assembled(kr270_chain(), cell)
     x = model.nominal if x is None else x
     n = len(model.parameters)
     return PoseInformation(model, load_states(cell), x[None], np.arange(n), np.ones(n))
@@ -80,7 +80,9 @@ def test_a_configuration_effect_bounds_what_repeats_can_tell() -> None:
     """With τ ≫ σ a pose of M markers tells at most what one exact reading with τ would."""
     tau = 1e-3
     cell = cell_for("deflection", AXIS, loads=DOWN[None], repeats=1000, repeatability=tau)
-    model = Model(kr270_chain(), replace(cell, tool=replace(cell.tool, markers={"M": np.zeros(3)})))
+    model = Model.assembled(
+        kr270_chain(), replace(cell, tool=replace(cell.tool, markers={"M": np.zeros(3)}))
+    )
     n = len(model.parameters)
     x = model.nominal
     found = PoseInformation(model, load_states(model.cell), x[None], np.arange(n), np.ones(n))

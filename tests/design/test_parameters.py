@@ -32,7 +32,7 @@ POSES = random_poses(CHAIN, 120, seed=1)
 
 def stacked(cell: Cell, q: NDArray, chain: Any = CHAIN) -> tuple[Model, NDArray]:
     """B of all parameters, scaled to columns of equal length."""
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     n = len(model.names)
     found = PoseInformation(
         model, load_states(cell), model.nominal[None], np.arange(n), np.ones(n)
@@ -164,9 +164,9 @@ def test_base_and_markers_count_where_there_is_nothing_else() -> None:
     ("interest", "error", "told"),
     [
         ("joint2.complience", InputError, ["did you mean 'joint2.compliance'", "interest"]),
-        ("joint1.compliance", InsufficientDataError, ["no feasible pose shows", "--fix joint1"]),
-        ("joint1.offset", InsufficientDataError, ["no set of poses tells", "base.rz", "--fix"]),
-        ("joint4.compliance", InsufficientDataError, ["is held", "drop it from --fix"]),
+        ("joint1.compliance", InsufficientDataError, ["no feasible pose shows", "fixed=['joint1"]),
+        ("joint1.offset", InsufficientDataError, ["no set of poses tells", "base.rz", "fixed=["]),
+        ("joint4.compliance", InsufficientDataError, ["is held", "drop it from `fixed`"]),
     ],
 )
 def test_interest_in_what_cannot_be_known_is_answered(

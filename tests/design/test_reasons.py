@@ -11,7 +11,7 @@ from elastocal.design.reasons import predicted, reasons
 from elastocal.identification.reduction import Reduction
 from elastocal.manipulator.model import Model
 
-MODEL = Model(kr270_chain(), kr270_cell(("joint_compliance",), "deflection"))
+MODEL = Model.assembled(kr270_chain(), kr270_cell(("joint_compliance",), "deflection"))
 SIZES = np.full(6, 1e-7)
 
 

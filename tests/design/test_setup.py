@@ -51,7 +51,7 @@ def covariance(cell: Cell, chain: Chain, q: NDArray) -> tuple[Model, NDArray, ND
 
     Over a basis of what the readings show (parameters, rank), and the pseudo-inverse there.
     """
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     loads = np.zeros((1, 3)) if cell.design.loads is None else cell.design.loads
     load = loads[-1] if len(loads) > 1 or loads.any() else None
     table = expand_plan(as_table(q), tuple(cell.tool.markers), cell.design.repeats, load)

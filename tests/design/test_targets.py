@@ -32,7 +32,7 @@ LEVELS = tuple(np.unique(TABLE_2[:, 1]).tolist())
 
 
 def rows_at(cell: Cell, targets: TargetPoses, x: NDArray, chain: Chain = CHAIN) -> NDArray:
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     n = len(model.names)
     information = PoseInformation(model, load_states(cell), x[None], np.arange(n), np.ones(n))
     return prediction_rows(information, targets, x)
@@ -114,7 +114,7 @@ def test_the_rows_are_how_position_changes_with_the_parameters(case: str) -> Non
     q = TABLE_2[[0, 4, 8, 13]] if chain is CHAIN else spread(chain, 4, 1)
     poses = [TargetPose(q[k], point=POINT if k % 2 else None, weight=1.0 + k) for k in range(4)]
     cell = replace(cell, design=replace(cell.design, test_poses=tuple(poses)))
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     targets = target_poses.test_poses(cell, chain)
     x = somewhere(model)
     A = rows_at(cell, targets, x, chain)

@@ -130,8 +130,8 @@ def test_the_model_gains_the_parameters_of_the_effects_and_no_others(tmp_path):
     keys = {"play_side": "load_and_approach"}
     cell = write_extended_cell(source, tmp_path / "out" / "cell.toml", (ECCENTRICITY, JUMP), keys)
     assert cell.model.play_side == "load_and_approach"
-    names = set(Model.from_cell(cell).names)
-    before = set(Model.from_cell(read_cell(source)).names)
+    names = set(Model(cell).names)
+    before = set(Model(read_cell(source)).names)
     assert names - before == {p.name for f in (ECCENTRICITY, JUMP) for p in f.parameters}
     assert before < names
     assert all(choice.name in CATALOGUE for choice in cell.model.effects)

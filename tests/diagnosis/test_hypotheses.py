@@ -38,7 +38,7 @@ def test_what_the_model_has_is_not_a_hypothesis_and_what_it_lacks_is() -> None:
     tried = {h.name for h in possible(MODEL, TABLE)[0]}
     assert not tried & {c.name for c in MODEL.cell.model.effects}
     assert "link_geometry" in tried
-    spare = Model(kr270_chain(), cell(("base_frame", "joint_compliance:joint2")))
+    spare = Model.assembled(kr270_chain(), cell(("base_frame", "joint_compliance:joint2")))
     places = {(h.name, h.where) for h in possible(spare, TABLE)[0]}
     assert ("joint_compliance", "joint3") in places and ("joint_offset", "joint1") in places
     assert ("joint_compliance", "joint2") not in places
@@ -83,7 +83,7 @@ def test_instruments_that_were_not_used_are_not_suspected() -> None:
     names = {h.name for h in possible(MODEL, TABLE)[0]}
     assert not names & {"marker_orientation", "distance_sensor"}
     for observe, name in (("pose", "marker_orientation"), ("distance", "distance_sensor")):
-        other = Model(kr270_chain(), cell(observe=observe))
+        other = Model.assembled(kr270_chain(), cell(observe=observe))
         assert name in {h.name for h in possible(other, TABLE)[0]}
 
 

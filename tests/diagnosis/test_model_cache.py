@@ -20,7 +20,7 @@ def small() -> Model:
 
 
 def copy(model: Model) -> Model:
-    return Model(model.chain, model.cell)
+    return Model.assembled(model.chain, model.cell)
 
 
 def test_a_model_is_made_once_for_a_key_and_anew_for_another() -> None:

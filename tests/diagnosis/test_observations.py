@@ -49,7 +49,7 @@ def test_positions_without_load_time_approach_and_further_markers() -> None:
     bare = table.take((table.force[:, 2] == 0) & (table.marker == 0))
     bare = replace(bare, time=None, approach=None)
     plain = cell(("base_frame", "joint_offset", "marker_position:marker:M1"), link_gravity=False)
-    d = diagnose(Model(kr270_chain(), plain), bare)
+    d = diagnose(Model.assembled(kr270_chain(), plain), bare)
     assert d.n_readings == d.n_configurations == 40
     assert {"joint_drift", "hysteresis", "payload_error"} <= {u.effect for u in d.untested}
     assert any("record time_s" in text for text in d.warnings)
@@ -65,7 +65,7 @@ def test_arms_of_other_numbers_of_joints(n_joints: int) -> None:
         "gear_eccentricity", "joint3", {"eccentricity_sin": 2e-4, "eccentricity_cos": -1.5e-4}
     )
     table = measured(chain, plain, [fault], plan(chain, 30, n_joints, PULL), n_joints)
-    d = diagnose(Model(chain, plain), table)
+    d = diagnose(Model.assembled(chain, plain), table)
     assert key(d) == fault.key and d.verdict in ("explained", "ambiguous")
     assert len(d.noise.repeatability) == n_joints
 

@@ -34,7 +34,7 @@ def scene(law: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> Sce
     table = measured(chain, cell(play_side=law), [PLAY], table, 3)
     if not sides:
         table = replace(table, approach=None)
-    model = with_recorded_drivers(Model(chain, cell(fitted)), table)
+    model = with_recorded_drivers(Model.assembled(chain, cell(fitted)), table)
     return scene_of(fit_baseline(model, table), possible(model, table)[0])
 
 

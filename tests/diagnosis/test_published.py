@@ -18,7 +18,7 @@ from elastocal.manipulator.model import Model
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return Model(kr270_chain(), kr270_cell(("base_frame",)))
+    return Model.assembled(kr270_chain(), kr270_cell(("base_frame",)))
 
 
 @pytest.mark.parametrize("name", VERDICTS)
@@ -28,10 +28,10 @@ def test_what_is_written_reads_back_alike(name, model):
 
 
 def test_every_part_of_the_result_is_published(model):
-    """A field added to the result must not be forgotten here; one has another name, and the fit
-    behind the figures of the report is no part of the answer."""
+    """A field added to the result must not be forgotten here; one has another name, and the
+    model and the fit behind the figures of the report are no part of the answer."""
     renamed = {"extra": "extra_plan"}
-    names = {renamed.get(f.name, f.name) for f in fields(Diagnosis)} - {"calibrated"}
+    names = {renamed.get(f.name, f.name) for f in fields(Diagnosis)} - {"calibrated", "model"}
     assert names <= set(publish(EXPLAINED, model, "data.csv"))
 
 

@@ -14,7 +14,7 @@ from elastocal.manipulator.model import Model
 
 
 def bare(**model) -> Model:
-    return Model(kr270_chain(), kr270_cell(("base_frame",), link_gravity=True, **model))
+    return Model.assembled(kr270_chain(), kr270_cell(("base_frame",), link_gravity=True, **model))
 
 
 def table(**columns):
@@ -35,7 +35,7 @@ def test_recorded_columns_choose_the_driver() -> None:
 
 
 def test_an_effect_that_the_cell_has_keeps_its_driver() -> None:
-    model = Model(kr270_chain(), kr270_cell(("backlash:joint2",), link_gravity=True))
+    model = Model.assembled(kr270_chain(), kr270_cell(("backlash:joint2",), link_gravity=True))
     n = len(table())
     sides = np.where(np.arange(n)[:, None] % 2 == 0, 1.0, -1.0) * np.ones((n, 6))
     assert with_recorded_drivers(model, table(approach=sides)).cell.model.play_side == "load"
@@ -51,7 +51,7 @@ def test_keys_are_those_of_the_effects_found() -> None:
 def test_without_load_the_joint_lags_behind_its_last_motion() -> None:
     """Joint 1 of an upright arm bears no torque: its play is decided by the approach alone."""
     cell = kr270_cell(("backlash:joint1",), link_gravity=True, play_side="load_and_approach")
-    model = Model(kr270_chain(), cell)
+    model = Model.assembled(kr270_chain(), cell)
     plain = random_table(kr270_chain(), 4, seed=5)
     still = replace(plain, force=np.zeros_like(plain.force))
     beta = 4e-4
@@ -60,7 +60,7 @@ def test_without_load_the_joint_lags_behind_its_last_motion() -> None:
         sides = np.full_like(plain.q, side)
         reading[side] = model.predict(replace(still, approach=sides), np.array([beta]))
     turned = {}
-    rigid = Model(kr270_chain(), kr270_cell((), link_gravity=True))
+    rigid = Model.assembled(kr270_chain(), kr270_cell((), link_gravity=True))
     for side in (1.0, -1.0):
         q = plain.q.copy()
         q[:, 0] -= side * beta / 2 * np.tanh(3.0)

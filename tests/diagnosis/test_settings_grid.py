@@ -32,7 +32,7 @@ def hypothesis(name: str, where: str, model: Model | None = None) -> Hypothesis:
 def ripple(orders: tuple[float, ...], q: np.ndarray, visits: Measurements) -> Grid:
     plain = campaign()[0]
     spec = replace(plain.cell.model, gear_ripple_orders=orders)
-    model = Model(kr270_chain(), replace(plain.cell, model=spec))
+    model = Model.assembled(kr270_chain(), replace(plain.cell, model=spec))
     at = visits.q.copy()
     at[:, 3] = q
     return grid_of(hypothesis("gear_ripple", "joint4", model), replace(visits, q=at), model.chain)

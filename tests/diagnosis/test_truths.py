@@ -115,7 +115,7 @@ def test_a_large_effect_is_not_held_to_be_smaller_than_it_was_found() -> None:
     stiff = Fault("gravity_compensator", "joint2", {"compensator_stiffness": 2e5})
     chain, plain = kr270_chain(), cell(sigma=5e-5)
     table = measured(chain, plain, [stiff], plan(chain, 40, 1), 1)
-    base = fit_baseline(Model(chain, plain), table)
+    base = fit_baseline(Model.assembled(chain, plain), table)
     scene = scene_of(base, [h for h in possible(base.model, table)[0] if h.name == stiff.effect])
     item = Item(scene.hypotheses[0], np.zeros(0), 0.0)
     found = Confirmation.of(_found(scene, (item,)), base, np.random.default_rng(3))

@@ -106,7 +106,7 @@ def test_every_key_of_a_plan_is_on_the_page(course):
 
 def test_every_key_of_a_diagnosis_is_on_the_page():
     cell = read_cell(EXAMPLE / "cell.toml", known_effects=tuple(CATALOGUE))
-    model = Model.from_cell(cell)
+    model = Model(cell)
     table = read_measurements(
         EXAMPLE / "data.csv", joint_kinds=model.chain.kinds, marker_names=tuple(cell.tool.markers)
     )

@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+import elastocal as ec
+
 DOCS = Path(__file__).parents[2] / "docs"
 # In the order in which they build on each other; design and diagnosis have tests of their own.
 PAGES = ("input", "model", "identification", "simulation")
@@ -22,14 +24,29 @@ def test_the_examples_run(course, monkeypatch, capsys):
     assert len(names["simulated"]) == 8 * 2 * 3 * 3  # poses, load states, repeats, markers
     (example,) = examples(DOCS / "identifying.md")
     exec(compile(example, "identifying", "exec"), names)
-    held = [e.name for e in names["result"].estimates if not e.identifiable]
+    held = [e.name for e in names["fit"].estimates if not e.identifiable]
     assert held == ["joint1.compliance"]
 
 
-def test_the_examples_of_design_and_diagnosis_name_what_exists():
-    for page in ("design", "diagnosis"):
-        (example,) = examples(DOCS / "reference" / "api" / f"{page}.md")
-        imports = [line for line in example.splitlines() if line.startswith("from ")]
-        assert imports
-        exec(compile("\n".join(imports), page, "exec"), {})
-        compile(example, page, "exec")
+def test_the_front_door_is_as_its_page_shows_it(course, monkeypatch, capsys):
+    monkeypatch.chdir(course.folder)
+    (example,) = examples(DOCS / "reference" / "api" / "front.md")
+    exec(compile(example, "front", "exec"), {})
+    assert "<Calibration" in capsys.readouterr().out
+    assert {"front.csv", "calibrated.urdf"} <= {path.name for path in course.folder.iterdir()}
+
+
+def test_every_name_of_the_front_door_that_a_page_uses_is_there():
+    used = {
+        name
+        for page in [DOCS.parent / "README.md", *DOCS.rglob("*.md")]
+        for example in examples(page)
+        for name in re.findall(r"\bec\.(\w+)", example)
+    }
+    assert {"Model", "identify", "design", "diagnose"} <= used <= set(ec.__all__)
+
+
+def test_the_page_of_the_front_door_has_every_name():
+    page = (DOCS / "reference" / "api" / "front.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^::: elastocal\.(\w+)$", page, re.M)
+    assert sorted(shown) == sorted(ec.__all__)

@@ -12,7 +12,7 @@ from elastocal.cell import Nominal
 from elastocal.export.cost import cost_of
 from elastocal.export.kept import Conditions, keep
 from elastocal.export.pieces import evaluate_pieces
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
 
@@ -48,12 +48,12 @@ INSTRUMENT = {
 }
 
 
-def calibrated(name: str) -> Calibrated:
+def calibrated(name: str) -> CalibratedArm:
     """A KR 270 with soft joints, its weights, and one effect at a place of its own."""
     observe = "distance" if name == "distance_sensor" else "position"
     nominal = Nominal(joint_compliance=(3e-7,) * 6, gravity_compensator=COMPENSATOR)
     cell = kr270_cell((), observe, nominal=nominal, link_gravity=True)
-    chain = Model.from_cell(cell).chain
+    chain = Model(cell).chain
     effect = CATALOGUE[name]
     place = effect.places(chain, cell)[0]
     keys = {s.key for s in effect.settings(place, chain, cell) if s.default is None}
@@ -64,12 +64,12 @@ def calibrated(name: str) -> Calibrated:
         nominal=replace(nominal, settings=settings),
         link_gravity=True,
     )
-    model = Model.from_cell(cell)
+    model = Model(cell)
     x = model.nominal.copy()
     for i, p in enumerate(model.parameters):
         if p.effect == name and name != "joint_compliance":
             x[i] += abs(p.typical or 1e-7)
-    return Calibrated(model, x, (), np.zeros((0, 0)), "result.json")
+    return CalibratedArm(model, x, (), np.zeros((0, 0)), "result.json")
 
 
 @pytest.mark.parametrize("name", [name for name in CATALOGUE if name not in ALWAYS])
@@ -107,7 +107,7 @@ def test_values_that_no_spring_has_leave_the_effect_out_with_its_cost() -> None:
 def test_measured_torques_give_way_to_those_of_the_load() -> None:
     arm = calibrated("joint_offset")
     spec = replace(arm.model.cell.model, torque="measured", link_gravity=False)
-    measured = Model(arm.model.chain, replace(arm.model.cell, model=spec))
+    measured = Model.assembled(arm.model.chain, replace(arm.model.cell, model=spec))
     kept = keep(replace(arm, model=measured), True, CONDITIONS)
     assert kept.full.model.cell.model.torque == "computed"
     assert cost_of(kept, 4, seed=0).total.flange_max == 0.0
@@ -116,7 +116,7 @@ def test_measured_torques_give_way_to_those_of_the_load() -> None:
 def test_linear_deflections_are_held_at_the_deflected_pose_and_that_costs() -> None:
     arm = calibrated("joint_offset")
     spec = replace(arm.model.cell.model, deflection_model="linear")
-    linear = Model(arm.model.chain, replace(arm.model.cell, model=spec))
+    linear = Model.assembled(arm.model.chain, replace(arm.model.cell, model=spec))
     kept = keep(replace(arm, model=linear), True, CONDITIONS)
     (omission,) = kept.omissions
     assert omission.effect == "linear deflections"

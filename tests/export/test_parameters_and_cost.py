@@ -95,7 +95,7 @@ def test_a_rigid_file_costs_the_deflection_and_none_without_load(tmp_path: Path)
     assert entry.effect == "joint_compliance" and entry.difference == loaded.cost.total
     assert loaded.cost.total.flange_rms > 1e-5
     assert unloaded.cost.total.flange_max == 0.0
-    assert any("--load" in warning for warning in unloaded.warnings)
+    assert any("`load`" in warning for warning in unloaded.warnings)
 
 
 def test_levels_of_a_joint_are_held_by_their_mean(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_temperature_is_frozen_into_the_lengths_where_it_is_stated(tmp_path: Pat
     calibrated = read_calibrated(*written)
     without = export(calibrated, Wish("urdf", poses=20))
     (entry,) = without.cost.effects
-    assert entry.difference is None and "--temperature-c" in entry.note
+    assert entry.difference is None and "`temperature_c`" in entry.note
     warm = export(calibrated, Wish("urdf", conditions=Conditions(temperature=30.0), poses=20))
     assert not warm.cost.effects and warm.cost.total.flange_max == 0.0
     (tmp_path / "warm.urdf").write_text(warm.text)

@@ -12,14 +12,14 @@ from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from support.urdf_text import arm
 
 from elastocal.export.urdf import Frames
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.urdf import read_urdf
 from elastocal.manipulator.urdf_check import check_urdf
 
 NANOMETRE = 1e-9
 
 
-def frame_positions(text: str, calibrated: Calibrated, q: np.ndarray, base: str, frame: str):
+def frame_positions(text: str, calibrated: CalibratedArm, q: np.ndarray, base: str, frame: str):
     """Placements (n, 4, 4) of a frame in the base link by pinocchio alone, other joints at zero."""
     model = pin.buildModelFromXML(text)
     data = model.createData()

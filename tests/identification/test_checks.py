@@ -25,7 +25,7 @@ from elastocal.manipulator.model import Model
 
 @pytest.fixture
 def model():
-    return Model(planar_chain(), cell_of(GEOMETRY))
+    return Model.assembled(planar_chain(), cell_of(GEOMETRY))
 
 
 def table_for(model, n=20, seed=0, q=None):
@@ -78,7 +78,7 @@ def test_controllers_may_overshoot_a_little(model):
 
 def test_the_cells_limits_narrow_the_robots():
     cell = replace(cell_of(GEOMETRY), limits={"joint2": (-0.5, 0.5), "joint3": (-9.0, 9.0)})
-    model = Model(planar_chain(), cell)
+    model = Model.assembled(planar_chain(), cell)
     lower, upper = joint_limits(model.cell, model.chain)
     np.testing.assert_allclose(lower, [-3.0, -0.5, -2.5])
     np.testing.assert_allclose(upper, [3.0, 0.5, 2.5])
@@ -125,7 +125,9 @@ def test_prismatic_limits_are_in_metres():
     joints = list(planar_chain().joints)
     axis = np.array([1.0, 0.0, 0.0])
     joints[2] = Joint("slide", "prismatic", placement([0.5, 0, 0]), axis, 0.0, 0.8)
-    model = Model(Chain("slider", tuple(joints), placement([0.1, 0, 0])), cell_of(GEOMETRY))
+    model = Model.assembled(
+        Chain("slider", tuple(joints), placement([0.1, 0, 0])), cell_of(GEOMETRY)
+    )
     q = np.zeros((5, 3))
     q[2, 2] = 15.0  # not an angle: no talk of turns
     with pytest.raises(InputError, match=r"line 4: joint3 \(slide\) at 15 m is beyond"):
@@ -200,7 +202,7 @@ def test_fixed_names_places_and_effects(model):
 def test_an_unknown_fixed_name(model, name, hint):
     with pytest.raises(InputError) as caught:
         identify(model, table_for(model), Options(fixed=(name,)))
-    message = f"cannot fix '{name}': the model has no such parameter, place or effect {hint}"
+    message = f"fixed=['{name}']: the model has no such parameter, place or effect {hint}"
     assert str(caught.value) == message
 
 
@@ -211,20 +213,20 @@ def test_everything_fixed_leaves_nothing(model):
 
 
 def test_a_model_without_parameters_is_refused():
-    bare = Model(planar_chain(), cell_of(()))
+    bare = Model.assembled(planar_chain(), cell_of(()))
     with pytest.raises(InputError, match="nothing is left to identify: choose effects"):
         identify(bare, table_for(bare))
 
 
 def test_readings_that_depend_on_nothing_that_is_fitted():
     """Compliances without any load: not one parameter is seen."""
-    model = Model(planar_chain(), cell_of(("joint_compliance",)))
+    model = Model.assembled(planar_chain(), cell_of(("joint_compliance",)))
     with pytest.raises(InsufficientDataError, match="do not depend on any parameter") as caught:
         identify(model, table_for(model))
     assert "measure other poses or loads, or choose other effects" in str(caught.value)
 
 
 def test_a_missing_column_names_itself(model):
-    distance = Model(planar_chain(), cell_of(("distance_sensor",), observe="distance"))
+    distance = Model.assembled(planar_chain(), cell_of(("distance_sensor",), observe="distance"))
     with pytest.raises(InputError, match=r"observe = 'distance' needs the columns distance_mm"):
         identify(distance, table_for(model))

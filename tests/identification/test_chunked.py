@@ -125,7 +125,7 @@ def test_a_bounded_fit_in_parts_is_the_constrained_minimum(in_parts):
     bound), and the free minimum where that is inside."""
     chain = planar_chain(4)
     cell = cell_of(("joint_compliance",), nominal=Nominal(joint_compliance=(1e-5,) * 4))
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     truth = np.array([1e-5, 0.0, 1e-5, 0.0])
     plan = table_at(random_poses(chain, 60, 3), [[0, 0, 0], [80, 40, -200]])
     tables = [measured(model, plan, truth, SIGMA, np.random.default_rng(k)) for k in range(3)]

@@ -16,7 +16,7 @@ MARKERS = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}
 
 
 def fitted():
-    model = Model(planar_chain(), cell_of(PLACED, MARKERS))
+    model = Model.assembled(planar_chain(), cell_of(PLACED, MARKERS))
     rng = np.random.default_rng(0)
     truth = true_values(model, rng)
     plan = table_at(random_poses(model.chain, 40, 0), markers=("M1", "M2"))

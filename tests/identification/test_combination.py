@@ -24,7 +24,7 @@ def test_the_expression_at_the_true_values_is_the_value_that_was_found():
     nominal = Nominal(joint_compliance=(HELD,) * 6)
     cell = cell_of(("joint_compliance",), {"M1": np.array([0.2, 0.1, 0.1])}, nominal=nominal,
                    load_point=(0.2, 0.1, 0.2))  # fmt: skip
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     rng = np.random.default_rng(0)
     truth = model.nominal * rng.uniform(0.5, 1.5, len(model.nominal))
     plan = table_at(q, [[0, 0, 0], [0, 0, -2600], [900, 0, -1500]])
@@ -46,7 +46,7 @@ def test_the_expression_at_the_true_values_is_the_value_that_was_found():
 
 def test_an_interval_without_an_end_is_null_with_the_reason():
     chain = kr270_chain()
-    model = Model(chain, cell_of(("joint_offset",), {"M1": np.array([0.2, 0.1, 0.1])}))
+    model = Model.assembled(chain, cell_of(("joint_offset",), {"M1": np.array([0.2, 0.1, 0.1])}))
     rng = np.random.default_rng(1)
     result = identify(
         model, measured(model, table_at(random_poses(chain, 9, 1)), model.nominal, 1e-5, rng)

@@ -66,7 +66,7 @@ def test_equals_refits_of_an_arm(effects, stated):
     noise = CartesianNoise(np.array([1.0, 2.0, 0.5]) * sigma) if stated else None
     chain = planar_chain(4) if effects == GEOMETRY else random_chain(5, 3)
     nominal = Nominal(joint_compliance=(2e-5,) * chain.n_joints)
-    model = Model(chain, cell_of(effects, tracker=Tracker(noise=noise), nominal=nominal))
+    model = Model.assembled(chain, cell_of(effects, tracker=Tracker(noise=noise), nominal=nominal))
     rng = np.random.default_rng(3)
     truth = true_values(model, rng)
     forces = [[0, 0, 0], [50, 0, -200]]
@@ -112,8 +112,9 @@ def test_a_level_measured_once_has_no_held_out_residual():
     """Joint 2's compliance at a level that only one configuration visits."""
     chain = planar_chain()
     levels = {"joint2": (-0.5, 0.7)}
-    model = Model(chain, cell_of(("base_frame", "joint_compliance"), compliance_levels=levels,
-                                 nominal=Nominal(joint_compliance=(1e-5,) * 3)))  # fmt: skip
+    nominal = Nominal(joint_compliance=(1e-5,) * 3)
+    effects = ("base_frame", "joint_compliance")
+    model = Model.assembled(chain, cell_of(effects, compliance_levels=levels, nominal=nominal))
     q = random_poses(chain, 12, 1)
     q[:, 1] = -0.5
     q[4, 1] = 0.7
@@ -132,7 +133,7 @@ def test_a_level_measured_once_has_no_held_out_residual():
 def test_held_out_covers_all_rows_of_a_configuration_together():
     """Repeats of one configuration share its model error, so they are left out together."""
     chain = planar_chain()
-    model = Model(chain, cell_of(("base_frame", "marker_position")))
+    model = Model.assembled(chain, cell_of(("base_frame", "marker_position")))
     rng = np.random.default_rng(2)
     truth = true_values(model, rng)
     plan = table_at(random_poses(chain, 10, 2))

@@ -43,7 +43,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "file-formats.md"
 def bearings() -> Model:
     """Six drives and the bearing of joint 2, whose true compliance is zero."""
     effects = ("joint_compliance", "off_axis_compliance:joint2")
-    return Model.from_cell(kr270_cell(effects, observe="deflection"))
+    return Model(kr270_cell(effects, observe="deflection"))
 
 
 @lru_cache
@@ -52,13 +52,13 @@ def drives(deflection_model: str = "equilibrium") -> Model:
     cell = kr270_cell(
         ("joint_compliance",), observe="deflection", deflection_model=deflection_model
     )
-    return Model.from_cell(cell)
+    return Model(cell)
 
 
 @lru_cache
 def placed() -> Model:
     """An arm at a free base with an unknown marker: base.rz and joint 1 turn alike."""
-    return Model.from_cell(kr270_cell(("base_frame", "joint_offset")))
+    return Model(kr270_cell(("base_frame", "joint_offset")))
 
 
 def readings(model: Model, seed: int, force=DOWN, **values: float) -> Measurements:
@@ -90,13 +90,13 @@ def prior_of(**stated: tuple[float, float]) -> GaussianPrior:
 
 def test_a_negative_compliance_is_reported_at_its_bound_with_a_one_sided_interval():
     alone = identify(bearings(), negative(), Options())
-    assert alone.estimate(BEARING_X).value < 0
+    assert alone[BEARING_X].value < 0
     found = by_physics()
-    at_bound = found.estimate(BEARING_X)
+    at_bound = found[BEARING_X]
     assert found.method == "constrained" and found.converged
     assert (at_bound.value, at_bound.ci95[0]) == (0.0, 0.0) and at_bound.identifiable
     assert 0 < at_bound.ci95[1] < 3 * at_bound.std
-    assert all(found.estimate(n).value >= 0 for n in bearings().names)
+    assert all(found[n].value >= 0 for n in bearings().names)
     (active,) = found.active
     assert (active.label, active.kind, active.names) == (f"{BEARING_X} >= 0", "lower", (BEARING_X,))
     assert active.multiplier > 0
@@ -118,8 +118,8 @@ def test_the_profile_of_the_nonlinear_fit_agrees_where_the_model_is_nearly_linea
 
 def test_the_bootstrap_piles_up_on_the_bound():
     found = by_physics(intervals="bootstrap")
-    low, high = found.estimate(BEARING_X).ci95
-    assert low == 0 and 0 < high < by_physics().estimate(BEARING_X).ci95[1] * 1.1
+    low, high = found[BEARING_X].ci95
+    assert low == 0 and 0 < high < by_physics()[BEARING_X].ci95[1] * 1.1
     for e, p in zip(found.estimates[2:6], by_physics().estimates[2:6], strict=True):
         assert np.diff(e.ci95) == pytest.approx(np.diff(p.ci95), rel=0.2)  # 999 draws: 5 %
 
@@ -146,7 +146,7 @@ def test_bounded_adds_the_physical_bounds_to_what_is_stated():
     found = identify(bearings(), negative(), Options(bounded=True, constraints=loose))
     np.testing.assert_allclose(found.x, by_physics().x, rtol=1e-6, atol=1e-13)
     assert [a.label for a in found.active] == [f"{BEARING_X} >= 0"]
-    assert found.estimate(BEARING_X).value == 0
+    assert found[BEARING_X].value == 0
 
 
 def test_huber_under_constraints_is_hubers_estimate_where_none_is_active():
@@ -156,7 +156,7 @@ def test_huber_under_constraints_is_hubers_estimate_where_none_is_active():
     found = identify(drives(), table, Options(method="huber", constraints=wide))
     np.testing.assert_allclose(found.x, alone.x, rtol=1e-5)
     for name in alone.determined:
-        one, other = found.estimate(name), alone.estimate(name)
+        one, other = found[name], alone[name]
         assert one.std == pytest.approx(other.std, rel=0.05)  # ψ′ by rows here, by readings there
 
 
@@ -196,7 +196,7 @@ def test_a_prior_is_the_ridge_of_the_linear_arm():
     assert list(found.prior_share) == list(alone.determined)
     np.testing.assert_allclose(list(found.prior_share.values()), share, atol=1e-8)
     for e, std, s in zip(
-        (found.estimate(n) for n in found.determined), np.sqrt(np.diag(V)), share, strict=True
+        (found[n] for n in found.determined), np.sqrt(np.diag(V)), share, strict=True
     ):
         dof = alone.dof / (1 - s) ** 2
         assert e.dof == pytest.approx(dof, rel=1e-5)
@@ -225,7 +225,7 @@ def test_a_prior_gives_a_number_to_what_no_reading_shows_and_says_so():
     found = identify(
         drives(), readings(drives(), 6), Options(prior=prior_of(joint1__compliance=(3e-7, 1e-7)))
     )
-    e = found.estimate("joint1.compliance")
+    e = found["joint1.compliance"]
     assert (e.value, e.std) == (pytest.approx(3e-7), pytest.approx(1e-7))
     assert found.prior_share["joint1.compliance"] == pytest.approx(1.0)
     assert found.prior_share["joint2.compliance"] == pytest.approx(0.0, abs=1e-9)
@@ -244,7 +244,7 @@ def test_a_prior_on_one_of_a_pair_tells_the_other(known, other):
     mean, std = 2e-3, 1e-4
     prior = GaussianPrior.independent((known,), [mean], [std])
     found = identify(placed(), table, Options(prior=prior))
-    assert found.estimate(known).value == pytest.approx(mean, rel=1e-6)
+    assert found[known].value == pytest.approx(mean, rel=1e-6)
     # Both turn about the same axis, base.rz upwards and joint 1 downwards.
     combined = alone.combination("base.rz")
     sign = combined.terms["joint1.offset"]
@@ -253,7 +253,7 @@ def test_a_prior_on_one_of_a_pair_tells_the_other(known, other):
         if known == "joint1.offset"
         else ((combined.value - mean) / sign)
     )
-    e = found.estimate(other)
+    e = found[other]
     assert e.value == pytest.approx(expected, abs=2e-6)
     assert e.std == pytest.approx(np.hypot(std, combined.std), rel=0.01)
     assert not {known, other} & {n for c in found.combinations for n in c.terms}
@@ -278,7 +278,7 @@ def test_intervals_of_truths_drawn_from_the_prior_hold_them():
             model, seed, **{"joint2.compliance": drawn[0], "joint6.compliance": drawn[1]}
         )
         found = identify(model, table, Options(method="ols", prior=prior))
-        ends = [found.estimate(n).ci95 for n in prior.names]
+        ends = [found[n].ci95 for n in prior.names]
         hits += [low <= v <= high for (low, high), v in zip(ends, drawn, strict=True)]
     low, high = binomial_band(len(hits), 0.95)
     assert low <= sum(hits) <= high
@@ -324,9 +324,9 @@ def test_an_equality_with_a_known_parameter_determines_an_unseen_one():
     table = readings(drives(), 9)
     stated = equal("joint1.compliance", "joint3.compliance")
     found, alone = (identify(drives(), table, Options(constraints=c)) for c in (stated, None))
-    one, other = found.estimate("joint1.compliance"), found.estimate("joint3.compliance")
+    one, other = found["joint1.compliance"], found["joint3.compliance"]
     assert one.value == pytest.approx(other.value, rel=1e-12)
-    assert other.value == pytest.approx(alone.estimate("joint3.compliance").value, rel=1e-6)
+    assert other.value == pytest.approx(alone["joint3.compliance"].value, rel=1e-6)
     assert one.std == pytest.approx(other.std) and one.note == ""
 
 
@@ -334,8 +334,8 @@ def test_a_known_value_splits_a_combination():
     table = readings(placed(), 10)
     known = Constraints(equalities=(LinearEquality({"joint1.offset": 1.0}, 1e-3),))
     found, alone = (identify(placed(), table, Options(constraints=c)) for c in (known, None))
-    assert found.estimate("joint1.offset").ci95 == (1e-3, 1e-3)
-    combined, e = alone.combination("base.rz"), found.estimate("base.rz")
+    assert found["joint1.offset"].ci95 == (1e-3, 1e-3)
+    combined, e = alone.combination("base.rz"), found["base.rz"]
     expected = combined.value - combined.terms["joint1.offset"] * 1e-3
     assert e.value == pytest.approx(expected, abs=2e-6)
     assert np.isfinite(found.covariance).all()

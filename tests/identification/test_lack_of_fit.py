@@ -20,7 +20,7 @@ SENTENCE = "Configurations scatter more than their repeats"
 
 def campaign(seed, effect=0.0, repeats=REPEATS):
     """Readings of a planar arm, each pose repeated, with an error common to a configuration."""
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     once = table_at(random_poses(model.chain, POSES, seed), [[0, 0, 0]])
     n = len(once)
     table = once.take(np.repeat(np.arange(n), repeats))

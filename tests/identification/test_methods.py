@@ -37,7 +37,7 @@ def campaign(seed=0, effect=0.0, poses=14, stated=True):
     """Two markers, four repeats, and an error common to the readings of a configuration."""
     noise = CartesianNoise(np.full(3, SIGMA)) if stated else None
     tracker = Tracker(position=np.array([3.0, 1.0, 0.5]), noise=noise)
-    model = Model(planar_chain(), cell_of(PLACED, MARKERS, tracker))
+    model = Model.assembled(planar_chain(), cell_of(PLACED, MARKERS, tracker))
     rng = np.random.default_rng(seed)
     truth = true_values(model, rng)
     once = table_at(random_poses(model.chain, poses, seed), markers=("M1", "M2"))
@@ -147,7 +147,7 @@ def test_robust_intervals_hold_with_outliers():
         model, table, truth = campaign(seed)
         result = identify(model, with_errors(table, 0.05, seed), Options(method="tukey"))
         for name, true in zip(model.names, truth, strict=True):
-            low, high = result.estimate(name).ci95
+            low, high = result[name].ci95
             hits, total = hits + (low <= true <= high), total + 1
     low, high = binomial_band(total, 0.95)
     assert low <= hits <= high
@@ -198,7 +198,7 @@ def test_intervals_hold_where_the_arm_does_not_come_back_to_the_same_place():
         model, table, truth = campaign(seed, effect=1e-4)
         both = identify(model, table), identify(model, table, Options(method="ols"))
         for name, true in zip(model.names, truth, strict=True):
-            ends = [r.estimate(name).ci95 for r in both]
+            ends = [r[name].ci95 for r in both]
             hits += ends[0][0] <= true <= ends[0][1]
             plain_hits += ends[1][0] <= true <= ends[1][1]
             total += 1
@@ -218,7 +218,7 @@ def test_every_kind_of_intervals(kind):
     result, plain = identify(model, table, options), identify(model, table, Options(method="ols"))
     assert result.noise.interval_kind.lower() == ("classical" if kind == "auto" else kind)
     for name, true in zip(model.names, truth, strict=True):
-        mine, other = result.estimate(name), plain.estimate(name)
+        mine, other = result[name], plain[name]
         width = (mine.ci95[1] - mine.ci95[0]) / (other.ci95[1] - other.ci95[0])
         assert 0.4 < width < 2.5
         assert mine.ci95[0] < mine.value < mine.ci95[1]
@@ -231,7 +231,7 @@ def test_clustered_intervals_hold_under_a_configuration_effect():
         model, table, truth = campaign(seed, effect=1e-4)
         result = identify(model, table, Options(method="ols", intervals="cr2"))
         for name, true in zip(model.names, truth, strict=True):
-            low, high = result.estimate(name).ci95
+            low, high = result[name].ci95
             hits, total = hits + (low <= true <= high), total + 1
     assert hits >= binomial_band(total, 0.95)[0]
 
@@ -242,7 +242,7 @@ def test_a_bootstrap_does_not_depend_on_the_number_of_processes():
         identify(model, table, Options(intervals="bootstrap", seed=7, jobs=jobs)) for jobs in (1, 2)
     )
     for name in model.names:
-        assert one.estimate(name).ci95 == two.estimate(name).ci95
+        assert one[name].ci95 == two[name].ci95
 
 
 # --- what does not go together --------------------------------------------------------------

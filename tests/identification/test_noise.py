@@ -170,7 +170,7 @@ def test_auto_for_distances_and_poses():
         ("axis", POLAR, r"the cell has no \[tracker\] sigma_um"),
         ("axis", Tracker(), r"the cell has no \[tracker\] sigma_um"),
         ("polar", AXIS, r"no \[tracker\] range_um, range_ppm, transverse_um, transverse_ppm"),
-        ("covariance", AXIS, r"'covariance' need a matrix \(--covariance FILE\)"),
+        ("covariance", AXIS, r"'covariance' need a matrix \(`covariance`\)"),
     ],
 )
 def test_noise_that_is_not_stated_is_refused(kind, tracker, message):
@@ -230,7 +230,7 @@ def test_wls_has_the_variance_it_states_and_beats_ols():
     """
     chain = planar_chain()
     effects = ("base_frame", "joint_offset:joint2", "joint_offset:joint3", "link_geometry:link2")
-    model = Model(chain, cell_of(effects))
+    model = Model.assembled(chain, cell_of(effects))
     plan, rng = heterogeneous(chain), np.random.default_rng(5)
     truth = true_values(model, rng)
     seen = observe(replace(plan, position=np.zeros((25, 3))), "position")
@@ -265,7 +265,7 @@ def test_wls_has_the_variance_it_states_and_beats_ols():
 def test_identify_states_the_covariance_that_its_estimates_have():
     """The whole path, 25 draws of 9 parameters: dᵀ cov⁻¹ d is 9·F(9, 66), of mean 9·66/64 and
     less than 1.3 times the standard deviation √18 of χ²(9); 4 standard errors of the mean."""
-    model = Model(planar_chain(), cell_of(("base_frame", "marker_position")))
+    model = Model.assembled(planar_chain(), cell_of(("base_frame", "marker_position")))
     plan, rng = heterogeneous(model.chain), np.random.default_rng(6)
     truth = true_values(model, rng)
     squared = []
@@ -279,7 +279,7 @@ def test_identify_states_the_covariance_that_its_estimates_have():
 
 
 def test_unit_weights_are_ols_and_worse():
-    model = Model(planar_chain(), cell_of(("base_frame", "marker_position")))
+    model = Model.assembled(planar_chain(), cell_of(("base_frame", "marker_position")))
     plan = heterogeneous(model.chain)
     rng = np.random.default_rng(6)
     truth = true_values(model, rng)
@@ -300,7 +300,9 @@ def test_weights_follow_a_subset_of_the_observations():
 def test_ratio_to_stated_noise():
     """The stated sigma is true: s² · dof is χ²(dof)."""
     tracker = Tracker(noise=CartesianNoise(np.array([2e-5, 2e-5, 5e-5])))
-    model = Model(planar_chain(), cell_of(("base_frame", "marker_position"), tracker=tracker))
+    model = Model.assembled(
+        planar_chain(), cell_of(("base_frame", "marker_position"), tracker=tracker)
+    )
     rng = np.random.default_rng(7)
     truth = true_values(model, rng)
     plan = table_at(random_poses(model.chain, 30, 7))

@@ -59,7 +59,7 @@ def false_alarms(model, tables, poses):
 def test_clean_tables_hardly_ever_raise_an_alarm():
     """At a rate of 1 % more than 6 alarms in 100 tables have a probability below 1e-4."""
     limit = stats.binom.isf(1e-4, 100, FALSE_ALARM)
-    model = Model(planar_chain(), cell_of(("base_frame",)))
+    model = Model.assembled(planar_chain(), cell_of(("base_frame",)))
     assert false_alarms(model, 100, 12) <= limit
 
 
@@ -67,7 +67,7 @@ def test_clean_tables_hardly_ever_raise_an_alarm():
 @pytest.mark.parametrize("effects", [PLACED, GEOMETRY], ids="+".join)
 def test_clean_tables_hardly_ever_raise_an_alarm_however_many_parameters(effects):
     limit = stats.binom.isf(1e-4, 200, FALSE_ALARM)
-    assert false_alarms(Model(random_chain(1, 4), cell_of(effects)), 200, 25) <= limit
+    assert false_alarms(Model.assembled(random_chain(1, 4), cell_of(effects)), 200, 25) <= limit
 
 
 # --- gross errors ---------------------------------------------------------------------------
@@ -77,7 +77,7 @@ def test_clean_tables_hardly_ever_raise_an_alarm_however_many_parameters(effects
 def test_a_tenth_of_gross_errors_is_found_and_little_else(seed):
     """20 σ and more are far beyond any limit.  A good reading is accused in one table of a
     hundred, so not one of 4 · 54 with a probability of 96 %; one per table is allowed."""
-    model = Model(planar_chain(), cell_of(GEOMETRY))
+    model = Model.assembled(planar_chain(), cell_of(GEOMETRY))
     table, _, rng = clean_table(model, seed, 60)
     wrong, bad = with_gross_errors(table, rng, 0.1)
     found = rows_of(identify(model, wrong).faulty)
@@ -87,7 +87,7 @@ def test_a_tenth_of_gross_errors_is_found_and_little_else(seed):
 
 def test_errors_among_several_load_states_and_markers():
     markers = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}
-    model = Model(planar_chain(), cell_of(PLACED, markers))
+    model = Model.assembled(planar_chain(), cell_of(PLACED, markers))
     rng = np.random.default_rng(3)
     truth = true_values(model, rng)
     plan = table_at(random_poses(model.chain, 15, 3), markers=("M1", "M2"))
@@ -102,7 +102,7 @@ def test_errors_among_several_load_states_and_markers():
 
 def test_error_and_ratio_of_a_faulty_reading():
     """8 mm on one reading: so it is reported, in m and in multiples of the noise (√3 per σ)."""
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     table, _, _ = clean_table(model, 5, 30)
     table.position[11] += [0.0, 8e-3, 0.0]
     (outlier,) = identify(model, table).faulty
@@ -113,7 +113,7 @@ def test_error_and_ratio_of_a_faulty_reading():
 
 
 def distance_block(seed, share, shift):
-    model = Model(
+    model = Model.assembled(
         planar_chain(4), cell_of(("distance_sensor", "marker_position"), observe="distance")
     )
     rng = np.random.default_rng(seed)
@@ -143,7 +143,7 @@ def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
     found = rows_of(result.excluded)
     assert set(block) <= set(found) and len(found) <= len(block) + 1
     assert blocks([o.line for o in result.excluded])[0] == (block[0] + 2, block[-1] + 2)
-    offset = result.estimate("tracker.length_offset").held
+    offset = result["tracker.length_offset"].held
     assert abs(offset - truth[model.names.index("tracker.length_offset")]) < abs(shift) / 4
 
 
@@ -152,7 +152,7 @@ def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_dropping_equals_never_having_had_them(seed):
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     table, _, rng = clean_table(model, seed, 40)
     wrong, bad = with_gross_errors(table, rng, 0.15, high=0.01)
     dropped = identify(model, wrong, Options(faulty="drop"))
@@ -169,14 +169,14 @@ def test_dropping_equals_never_having_had_them(seed):
 
 def test_errors_of_decimetres_do_not_end_the_identification():
     """6 of 40 readings off by up to 0.1 m, base and marker to be placed."""
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     table, _, rng = clean_table(model, 0, 40)
     wrong, bad = with_gross_errors(table, rng, 0.15)
     assert np.array_equal(rows_of(identify(model, wrong).faulty), bad)
 
 
 def test_nothing_is_left_out_in_silence():
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     table, _, rng = clean_table(model, 7, 40)
     wrong, bad = with_gross_errors(table, rng, 0.05)
     kept = identify(model, wrong, Options(faulty="keep"))
@@ -195,7 +195,7 @@ def test_nothing_is_left_out_in_silence():
 
 
 def test_a_clean_table_is_used_whole_with_and_without_dropping():
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     table, _, _ = clean_table(model, 8, 30)
     a, b = identify(model, table), identify(model, table, Options(faulty="drop"))
     assert a.excluded == b.excluded == a.outliers == b.outliers == ()
@@ -206,7 +206,7 @@ def test_a_clean_table_is_used_whole_with_and_without_dropping():
 def test_stated_sigmas_count():
     """A reading of sigma 2 mm that is off by 3 mm is no outlier; one of sigma 20 µm off by 1 mm
     is."""
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     rng = np.random.default_rng(9)
     truth = true_values(model, rng)
     plan = table_at(random_poses(model.chain, 30, 9))
@@ -221,7 +221,7 @@ def test_stated_sigmas_count():
 
 
 def test_outliers_are_found_under_a_given_covariance_too():
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     table, _, _ = clean_table(model, 10, 30)
     table.position[4] += 0.02
     options = Options(weights="covariance", covariance=SIGMA**2 * np.eye(90))

@@ -52,7 +52,7 @@ def z_chain():
 
 def reduced(chain, effects, forces=((0, 0, 0),), seed=0, **cell):
     """Structural reduction of the model at nominal values, with names: kept → {dropped: share}."""
-    model = Model(chain, cell_of(effects, **cell))
+    model = Model.assembled(chain, cell_of(effects, **cell))
     B = model.regressor(table_at(random_poses(chain, 30, seed), forces)).B
     found = reduce(B, model.sizes(B), model.parameters, 1.0, 0.0)
     share = {
@@ -165,7 +165,7 @@ def regression(chain_name, effects, seed=0):
         chain_name
     ]()
     nominal = Nominal(joint_compliance=(1e-6,) * chain.n_joints)
-    model = Model(chain, cell_of(effects, nominal=nominal))
+    model = Model.assembled(chain, cell_of(effects, nominal=nominal))
     table = table_at(random_poses(chain, 25, seed), ((0, 0, 0), (100, 50, -200)))
     B = model.regressor(table).B
     return model, B, model.sizes(B)
@@ -252,7 +252,7 @@ IDENTIFIED = [
 
 def simulated(chain, effects, seed, poses=25, sigma=5e-5):
     rng = np.random.default_rng(seed)
-    model = Model(chain, cell_of(effects))
+    model = Model.assembled(chain, cell_of(effects))
     truth = true_values(model, rng)
     table = measured(model, table_at(random_poses(chain, poses, seed)), truth, sigma, rng)
     return identify(model, table), truth
@@ -297,11 +297,11 @@ def test_every_member_of_a_combination_names_the_others():
     for c in result.combinations:
         first, *others = c.terms
         assert first in result.determined and c.terms[first] == 1.0
-        assert result.estimate(first).combined_with == tuple(others)
-        assert result.estimate(first).note == f"only as {c.expression}"
+        assert result[first].combined_with == tuple(others)
+        assert result[first].note == f"only as {c.expression}"
         for name in others:
-            assert first in result.estimate(name).combined_with
-            assert result.estimate(name).note.startswith("held: known only together with")
+            assert first in result[name].combined_with
+            assert result[name].note.startswith("held: known only together with")
     with_height = [next(iter(c.terms)) for c in result.combinations if "link1.dz" in c.terms]
     assert with_height and set(with_height) <= {"base.x", "base.y", "base.z"}
 
@@ -336,13 +336,13 @@ def test_combinations_cover_the_true_combination():
 
 def test_what_another_effect_explains_completely_is_reported_with_it():
     """An effect switched on twice in disguise: joint 1's offset and the base's turn about it."""
-    model = Model(planar_chain(), cell_of(("base_frame", "joint_offset:joint1")))
+    model = Model.assembled(planar_chain(), cell_of(("base_frame", "joint_offset:joint1")))
     assert model.cell.model.effects == choices(("base_frame", "joint_offset:joint1"))
     rng = np.random.default_rng(0)
     truth = true_values(model, rng, anywhere=False)
     table = measured(model, table_at(random_poses(model.chain, 15, 0)), truth, 1e-5, rng)
     result = identify(model, table)
-    offset = result.estimate("joint1.offset")
+    offset = result["joint1.offset"]
     assert not offset.identifiable and offset.combined_with == ("base.rz",)
     assert result.combination("base.rz").terms == pytest.approx(
         {"base.rz": 1.0, "joint1.offset": 1.0}, abs=1e-2

@@ -27,7 +27,7 @@ ATTITUDES = {
 
 
 def flange_poses(chain, seed, n=POSES):
-    model = Model(chain, cell_of(()))
+    model = Model.assembled(chain, cell_of(()))
     return model.flange_poses(table_at(random_poses(chain, n, seed)))
 
 

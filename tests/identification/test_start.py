@@ -35,7 +35,7 @@ def test_position_start_is_as_near_as_the_nominal_geometry_allows(seed):
     start, which fits base and marker to the nominal arm, must not miss by more than the truth
     with its own geometry undone (1.5: median instead of squares, 2 · 30 poses)."""
     chain = random_chain(seed)
-    model = Model(chain, cell_of(("base_frame", "joint_offset", "link_geometry",
+    model = Model.assembled(chain, cell_of(("base_frame", "joint_offset", "link_geometry",
                                   "marker_position")))  # fmt: skip
     rng = np.random.default_rng(seed)
     truth = true_values(model, rng)
@@ -53,7 +53,7 @@ def test_position_start_is_as_near_as_the_nominal_geometry_allows(seed):
 def test_only_active_parameters_move():
     chain, rng = kr270_chain(), np.random.default_rng(0)
     nominal = Nominal(joint_compliance=COMPLIANCE)
-    full = Model(chain, cell_of(SPRINGS, nominal=nominal))
+    full = Model.assembled(chain, cell_of(SPRINGS, nominal=nominal))
     truth = true_values(full, rng)
     table = measured(full, table_at(random_poses(chain, 20, 0)), truth, SIGMA, rng)
     x = start_values(full, table)
@@ -64,7 +64,7 @@ def test_only_active_parameters_move():
         (("base_frame", "joint_offset"), {"base_frame"}),
         (("joint_offset", "link_geometry"), set()),
     ):
-        model = Model(chain, cell_of(effects, nominal=nominal))
+        model = Model.assembled(chain, cell_of(effects, nominal=nominal))
         x = start_values(model, table)
         assert x.shape == model.nominal.shape
         found = {p.effect for p, a, b in zip(model.parameters, x, model.nominal, strict=True)
@@ -76,7 +76,7 @@ def test_one_marker_may_be_free_while_another_is_given():
     chain, rng = kr270_chain(), np.random.default_rng(1)
     markers = {"M1": np.array([0.1, 0.0, 0.1]), "M2": np.zeros(3)}
     effects = ("base_frame", "marker_position:marker:M2")
-    model = Model(chain, cell_of(effects, markers))
+    model = Model.assembled(chain, cell_of(effects, markers))
     assert not any(name.startswith("marker:M1") for name in model.names)
     truth = with_values(model, {"marker:M2.x": 0.2, "marker:M2.z": -0.1, "base.x": 2.0})
     table = table_at(random_poses(chain, 20, 1), markers=("M1", "M2"))
@@ -88,7 +88,7 @@ def test_one_marker_may_be_free_while_another_is_given():
 def test_unloaded_readings_serve_alone_where_they_suffice():
     """0.1 rad of deflection under load would pull the start; unloaded rows must keep it exact."""
     chain = kr270_chain()
-    stiff = Model(chain, cell_of(("base_frame", "marker_position", "joint_compliance"),
+    stiff = Model.assembled(chain, cell_of(("base_frame", "marker_position", "joint_compliance"),
                                  nominal=Nominal(joint_compliance=(2e-5,) * 6)))  # fmt: skip
     truth = with_values(stiff, {"base.x": 1.0, "base.rz": 2.0, "marker:M1.x": 0.1})
     forces = [[0, 0, 0], [0, 0, -1500.0]]
@@ -104,7 +104,7 @@ def test_pose_start_finds_the_orientation_of_the_target(seed):
     effects = ("base_frame", "marker_position", "marker_orientation")
     markers = {"M1": np.zeros(3), "M2": np.zeros(3)}
     tracker = Tracker(rotation_sigma=1e-4)
-    model = Model(chain, cell_of(effects, markers, tracker, observe="pose"))
+    model = Model.assembled(chain, cell_of(effects, markers, tracker, observe="pose"))
     truth = true_values(model, rng)
     for name in ("M1", "M2"):
         rows = [model.names.index(f"marker:{name}.r{k}") for k in "xyz"]
@@ -127,7 +127,9 @@ def test_pose_start_finds_the_orientation_of_the_target(seed):
 
 def distance_case(seed, direction, wrong, rows=80):
     chain, rng = random_chain(seed, 4), np.random.default_rng(seed)
-    model = Model(chain, cell_of(("distance_sensor", "marker_position"), observe="distance"))
+    model = Model.assembled(
+        chain, cell_of(("distance_sensor", "marker_position"), observe="distance")
+    )
     anchor = direction / np.linalg.norm(direction) * rng.uniform(0.8, 2.5) + [0, 0, 0.4]
     values = dict(zip((f"tracker.anchor_{k}" for k in "xyz"), anchor, strict=True))
     values |= {"tracker.length_offset": rng.uniform(-0.2, 0.2)}
@@ -166,7 +168,9 @@ def test_distance_start_finds_an_anchor_anywhere(k, wrong):
 def test_a_given_anchor_is_tried_first_and_kept_where_it_is_not_fitted():
     chain = random_chain(3)
     tracker = Tracker(anchor=np.array([1.5, -1.0, 0.2]))
-    model = Model(chain, cell_of(("marker_position",), tracker=tracker, observe="distance"))
+    model = Model.assembled(
+        chain, cell_of(("marker_position",), tracker=tracker, observe="distance")
+    )
     truth = with_values(model, {"marker:M1.x": 0.1, "marker:M1.y": -0.05})
     table = simulate(model, table_at(random_poses(chain, 40, 3)), truth, 0, noise=False)
     np.testing.assert_allclose(start_values(model, table), truth, atol=1e-6)
@@ -174,7 +178,7 @@ def test_a_given_anchor_is_tried_first_and_kept_where_it_is_not_fitted():
 
 def test_nothing_to_place_leaves_the_nominal_values():
     chain = random_chain(4)
-    model = Model(chain, cell_of(("joint_offset",), observe="distance"))
+    model = Model.assembled(chain, cell_of(("joint_offset",), observe="distance"))
     table = table_at(random_poses(chain, 10, 4))
     table = simulate(model, table, model.nominal, 0)
     assert np.array_equal(start_values(model, table), model.nominal)

@@ -30,7 +30,9 @@ def _registered(tmp_path: Path) -> Iterator[None]:
 def model_with(effects: list[str]) -> Model:
     markers = {"M1": np.array([0.2, 0.05, 0.1])}
     spec = ModelSpec(effects=tuple(EffectChoice(*e.split(":")) for e in effects))
-    return Model(kr270_chain(), Cell("kr", None, Robot(), Tool(markers=markers), model=spec))
+    return Model.assembled(
+        kr270_chain(), Cell("kr", None, Robot(), Tool(markers=markers), model=spec)
+    )
 
 
 def test_it_is_one_more_entry_of_the_catalogue() -> None:

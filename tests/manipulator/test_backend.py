@@ -263,7 +263,7 @@ def test_a_summary_counts_expressions() -> None:
 def test_a_model_reports_what_evaluates_it(backend: str) -> None:
     if backend == "compiled":
         system_compiler()
-    model = Model(kr270_chain(), kr270_cell(["joint_compliance"]), backend=backend)
+    model = Model.assembled(kr270_chain(), kr270_cell(["joint_compliance"]), backend=backend)
     model.predict(random_table(model.chain, 2, 0))
     assert model.backend_report().startswith(f"{backend} (")
     assert model.rigid.backend_report() == "nothing evaluated yet"

@@ -34,7 +34,7 @@ def chosen(*effects: str, **model) -> list[tuple[str, str]]:
 
 
 def model_of(*effects: str, **model) -> Model:
-    return Model(kr270_chain(), kr270_cell(effects, **model))
+    return Model.assembled(kr270_chain(), kr270_cell(effects, **model))
 
 
 # --- names ---------------------------------------------------------------------------------
@@ -183,8 +183,8 @@ def test_weights_without_masses_are_refused() -> None:
     massless = replace(kr270_chain(), masses=())
     cell = kr270_cell(("joint_compliance",), link_gravity=True)
     with pytest.raises(InputError, match=r"no masses: .*\[robot\] masses.*link_gravity = false"):
-        Model(massless, cell)
-    Model(massless, kr270_cell(("joint_compliance",)))
+        Model.assembled(massless, cell)
+    Model.assembled(massless, kr270_cell(("joint_compliance",)))
 
 
 # --- markers -------------------------------------------------------------------------------
@@ -195,7 +195,7 @@ def without_markers(*effects: str) -> Cell:
 
 
 def test_markers_are_the_tables_where_the_cell_lists_none() -> None:
-    model = Model.from_cell(without_markers("marker_position"), ("front", "back"))
+    model = Model(without_markers("marker_position"), ("front", "back"))
     assert model.names[::3] == ("marker:front.x", "marker:back.x")
     assert not model.nominal.any()
     table = random_table(model.chain, 2, seed=0, markers=("back", "front"))
@@ -205,11 +205,11 @@ def test_markers_are_the_tables_where_the_cell_lists_none() -> None:
 
 
 def test_without_any_names_there_is_one_marker() -> None:
-    assert Model.from_cell(without_markers("marker_position")).names[0] == "marker:M1.x"
+    assert Model(without_markers("marker_position")).names[0] == "marker:M1.x"
 
 
 def test_the_cells_markers_win_over_the_tables() -> None:
-    model = Model.from_cell(kr270_cell(("marker_position",)), ("front",))
+    model = Model(kr270_cell(("marker_position",)), ("front",))
     assert model.names[::3] == ("marker:M1.x", "marker:M2.x", "marker:M3.x")
     np.testing.assert_array_equal(model.nominal, np.concatenate(list(MARKERS.values())))
 
@@ -227,7 +227,7 @@ def test_an_unknown_marker_is_refused_where_the_cell_has_one_only() -> None:
     cell = replace(kr270_cell(("joint_offset",)), tool=Tool(markers={"M1": np.zeros(3)}))
     table = random_table(kr270_chain(), 1, seed=0, markers=("M1", "M9"))
     with pytest.raises(InputError, match="marker 'M9'"):
-        Model(kr270_chain(), cell).predict(table)
+        Model.assembled(kr270_chain(), cell).predict(table)
 
 
 # --- nominal values ------------------------------------------------------------------------

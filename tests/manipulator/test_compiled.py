@@ -205,7 +205,7 @@ def model(kind: str, backend: str, observe: str = "position") -> Model:
     deflection = "linear" if kind == "linear" else "equilibrium"
     effects = RIGID if kind == "explicit" else EFFECTS
     cell = kr270_cell(effects, observe, deflection_model=deflection)
-    return Model(kr270_chain(), cell, backend=backend)
+    return Model.assembled(kr270_chain(), cell, backend=backend)
 
 
 def table(poses: int) -> Measurements:

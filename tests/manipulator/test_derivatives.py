@@ -92,7 +92,9 @@ def everything(observed: str, deflection_model: str, disturbed: bool = True) -> 
     effects = [second(name) for name in with_parameters(observed)]
     effects += [f"joint_compliance:joint{i}" for i in (1, 3, 4, 5, 6)]
     cell = full_cell(effects, observed, deflection_model=deflection_model)
-    return case(Model(kr270_chain(), cell), random_table(kr270_chain(), 4, seed=3), disturbed)
+    return case(
+        Model.assembled(kr270_chain(), cell), random_table(kr270_chain(), 4, seed=3), disturbed
+    )
 
 
 def complex_step(c: Case, k: int) -> NDArray:
@@ -176,7 +178,7 @@ def test_at_all_places(effect: str) -> None:
     """On an elastic arm."""
     chain = kr270_chain()
     cell = full_cell({"joint_compliance", effect})
-    c = case(Model(chain, cell), random_table(chain, 3, seed=5))
+    c = case(Model.assembled(chain, cell), random_table(chain, 3, seed=5))
     assert largest_excess(c, c.columns(effect)) <= 1
 
 
@@ -194,7 +196,7 @@ def test_with_measured_torques(observed: str) -> None:
     explicit = ("joint_compliance", "joint_hardening", "backlash", "hysteresis")
     effects = (*explicit, "joint_offset", "link_geometry:link3", "marker_position")
     cell = full_cell(effects, observed, torque="measured", link_gravity=False)
-    c = case(Model(kr270_chain(), cell), random_table(kr270_chain(), 4, seed=6))
+    c = case(Model.assembled(kr270_chain(), cell), random_table(kr270_chain(), 4, seed=6))
     assert c.model.deflection(c.table).shape[1] == 0  # nothing left to solve for
     assert largest_excess(c, range(len(c.x))) <= 1
     if observed == "position":
@@ -218,7 +220,7 @@ def test_with_a_compliance_per_level(observed: str, deflection_model: str) -> No
     q = table.q.copy()
     q[:, 1] = np.array(levels)[level]
     table = replace(table, q=q)
-    c = case(Model(kr270_chain(), cell), table)
+    c = case(Model.assembled(kr270_chain(), cell), table)
     assert largest_excess(c, range(len(c.x))) <= 1
     split = [c.model.names.index(f"joint2.compliance_level{n + 1}") for n in range(3)]
     lead = observe(table, observed).lead
@@ -246,5 +248,7 @@ def test_of_chains_with_sliding_joints(
                f"backlash:{turning}", "gravity_compensator", "link_mass_error:link3",
                "marker_position")  # fmt: skip
     cell = full_cell(effects, observed, nominal=nominal, deflection_model=deflection_model)
-    c = case(Model(chain, cell), random_table(chain, 3, seed, force=np.array([300, -200, 500])))
+    c = case(
+        Model.assembled(chain, cell), random_table(chain, 3, seed, force=np.array([300, -200, 500]))
+    )
     assert largest_excess(c, range(len(c.x))) <= 1

@@ -42,7 +42,7 @@ SPRING = Nominal(joint_compliance=COMPLIANCE, gravity_compensator=COMPENSATOR)
 
 
 def kr270(*effects: str, **model) -> Model:
-    return Model(kr270_chain(), kr270_cell(effects or ("joint_compliance",), **model))
+    return Model.assembled(kr270_chain(), kr270_cell(effects or ("joint_compliance",), **model))
 
 
 def positions(model: Model, poses: Array, force: Array) -> Array:

@@ -138,7 +138,7 @@ def test_poses_are_observed_as_turned_by_nothing() -> None:
 
 
 def test_a_measured_pose_that_is_the_models_has_no_residual() -> None:
-    model = Model(kr270_chain(), kr270_cell(("joint_compliance",), "pose"))
+    model = Model.assembled(kr270_chain(), kr270_cell(("joint_compliance",), "pose"))
     table = random_table(model.chain, 3, seed=1)
     predicted = model.predict(table).reshape(-1, 6)
     assert np.linalg.norm(predicted[:, 3:], axis=1).min() > 1e-3
@@ -170,7 +170,7 @@ def test_a_missing_column_is_named(kind: str, column: str, named: str) -> None:
 def models() -> tuple[Model, Model]:
     effects = ("base_frame", "joint_offset", "joint_compliance")
     return tuple(
-        Model(kr270_chain(), kr270_cell(effects, kind, link_gravity=True))
+        Model.assembled(kr270_chain(), kr270_cell(effects, kind, link_gravity=True))
         for kind in ("position", "deflection")
     )
 
@@ -199,7 +199,7 @@ def test_predicted_deflections_are_differences_of_predicted_positions() -> None:
 @pytest.mark.parametrize("kind", SIZE)
 def test_rows_of_b_follow_the_table(kind: str) -> None:
     """All components of an observation together, observations in the table's order."""
-    model = Model(kr270_chain(), kr270_cell(("joint_offset", "joint_compliance"), kind))
+    model = Model.assembled(kr270_chain(), kr270_cell(("joint_offset", "joint_compliance"), kind))
     table = shuffled()
     whole = model.regressor(table)
     seen, size = whole.observations, SIZE[kind]
@@ -218,7 +218,7 @@ def test_rows_of_b_follow_the_table(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", SIZE)
 def test_a_subset_keeps_the_rows_it_needs(kind: str) -> None:
-    model = Model(kr270_chain(), kr270_cell(("joint_offset", "joint_compliance"), kind))
+    model = Model.assembled(kr270_chain(), kr270_cell(("joint_offset", "joint_compliance"), kind))
     whole = model.regressor(shuffled())
     seen = whole.observations
     chosen = np.random.default_rng(5).random(len(seen.lead)) < 0.4

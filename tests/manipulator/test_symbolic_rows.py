@@ -31,7 +31,7 @@ BASE = Nominal(COMPLIANCE, np.array([0.4, -2.0, 0.3]), np.eye(3)[[1, 2, 0]])
 
 
 def model_of(effects: tuple[str, ...], observe: str, **options: Any) -> Model:
-    return Model(kr270_chain(), kr270_cell(effects, observe, **options))
+    return Model.assembled(kr270_chain(), kr270_cell(effects, observe, **options))
 
 
 def both(model: Model, table: Measurements, x: Array, steps: int = 2) -> tuple[Array, Array]:

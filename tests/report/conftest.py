@@ -50,7 +50,7 @@ def make_case(
         tool=replace(cell.tool, markers=points),
         tracker=Tracker(noise=noise, rotation_sigma=3e-5 if observe == "pose" else None),
     )
-    model = Model(kr270_chain(), cell)
+    model = Model.assembled(kr270_chain(), cell)
     rng = np.random.default_rng(7)
     table = table_of(
         random_poses(model.chain, poses, 3), np.array([0.0, 0.0, -2600.0]), names, both=True

@@ -65,7 +65,7 @@ def texts(hostile: Any) -> dict[str, str]:
     model = hostile.result.model
     base = Baseline(model, seen, hostile.result.x, np.ones(len(model.names)),
                     hostile.result.residual, hostile.result.residual, None)  # fmt: skip
-    arm = Model(kr270_chain(), kr270_cell(("base_frame",)))
+    arm = Model.assembled(kr270_chain(), kr270_cell(("base_frame",)))
     spec = DesignSpec(poses=4, loads=np.array([[0, 0, 0], [0, 0, -2600.0]]), candidates=30)
     cell = kr270_cell(["joint_compliance"], observe="deflection")
     cell = replace(cell, tracker=Tracker(noise=CartesianNoise(np.full(3, 1e-5))), design=spec)

@@ -21,7 +21,7 @@ from elastocal.report.page import diagnosis_page, write_diagnosis_report
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return Model(kr270_chain(), kr270_cell(("base_frame",)))
+    return Model.assembled(kr270_chain(), kr270_cell(("base_frame",)))
 
 
 @pytest.fixture(scope="module")

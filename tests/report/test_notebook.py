@@ -195,7 +195,7 @@ def commands():
     from elastocal.manipulator.model import Model
 
     cell = kr270_cell(("joint_offset", "joint_compliance"))
-    x = erring(Model(kr270_chain(), cell), np.random.default_rng(1), 0.5)
+    x = erring(Model.assembled(kr270_chain(), cell), np.random.default_rng(1), 0.5)
     arm = calibrated(kr270_chain(), cell, x, std=0.01)
     places = np.array([[1.8, 0.3, 1.5], [9.0, 0.0, 0.0], [1.8, -0.3, 1.5]])
     targets = targets_at("targets.csv", places, None, "base", np.array([0, 0, -2600.0]))

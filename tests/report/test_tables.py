@@ -67,7 +67,7 @@ def test_undetermined_rows_can_be_left_out(case: Any) -> None:
 
 def test_truth_column_says_inside_or_outside(case: Any) -> None:
     name = next(e.name for e in case.result.estimates if e.identifiable)
-    wrong = case.truth | {name: case.result.estimate(name).ci95[1] + 1.0}
+    wrong = case.truth | {name: case.result[name].ci95[1] + 1.0}
     rows = {row["parameter"]: row for row in cells(parameter_table(case.result, wrong))}
     assert rows[name]["in 95 %"] == "outside"
     for e in case.result.estimates:

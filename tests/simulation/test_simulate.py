@@ -21,7 +21,7 @@ POLAR = Tracker(np.array([3.0, 0.5, 1.0]), PolarNoise(2e-6, 5e-6, 1e-5, 3e-5))
 
 
 def model_with(tracker=None, effects=GEOMETRY, **cell):
-    return Model(planar_chain(), cell_of(effects, tracker=tracker, **cell))
+    return Model.assembled(planar_chain(), cell_of(effects, tracker=tracker, **cell))
 
 
 def plan_of(model, n=20, forces=((0, 0, 0),), markers=("M1",)):
@@ -142,7 +142,7 @@ def test_poses_from_a_plan_without_rotations():
 def test_deflections_are_loaded_minus_unloaded_readings():
     nominal = Nominal(joint_compliance=COMPLIANCE)
     cell = cell_of(("joint_compliance",), observe="deflection", nominal=nominal)
-    model = Model(kr270_chain(), cell)
+    model = Model.assembled(kr270_chain(), cell)
     plan = table_at(random_poses(model.chain, 10, 3), [[0, 0, 0], [500, 0, -2600]])
     table = simulate(model, plan, model.nominal, 0)
     seen = observe(table, "deflection")
@@ -228,7 +228,7 @@ def test_a_load_on_top_of_the_plans_own_forces_is_refused():
 
 def test_an_arm_that_buckles_is_refused_with_its_line():
     nominal = Nominal(joint_compliance=(1e-3,) * 6)
-    model = Model(kr270_chain(), cell_of(("joint_compliance",), nominal=nominal))
+    model = Model.assembled(kr270_chain(), cell_of(("joint_compliance",), nominal=nominal))
     plan = table_at(random_poses(model.chain, 8, 0), [[0, 0, 0], [0, 0, -20000.0]])
     with pytest.raises(InputError, match=r"table\.csv, line \d+: no static equilibrium under this"):
         simulate(model, plan, model.nominal, 0)
@@ -237,7 +237,7 @@ def test_an_arm_that_buckles_is_refused_with_its_line():
 def test_distances_without_equilibrium_are_refused_with_their_line():
     nominal = Nominal(joint_compliance=(1e-3,) * 6)
     cell = cell_of(("joint_compliance",), observe="distance", nominal=nominal)
-    model = Model(kr270_chain(), cell)
+    model = Model.assembled(kr270_chain(), cell)
     plan = table_at(random_poses(model.chain, 8, 0), [[0, 0, 0], [0, 0, -20000.0]])
     with pytest.raises(Exception, match=r"table\.csv, line \d+: no static equilibrium") as caught:
         simulate(model, plan, model.nominal, 0)

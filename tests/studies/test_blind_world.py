@@ -89,7 +89,7 @@ def model_with(
     added = tuple(EffectChoice(name, where) for name, where, _ in effects)
     nominal = replace(cell.model.nominal, settings={w: s for _, w, s in effects if s})
     spec = replace(cell.model, effects=cell.model.effects + added, nominal=nominal)
-    return Model.from_cell(replace(cell, model=spec)), table
+    return Model(replace(cell, model=spec)), table
 
 
 def model_error(world: World, folder: Path) -> np.ndarray:

@@ -54,7 +54,7 @@ def test_the_study_estimates_what_the_tool_does():
     gives the same estimates and intervals within a small part of a standard deviation."""
     demo = scenarios.DEMO
     cell = read_cell(demo / "cell.toml")
-    model = Model.from_cell(cell)
+    model = Model(cell)
     setting = scenarios.Setting(NAMES["table1_6_effect"])
     e, _ = setting.draw(0)
     rows = expand_plan(
@@ -72,7 +72,7 @@ def test_the_study_estimates_what_the_tool_does():
     noise = study.settle(replace(readings, sight=None, reach=None)).noise
     std = noise.covariance.std
     for k, name in enumerate(setting.names):
-        estimate = result.estimate(name)
+        estimate = result[name]
         assert abs(estimate.value * 1e6 - setting.truth[k] - noise.x[k]) < 0.05 * std[k]
         assert estimate.std * 1e6 == pytest.approx(std[k], rel=0.02)
 

@@ -146,10 +146,10 @@ def combination_truth(result: Calibration, truth: Array, first: str) -> float:
     """True value of a determined parameter or combination: X_k + Σ f (X_d − held_d)."""
     names = result.model.names
     value = truth[names.index(first)]
-    if result.estimate(first).combined_with:
+    if result[first].combined_with:
         for name, factor in result.combination(first).terms.items():
             if name != first:
-                value += factor * (truth[names.index(name)] - result.estimate(name).held)
+                value += factor * (truth[names.index(name)] - result[name].held)
     return float(value)
 
 
@@ -159,7 +159,7 @@ def z_scores(result: Calibration, truth: Array, names: Sequence[str] = ()) -> Ar
     chosen = names or result.determined
     return np.array(
         [
-            (result.estimate(name).held - combination_truth(result, truth, name))
+            (result[name].held - combination_truth(result, truth, name))
             / std[result.determined.index(name)]
             for name in chosen
         ]

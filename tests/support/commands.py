@@ -9,19 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Array, Cell
 from elastocal.compensation.compensate import Compensation
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
 
 
-def calibrated(chain: Chain, cell: Cell, x: Array | None = None, std: float = 0.0) -> Calibrated:
+def calibrated(chain: Chain, cell: Cell, x: Array | None = None, std: float = 0.0) -> CalibratedArm:
     """The arm at values x (default nominal), every parameter determined with `std` times its
     typical size."""
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     sizes = np.array([p.typical or abs(p.nominal) or 1.0 for p in model.parameters])
     values = model.nominal if x is None else x
-    return Calibrated(model, values, model.names, np.diag((std * sizes) ** 2), "result.json")
+    return CalibratedArm(model, values, model.names, np.diag((std * sizes) ** 2), "result.json")
 
 
 def erring(model: Model, rng: np.random.Generator, scale: float = 1.0) -> Array:
@@ -39,7 +39,7 @@ def circumstances(n: int, joints: int, rng: np.random.Generator) -> dict[str, An
     }
 
 
-def tool_errors(arm: Calibrated, found: Compensation, marker: str = "M1") -> tuple[Array, Array]:
+def tool_errors(arm: CalibratedArm, found: Compensation, marker: str = "M1") -> tuple[Array, Array]:
     """Distance in m and angle in rad (n,) of the marker from the targets, as `Model` has it.
 
     By the model that identification predicts with, not by the expressions that commands are

@@ -91,7 +91,8 @@ def setup_of(
     """What a design knows before it chooses among candidates q (N, n)."""
     chain = chain or kr270_chain()
     return set_up(
-        Model(chain, cell), load_states(cell), q, all_loads(q) if load is None else load, n_poses,
+        Model.assembled(chain, cell), load_states(cell), q,
+        all_loads(q) if load is None else load, n_poses,
         targets or target_poses.test_poses(cell, chain, None, seed), known or Known(), seed,
     )  # fmt: skip
 

@@ -140,8 +140,8 @@ def measured(
     )
     effects = (*plain.model.effects, *choices([f"{f.effect}:{f.where}" for f in faults]))
     spec = replace(plain.model, effects=effects, nominal=replace(nominal, settings=settings))
-    truth = Model(chain, replace(plain, model=spec))
-    errors = draw_errors(Model(chain, plain), 1.0, np.random.default_rng((seed, 4)))
+    truth = Model.assembled(chain, replace(plain, model=spec))
+    errors = draw_errors(Model.assembled(chain, plain), 1.0, np.random.default_rng((seed, 4)))
     values = errors | {f"{f.where}.{key}": v for f in faults for key, v in f.values.items()}
     rng = np.random.default_rng((seed, 2))
     key = np.column_stack([table.configuration, table.repeat, table.force])
@@ -166,7 +166,7 @@ def campaign(
     """Model without, and readings with, the faults of these names."""
     chain, plain = kr270_chain(), cell(observe=observe, sigma=sigma)
     faults = [FAULTS[name] for name in names]
-    return Model(chain, plain), measured(chain, plain, faults, plan(chain, n, seed), seed)
+    return Model.assembled(chain, plain), measured(chain, plain, faults, plan(chain, n, seed), seed)
 
 
 @lru_cache

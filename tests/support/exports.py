@@ -13,7 +13,7 @@ from elastocal.export.cost import random_table
 from elastocal.export.export import Exported, Wish, export
 from elastocal.export.kept import Conditions
 from elastocal.export.urdf import Frames
-from elastocal.manipulator.calibrated import Calibrated, read_calibrated
+from elastocal.manipulator.calibrated import CalibratedArm, read_calibrated
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.parameter import Parameter
@@ -54,7 +54,7 @@ def write_result(
     )
     rng = np.random.default_rng(seed)
     parameters = []
-    for p in Model.from_cell(read_cell(cell, known_effects=tuple(CATALOGUE))).parameters:
+    for p in Model(read_cell(cell, known_effects=tuple(CATALOGUE))).parameters:
         drawn = float(p.nominal + 1e-3 * rng.normal())
         if p.effect == "base_frame":
             drawn = float(rng.normal())
@@ -79,14 +79,14 @@ def exported(
     force: Array | None = None,
     poses: int = 20,
     frames: Frames | None = None,
-) -> tuple[Calibrated, Exported]:
+) -> tuple[CalibratedArm, Exported]:
     calibrated = read_calibrated(cell, result)
     conditions = Conditions(np.zeros(3) if force is None else force)
     wish = Wish(format, frames or Frames(), conditions, poses=poses)
     return calibrated, export(calibrated, wish)
 
 
-def flanges_in_base(calibrated: Calibrated, q: Array, force: Array) -> Array:
+def flanges_in_base(calibrated: CalibratedArm, q: Array, force: Array) -> Array:
     """T_base_flange (n, 4, 4) that the full model predicts at commanded q (n, joints)."""
     from scipy.spatial.transform import Rotation
 
@@ -99,5 +99,5 @@ def flanges_in_base(calibrated: Calibrated, q: Array, force: Array) -> Array:
     return np.asarray(np.linalg.solve(T, model.flange_poses(table, x)))
 
 
-def poses_of(calibrated: Calibrated, n: int, seed: int) -> Array:
+def poses_of(calibrated: CalibratedArm, n: int, seed: int) -> Array:
     return random_table(calibrated.model, Conditions(), n, seed).q

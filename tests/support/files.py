@@ -30,7 +30,7 @@ def write_campaign(folder: Path, poses: int = 12) -> tuple[Path, Path]:
     shutil.copyfile(KR270, folder / "arm.urdf")
     cell = folder / "cell.toml"
     cell.write_text(CELL, encoding="utf-8")
-    model = Model.from_cell(read_cell(cell))
+    model = Model(read_cell(cell))
     q = random_poses(model.chain, poses, seed=4)
     position = model.predict(table_of(q, np.zeros(3), ("M1",))).reshape(-1, 3)
     rng = np.random.default_rng(5)

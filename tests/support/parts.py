@@ -48,7 +48,7 @@ def arm(
         effects, tracker=Tracker(noise=noise, **tracker), observe=observe,
         nominal=Nominal(joint_compliance=(1e-5,) * 4),
     )  # fmt: skip
-    model = Model(chain, cell)
+    model = Model.assembled(chain, cell)
     rng = np.random.default_rng(seed)
     truth = true_values(model, rng)
     return model, table_at(random_poses(chain, poses, seed), forces), truth, rng

@@ -65,7 +65,7 @@ def campaign(
     q[:, 2] = rng.uniform(-half_range, half_range, n)
     table = table_of(q, DOWN, both=True)
     table = replace(table, time=30.0 * (np.arange(len(table)) // 3))
-    return Model(chain, plain), measured(table, effects, seed, **model)
+    return Model.assembled(chain, plain), measured(table, effects, seed, **model)
 
 
 def measured(
@@ -87,7 +87,7 @@ def measured(
         f"{names[key.split('_')[0]]}:{where}"
         for where, _, key in (name.partition(".") for name in effects)
     }
-    truth = Model(kr270_chain(), cell_of(sorted(active), nominal=nominal, **model))
+    truth = Model.assembled(kr270_chain(), cell_of(sorted(active), nominal=nominal, **model))
     rng = np.random.default_rng((seed, 2))
     visit = np.unique(
         np.column_stack([table.configuration, table.force]), axis=0, return_inverse=True

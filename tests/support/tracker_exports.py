@@ -37,7 +37,7 @@ def kr270_cell_file(folder: Path) -> Path:
 def kr270_readings(folder: Path, poses: int = 10) -> tuple[Cell, np.ndarray, np.ndarray]:
     """The cell, joint values (poses, 6) in degrees, and points (poses, markers, 3) in mm."""
     cell = read_cell(kr270_cell_file(folder))
-    model = Model.from_cell(cell)
+    model = Model(cell)
     degrees = np.round(np.degrees(random_poses(model.chain, poses, seed=4)), 3)
     table = table_of(np.radians(degrees), np.zeros(3), MARKERS)
     points = model.predict(table).reshape(poses, len(MARKERS), 3) * 1e3

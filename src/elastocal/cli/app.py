@@ -19,8 +19,6 @@ from elastocal.errors import ElastocalError, InputError, options_as_flags
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from elastocal.cell import Array
-
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 
 # The order of the work, in which --help lists the verbs.
@@ -142,16 +140,6 @@ def options(
     if backend is not None:
         os.environ[VARIABLE] = backend
     chosen_backend()
-
-
-def checked_force(load: tuple[float, float, float] | None) -> Array | None:
-    """--load as a force (3,) in N, None where it is not given; InputError unless it is finite."""
-    import numpy as np
-
-    if load is not None and not np.isfinite(load).all():
-        found = " ".join(f"{value:g}" for value in load)
-        raise InputError(f"--load takes three finite numbers in N; found {found}")
-    return None if load is None else np.array(load)
 
 
 def check_outputs(*paths: Path | None) -> None:

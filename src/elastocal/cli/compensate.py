@@ -14,7 +14,6 @@ from elastocal.cli.app import (
     Seed,
     app,
     check_outputs,
-    checked_force,
     console,
     progress_line,
     reporting_errors,
@@ -26,7 +25,7 @@ from elastocal.text import json_text
 if TYPE_CHECKING:
     from elastocal.cell import Array
     from elastocal.compensation.targets import Targets
-    from elastocal.manipulator.calibrated import Calibrated
+    from elastocal.manipulator.calibrated import CalibratedArm
 
 Progress = Callable[[str], None]
 
@@ -106,11 +105,12 @@ def compensate(
     from elastocal.compensation.point import tool_point
     from elastocal.files import atomic_write_text
     from elastocal.manipulator.calibrated import read_calibrated
+    from elastocal.manipulator.inputs import given_force
 
     # What can be wrong with the options is told before any file is read.
     _check_targets(targets, target, frame, output, table)
     _check_grid(table, grid, box, rotation)
-    force = checked_force(load)
+    force = given_force(load)
     written = [path for path in (output, table) if path is not None]
     check_outputs(*written)
     content, texts = {}, {}
@@ -182,7 +182,7 @@ def _check_grid(table: Path | None, grid: str, box: str | None, rotation: str | 
 
 
 def _targets(
-    arm: Calibrated, path: Path | None, target: str | None, frame: str, force: Array | None
+    arm: CalibratedArm, path: Path | None, target: str | None, frame: str, force: Array | None
 ) -> Targets | None:
     from elastocal.compensation.targets import one_target, read_targets
 

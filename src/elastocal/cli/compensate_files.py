@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.errors import InputError
 from elastocal.tables import csv_text
 
 if TYPE_CHECKING:
     from elastocal.cell import Array
     from elastocal.compensation.compensate import Compensation
     from elastocal.compensation.table import CorrectionTable, Grid
-    from elastocal.manipulator.calibrated import Calibrated
+    from elastocal.manipulator.calibrated import CalibratedArm
 
-REMEDIES = {
-    "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of "
-    "another posture",
-    "not reached": "out of reach, or beside a singular posture: move the target, or give q1_deg … "
-    "of another posture",
-    "no equilibrium": "no static equilibrium under this load: check force_*_N",
-}
 GRID_REMEDIES = {
     "limit": "joint limits prevent it: widen [limits], or give a smaller --box or another --near",
     "not reached": "out of reach, or beside a singular posture: give a smaller --box, another "
     "--rotation or another --near",
     "no equilibrium": "no static equilibrium under this load: check --load",
 }
-NAMED = 8  # rows that a message names
 
 
-def read_near(arm: Calibrated, text: str | None) -> Array | None:
+def read_near(arm: CalibratedArm, text: str | None) -> Array | None:
     """--near as joints (n,) in rad or m."""
     import numpy as np
 
@@ -51,7 +42,7 @@ def read_near(arm: Calibrated, text: str | None) -> Array | None:
     return values
 
 
-def read_table_grid(arm: Calibrated, grid: str, box: str | None, rotation: str | None) -> Grid:
+def read_table_grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) -> Grid:
     """The grid that --grid, --box and --rotation ask for."""
     import numpy as np
     from scipy.spatial.transform import Rotation
@@ -76,48 +67,32 @@ def read_table_grid(arm: Calibrated, grid: str, box: str | None, rotation: str |
 
 
 def commands_of(
-    found: Compensation, arm: Calibrated, listed: bool, partial: bool
+    found: Compensation, arm: CalibratedArm, listed: bool, partial: bool
 ) -> tuple[dict[str, Any], str]:
     """Summary of the commands, with each of them where `listed`, and their table as CSV.
 
     Raises InsufficientDataError where rows are not reached and `partial` does not allow for that.
     """
-    from elastocal.compensation.commands_file import commands_csv, summary
+    from elastocal.compensation.commands_file import check_reached, commands_csv, summary
 
-    table = found.targets.table
-    rows = [f"line {line}" for line in table.row]
-    _refuse(f"{table.source}: %d of %d targets", rows, found.status, "reached", REMEDIES, partial)
+    if not partial:
+        check_reached(found)
     kinds = arm.model.chain.kinds
     return summary(found, kinds, commands=listed), commands_csv(found, kinds)
 
 
-def _refuse(
-    what: str,
-    rows: Sequence[str],
-    status: Sequence[str],
-    good: str,
-    remedies: Mapping[str, str],
-    partial: bool,
-) -> None:
-    """Raise InsufficientDataError for rows of another status than `good`; `what` counts them."""
-    lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]
-    if not lost or partial:
-        return
-    named = ", ".join(f"{row} ({s})" for row, s in lost[:NAMED])
-    more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
-    kinds = dict.fromkeys(s for _, s in lost)
-    raise InsufficientDataError(
-        f"{what % (len(lost), len(status))} are not reached: {named}{more}. "
-        + "; ".join(f"{kind}: {remedies[kind]}" for kind in kinds)
-        + ". Nothing was written; --partial writes the others"
-    )
-
-
-def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[dict[str, Any], str]:
+def table_of(
+    found: CorrectionTable, arm: CalibratedArm, partial: bool
+) -> tuple[dict[str, Any], str]:
     """Summary of the correction table, and the table as CSV; refused as `commands_of` is."""
     import numpy as np
 
-    from elastocal.compensation.commands_file import in_file_units, joint_columns, spread
+    from elastocal.compensation.commands_file import (
+        check_status,
+        in_file_units,
+        joint_columns,
+        spread,
+    )
     from elastocal.compensation.table import EXACT, FIRST_ORDER
 
     kinds = arm.model.chain.kinds
@@ -130,7 +105,8 @@ def table_of(found: CorrectionTable, arm: Calibrated, partial: bool) -> tuple[di
     # A grid point has no line in any file of the user's: it is named by where it lies.
     named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
     what = f"--table: %d of %d grid points ({', '.join(heads)})"
-    _refuse(what, named, plain, EXACT, GRID_REMEDIES, partial)
+    if not partial:
+        check_status(what, named, plain, EXACT, GRID_REMEDIES)
     heads += ["dx_mm", "dy_mm", "dz_mm"]
     columns = [found.correction[:, :3] * 1e3]
     if found.oriented:

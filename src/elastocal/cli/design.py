@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperOption
@@ -30,11 +29,6 @@ from elastocal.cli.plan_files import (
     write_page,
 )
 from elastocal.errors import ElastocalError, InputError, require
-
-if TYPE_CHECKING:
-    from elastocal.cell import Cell
-    from elastocal.design.options import DesignOptions
-    from elastocal.identification.constrained.prior import GaussianPrior
 
 
 def _criteria() -> list[str]:
@@ -117,6 +111,7 @@ def design(
     """
     from elastocal.design.checkpoint import Checkpoint, key_of
     from elastocal.design.design import design as run
+    from elastocal.verbs import design_request
 
     summary = output.with_suffix(".json")
     require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
@@ -124,7 +119,7 @@ def design(
     check_suffixes(programs, picture)
     written = [p for p in (output, summary, *programs, picture, report) if p is not None]
     check_outputs(*written)
-    asked = {
+    asked: dict[str, Any] = {
         "poses": poses,
         "criterion": criterion,
         "target": _target(target, poses),
@@ -137,9 +132,11 @@ def design(
             tell(message)
 
         progress("reading")
-        wanted = _read(cell, asked)
+        wanted, options = design_request(
+            cell, **asked, augment=augment, knowledge=knowledge, fixed=tuple(fix or ()),
+            curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
+        )  # fmt: skip
         check_programs(wanted, programs)
-        options = _options(wanted, augment, knowledge, fix, curve, effort, seed, jobs)
         files = [p for p in (cell, augment, knowledge, *files_of(wanted)) if p is not None]
         check_apart(written, files)
         told = asked | {"fix": fix, "curve": curve, "effort": effort}
@@ -156,7 +153,7 @@ def design(
                 checkpoint.drop()
             raise
         interrupts.check()
-        write_all(plan, output, summary, programs, picture)
+        write_all(plan, output, programs, picture)
         if report is not None:
             progress("writing the report")
             write_page(plan, report, files)
@@ -184,77 +181,6 @@ def _target(target: float | None, poses: int | None) -> float | None:
         f"--poses {poses} and --target {target:g}: a target asks for the number of poses; drop one",
     )
     return target * 1e-6
-
-
-def _read(path: Path, asked: dict[str, Any]) -> Cell:
-    """The cell, with what the command line says of [design] in its place."""
-    from elastocal.cell import read_cell
-    from elastocal.manipulator.effects import CATALOGUE
-    from elastocal.planning.criteria import CRITERIA
-    from elastocal.text import did_you_mean, listed, quoted
-
-    cell = read_cell(path, known_effects=CATALOGUE)
-    name = asked["criterion"]
-    if name is not None and name not in CRITERIA:
-        raise InputError(
-            f"--criterion {quoted(name)} is unknown{did_you_mean(name, CRITERIA)}; there are "
-            f"{listed(CRITERIA)}"
-        )
-    changes = {key: value for key, value in asked.items() if value is not None}
-    if "poses" in changes:
-        # What the cell says of their number gives way to the command line.
-        changes |= {"per_level": (), "target": None}
-    return replace(cell, design=replace(cell.design, **changes))
-
-
-def _options(
-    cell: Cell, augment: Path | None, knowledge: Path | None, fix: list[str] | None,
-    curve: str | None, effort: str, seed: int, jobs: int,
-) -> DesignOptions:  # fmt: skip
-    from elastocal.design.options import DesignOptions
-    from elastocal.manipulator.choice import load_chain
-    from elastocal.measurements import read_measurements
-
-    done = None
-    if augment is not None:
-        done = read_measurements(
-            augment,
-            joint_kinds=load_chain(cell).kinds,
-            marker_names=tuple(cell.tool.markers),
-            observe=cell.model.observe,
-        )
-    markers = () if done is None else done.marker_names
-    prior, notes = (None, ()) if knowledge is None else _prior(knowledge, cell, markers)
-    return DesignOptions(
-        effort=effort,  # type: ignore[arg-type]
-        seed=seed,
-        jobs=jobs,
-        fixed=tuple(fix or ()),
-        prior=prior,
-        done=done,
-        curve=_numbers(curve),
-        notes=notes,
-    )
-
-
-def _prior(
-    path: Path, cell: Cell, markers: tuple[str, ...]
-) -> tuple[GaussianPrior, tuple[str, ...]]:
-    """What a knowledge file says that counts for a plan, and a sentence on what does not."""
-    from elastocal.identification.constrained.constraints import Constraints
-    from elastocal.identification.knowledge import read_knowledge
-    from elastocal.manipulator.model import Model
-
-    known = read_knowledge(path)
-    prior = known.of(Model.from_cell(cell, markers))[1]
-    if prior is None:
-        raise InputError(
-            f"{path}: states no prior, and only priors count for a plan; add "
-            '[prior."joint2.compliance"] with mean and std, or leave --knowledge out'
-        )
-    left_out = known.physical or known.constraints != Constraints()
-    note = f"{path}: only its priors count for a plan; bounds, equalities and matrices do not"
-    return prior, (note,) if left_out else ()
 
 
 def _numbers(text: str | None) -> tuple[int, ...]:

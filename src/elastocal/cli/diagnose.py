@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -23,13 +22,6 @@ from elastocal.cli.identify import load_inputs
 from elastocal.cli.plan_files import check_apart, files_of
 from elastocal.errors import require
 from elastocal.text import json_text
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from elastocal.diagnosis.result import Diagnosis
-    from elastocal.manipulator.model import Model
-    from elastocal.measurements import Measurements
 
 MOST_POSES = 10
 
@@ -74,6 +66,7 @@ def diagnose(
     from elastocal.diagnosis.options import DiagnosisOptions
     from elastocal.diagnosis.published import publish
     from elastocal.manipulator.effects import CATALOGUE
+    from elastocal.verbs import with_extra_poses
 
     if not set(without or ()) <= set(CATALOGUE):
         read_cell(cell)  # its plug-ins may have the effect
@@ -92,7 +85,7 @@ def diagnose(
         found = run(model, table, options, progress)
         if plan is not None and found.open:
             most = MOST_POSES if poses is None else poses
-            found = _with_extra_poses(model, table, found, most, seed, progress)
+            found = with_extra_poses(model, table, found, most, seed, progress)
         content = publish(found, model, str(data))
         told = write_diagnosis(outputs, found, content, model, cell, data, seed)
     if as_json:
@@ -103,16 +96,3 @@ def diagnose(
     print_diagnosis(console(), found, model.chain.kinds)
     for line in told:
         typer.echo(line)
-
-
-def _with_extra_poses(
-    model: Model, table: Measurements, found: Diagnosis, most: int, seed: int,
-    progress: Callable[[str], None],
-) -> Diagnosis:  # fmt: skip
-    """The diagnosis with the fewest of at most `most` poses that tell its rivals apart."""
-    from elastocal.diagnosis.separate.plan import plan_extra
-
-    progress("looking for poses that tell the rivals apart")
-    return replace(
-        found, extra=plan_extra(model, table, found, most=most, seed=seed, progress=progress)
-    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,6 @@ from elastocal.text import json_text
 if TYPE_CHECKING:
     from elastocal.diagnosis.result import Diagnosis
     from elastocal.manipulator.model import Model
-    from elastocal.measurements import Measurements
 
 
 @dataclass(frozen=True)
@@ -80,37 +78,7 @@ def _write_plan(path: Path, diagnosis: Diagnosis, kinds: Sequence[str]) -> str:
         return f"{path} not written: there are no rivals to tell apart"
     if extra.plan is None:
         return f"{path} not written: no pose tells the rivals apart"
-    write_extra_poses(path, extra.plan, kinds)
+    from elastocal.saving import save_extra_poses
+
+    save_extra_poses(path, extra.plan, kinds)
     return f"wrote {path}: {extra.n_poses} poses, {len(extra.plan)} visits"
-
-
-def write_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str]) -> None:
-    """Write visits (rows of `plan`, in the order of measuring) as plan.csv, which `simulate` reads.
-
-    Angles in degrees, travel in mm, force, approach direction and time where the plan has them.  A
-    pose that is visited again under the same force is a configuration of its own: 4, 4/2, ….
-    Raises InputError where the place cannot be written.
-    """
-    import numpy as np
-
-    from elastocal.design.plan_file import PlanRows, write_plan
-
-    names = []
-    visits: Counter[tuple[int, bytes]] = Counter()
-    for code, force in zip(plan.configuration, plan.force + 0.0, strict=True):
-        visits[key := (int(code), force.tobytes())] += 1
-        again = f"/{visits[key]}" if visits[key] > 1 else ""
-        names.append(plan.configuration_labels[code] + again)
-    approach = None if plan.approach is None else plan.approach.astype(np.int64)
-    # `simulate` takes the time of a plan's row as that of its readings.
-    time = {} if plan.time is None else {"time_s": [repr(float(t)) for t in plan.time]}
-    rows = PlanRows(
-        configuration=tuple(names),
-        q=plan.q,
-        level=np.ones(len(plan), dtype=np.int64),
-        order=np.arange(1, len(plan) + 1),
-        force=plan.force,
-        approach=approach,
-        notes=time,
-    )
-    write_plan(path, rows, kinds)

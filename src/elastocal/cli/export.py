@@ -13,13 +13,11 @@ from elastocal.cli.app import (
     Seed,
     app,
     check_outputs,
-    checked_force,
     console,
     progress_line,
     reporting_errors,
 )
 from elastocal.cli.plan_files import check_apart, files_of
-from elastocal.errors import InputError
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -79,30 +77,15 @@ def export(
 
     Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
     """
-    import numpy as np
-
-    from elastocal.export.export import Wish
     from elastocal.export.export import export as run
     from elastocal.export.formats import format_of
-    from elastocal.export.kept import Conditions
-    from elastocal.export.urdf import Frames
     from elastocal.files import atomic_write_text
     from elastocal.manipulator.calibrated import read_calibrated
+    from elastocal.saving import wish_of
 
     chosen = format_of(output, format)
     check_outputs(output)
-    for name, value in (("--temperature-c", temperature_c), ("--time-s", time_s)):
-        if value is not None and not np.isfinite(value):
-            raise InputError(f"{name} takes a finite number; found {value}")
-    given = checked_force(load)
-    force = np.zeros(3) if given is None else given
-    wish = Wish(
-        format=chosen,
-        frames=Frames(tool=frames, base=base_frame),
-        conditions=Conditions(force, time_s, temperature_c),
-        poses=poses,
-        seed=seed,
-    )
+    wish = wish_of(output, chosen, load, frames, base_frame, temperature_c, time_s, poses, seed)
     with progress_line(quiet) as progress:
         progress("reading")
         calibrated = read_calibrated(cell, result)

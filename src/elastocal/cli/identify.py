@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,7 +23,6 @@ from elastocal.errors import InputError
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
-    from elastocal.identification.knowledge import Knowledge
     from elastocal.manipulator.model import Model
     from elastocal.measurements import Measurements
 
@@ -112,14 +111,10 @@ def identify(
     from elastocal.cell.work_cell import read_cell
     from elastocal.cli.results import write_results
     from elastocal.identification.identify import identify as run
-    from elastocal.identification.noise import WeightKind
     from elastocal.identification.options import Options
     from elastocal.identification.variance.structure import noise_models
+    from elastocal.verbs import knowledge_of
 
-    if weights not in get_args(WeightKind):
-        raise InputError(
-            f"--weights takes one of {', '.join(get_args(WeightKind))}; found '{weights}'"
-        )
     if noise not in noise_models():
         read_cell(cell)  # its plug-ins may have the model
     # What can be wrong with the options is told before any file is read.
@@ -135,7 +130,7 @@ def identify(
         seed=seed,
         jobs=jobs,
     )
-    known = _read_knowledge(knowledge, physical)
+    known = knowledge_of(knowledge, physical)
     check_outputs(output, report, residuals)
     inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
     written = [p for p in (output, report, residuals) if p is not None]
@@ -161,35 +156,11 @@ def identify(
 
 def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]:
     """Model and tables; every file is checked before anything is computed."""
-    from elastocal.cell import read_cell
-    from elastocal.manipulator.choice import load_chain
-    from elastocal.manipulator.effects import CATALOGUE
     from elastocal.manipulator.model import Model
-    from elastocal.measurements import read_measurements
 
-    cell = read_cell(cell_path, known_effects=CATALOGUE)
-    chain = load_chain(cell)
-    tables = [
-        read_measurements(
-            path,
-            joint_kinds=chain.kinds,
-            marker_names=tuple(cell.tool.markers),
-            observe=cell.model.observe,
-        )
-        for path in data
-    ]
-    names: tuple[str, ...] = tuple(dict.fromkeys(m for t in tables for m in t.marker_names))
-    return Model.from_cell(cell, names), tables
-
-
-def _read_knowledge(path: Path | None, physical: bool) -> Knowledge | None:
-    """What the file and the flag state together; None where neither was given."""
-    from elastocal.identification.knowledge import Knowledge, read_knowledge
-
-    if path is None:
-        return Knowledge(physical=True, source="--physical") if physical else None
-    known = read_knowledge(path)
-    return replace(known, physical=known.physical or physical)
+    model = Model(cell_path)
+    tables = [model.read(path) for path in data]
+    return model.with_markers_of(*tables), tables
 
 
 def _read_covariance(path: Path) -> Any:

@@ -78,19 +78,13 @@ def files_of(cell: Cell) -> tuple[Path | None, ...]:
     return (robot.urdf, robot.dh, robot.masses, test_path, *meshes, *plugins)
 
 
-def write_all(
-    plan: Plan, output: Path, report: Path, programs: tuple[Path, ...], picture: Path | None
-) -> None:
+def write_all(plan: Plan, output: Path, programs: tuple[Path, ...], picture: Path | None) -> None:
     """plan.csv, plan.json, robot programs and picture, each whole or not at all."""
-    from elastocal.design.plan_file import plan_rows, write_plan, write_plan_json
     from elastocal.files import atomic_write_text
+    from elastocal.saving import save_plan
 
     chain = plan.model.chain
-    rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
-    write_plan(output, rows, chain.kinds)
-    command = shlex.join(["elastocal", *sys.argv[1:]])
-    backend = plan.model.backend_report()
-    write_plan_json(report, plan.to_json() | {"command": command, "backend": backend})
+    save_plan(plan, output, shlex.join(["elastocal", *sys.argv[1:]]))
     for path in programs:
         text = _program(path, plan.execution, chain, plan.configurations, plan.forces)
         atomic_write_text(path, text)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from elastocal.files import atomic_write_text
 from elastocal.identification.result import Calibration
-from elastocal.tables import csv_text
+from elastocal.saving import save_residuals
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -34,9 +34,7 @@ def write_results(
     if output is not None:
         atomic_write_text(output, json_text(result.to_json()) + "\n")
     if residuals is not None:
-        rows = result.residual_table()
-        header = list(rows[0])
-        atomic_write_text(residuals, csv_text(header, ([row[h] for h in header] for row in rows)))
+        save_residuals(result, residuals)
     if report is not None:
         from elastocal.report.page import write_identification_report
 

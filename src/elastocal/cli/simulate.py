@@ -13,7 +13,6 @@ from elastocal.cli.app import (
     Seed,
     app,
     check_outputs,
-    checked_force,
     reporting_errors,
 )
 from elastocal.cli.plan_files import check_apart, files_of
@@ -58,24 +57,23 @@ def simulate(
     """
     import numpy as np
 
-    from elastocal.cell import read_cell
     from elastocal.files import atomic_write_text
     from elastocal.identification.checks import check_limits
-    from elastocal.manipulator.effects import CATALOGUE
+    from elastocal.manipulator.inputs import given_force
     from elastocal.manipulator.model import Model
-    from elastocal.measurements import read_plan, write_measurements
+    from elastocal.measurements import write_measurements
     from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
     from elastocal.simulation.simulate import simulate as run
 
-    force = checked_force(load)
+    force = given_force(load)
     require(
         0 <= draw < float("inf"),
         f"--draw takes a factor of the typical sizes, 0 or more; found {draw:g}",
     )
     check_outputs(output, truth)
-    model = Model.from_cell(read_cell(cell, known_effects=CATALOGUE))
+    model = Model(cell)
     check_apart([output, truth], [cell, plan, *files_of(model.cell)])
-    poses = read_plan(plan, joint_kinds=model.chain.kinds)
+    poses = model.read_plan(plan)
     check_limits(model, poses)
     rng = np.random.default_rng(seed)
     values = draw_errors(model, draw, rng) if draw else {}

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from elastocal.compensation.compensate import REACHED, Compensation
+from elastocal.errors import InsufficientDataError, option
 from elastocal.manipulator.chain import Array
 from elastocal.measurements import families
 from elastocal.tables import column, csv_text
@@ -16,6 +17,44 @@ from elastocal.text import plain
 SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.
 DIGITS = 9
+
+
+REMEDIES = {
+    "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of "
+    "another posture",
+    "not reached": "out of reach, or beside a singular posture: move the target, or give q1_deg … "
+    "of another posture",
+    "no equilibrium": "no static equilibrium under this load: check force_*_N",
+}
+NAMED = 8  # rows that a message names
+
+
+def check_reached(result: Compensation) -> None:
+    """Raise InsufficientDataError where targets are not reached: which, and what would help."""
+    table = result.targets.table
+    rows = [f"line {line}" for line in table.row]
+    check_status(f"{table.source}: %d of %d targets", rows, result.status, REACHED, REMEDIES)
+
+
+def check_status(
+    what: str,
+    rows: Sequence[str],
+    status: Sequence[str],
+    good: str,
+    remedies: Mapping[str, str],
+) -> None:
+    """Raise InsufficientDataError for rows of another status than `good`; `what` counts them."""
+    lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]
+    if not lost:
+        return
+    named = ", ".join(f"{row} ({s})" for row, s in lost[:NAMED])
+    more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
+    kinds = dict.fromkeys(s for _, s in lost)
+    raise InsufficientDataError(
+        f"{what % (len(lost), len(status))} are not reached: {named}{more}. "
+        + "; ".join(f"{kind}: {remedies[kind]}" for kind in kinds)
+        + f". Nothing was written; {option('partial', True)} writes the others"
+    )
 
 
 def in_file_units(values: Array, kinds: Sequence[str]) -> Array:

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.above import Result
 from elastocal.compensation.nominal import jumps, nominal_path
 from elastocal.compensation.notices import notices_of
 from elastocal.compensation.point import ToolPoint
@@ -18,30 +19,45 @@ from elastocal.compensation.tool import CalibratedTool
 from elastocal.compensation.uncertainty import Uncertainty, position_uncertainty, undetermined
 from elastocal.identification.checks import check_limits
 from elastocal.manipulator import rigid
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.inverse_kinematics import inverse_kinematics
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.reaching import Reaching
 from elastocal.manipulator.tape import Tape
-from elastocal.notebook import ForNotebooks
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
 
 
-@dataclass(frozen=True)
-class Compensation(ForNotebooks):
-    """Commands for n targets.
+@dataclass(frozen=True, repr=False)
+class Compensation(Result):
+    """Commands that put the tool at n targets.
 
-    `q` and `nominal` (n, joints) rad or m; `before` and `after` (n,) m: predicted distance of the
-    tool from its target at the nominal command and at the new one (NaN: no equilibrium), `turn`
-    (n, 2) rad the same for the rotation; `status` (n,) of reached, limit, no equilibrium, not
-    reached; `goals` in the data's frame, `force` (n, 3) N in the data's frame;
-    `T_data_base` (n, 4, 4); `place` (n, 3) m and `turned` (n, 3, 3): the point and the tool's
-    rotation in the flange frame; `nominal_miss` (n,) m: how far the nominal arm is from the
-    target at the nominal command (zero where it reaches it).  `uncertainty` is NaN where a
-    row is not reached.
+    Attributes:
+        q: The new commands (n, joints), in rad or m.
+        nominal: The nominal ones (n, joints).
+        before: Predicted distance (n,) in m of the tool from its target at the nominal command;
+            NaN without a static equilibrium.
+        after: The same at the new command.
+        turn: (n, 2), the same two for the rotation, in rad.
+        status: (n,), of "reached", "limit", "no equilibrium" and "not reached".
+        uncertainty: Of the tool's position, NaN where a row is not reached.
+        warnings: What to know before one runs the commands, in sentences.
+        targets: The targets as given; `goals` are they in the data's frame.
+        point: The tool's point.
+        force: (n, 3) in N, in the data's frame.
+        T_data_base: (n, 4, 4).
+        place: (n, 3) in m, the point in the flange frame; `turned` (n, 3, 3) the tool's rotation.
+        nominal_miss: (n,) in m, how far the nominal arm is from the target at the nominal command.
+        chain: The nominal chain.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv")
+        >>> commands = ec.compensate(fit.arm, [1.8, 0.0, 0.9], load=[0, 0, -2600])
+        >>> commands.q.shape, commands.status
+        ((1, 6), ('reached',))
+        >>> commands.save("commands.csv")
     """
 
     chain: Chain
@@ -62,6 +78,15 @@ class Compensation(ForNotebooks):
     uncertainty: Uncertainty
     warnings: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        return (
+            f"<Compensation {self.chain.name}: {int(self.reached.sum())} of {len(self)} targets "
+            "reached>"
+        )
+
+    def __len__(self) -> int:
+        return len(self.q)
+
     @property
     def reached(self) -> NDArray[np.bool_]:
         """(n,)"""
@@ -69,7 +94,7 @@ class Compensation(ForNotebooks):
 
 
 def compensate(
-    arm: Calibrated,
+    arm: CalibratedArm,
     targets: Targets,
     point: ToolPoint,
     near: Array | None = None,

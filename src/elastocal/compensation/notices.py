@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from elastocal.cell import Cell
 from elastocal.compensation.targets import Targets
 from elastocal.compensation.uncertainty import Uncertainty
+from elastocal.errors import option
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.effects import effect_of
 from elastocal.text import listed
@@ -65,8 +66,8 @@ def notices_of(
         if far.any():
             told.append(
                 f"{_rows(targets, far)}: the nominal command q1_deg … puts the tool up to "
-                f"{before[far].max() * 1e3:.0f} mm from its target; check --frame, --point and "
-                "units"
+                f"{before[far].max() * 1e3:.0f} mm from its target; check {option('frame')}, "
+                f"{option('point')} and units"
             )
     told += _without_load(cell, targets)
     told += _beyond_levels(cell, targets, q, reached)
@@ -78,7 +79,7 @@ def notices_of(
             f"The data do not determine {listed(uncertainty.blamed, 4)}, on which the place of "
             f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm "
             "rms, which the stated uncertainty leaves out; choose a marker that was fitted "
-            "(--point), or measure what is missing"
+            f"({option('point')}), or measure what is missing"
         )
     return tuple(told)
 
@@ -91,7 +92,7 @@ def _without_load(cell: Cell, targets: Targets) -> list[str]:
         return []
     return [
         f"{targets.table.source}: no load is stated, so no compliance is compensated; where the "
-        "tool carries one, give --load or force_x_N, force_y_N, force_z_N"
+        f"tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
     ]
 
 

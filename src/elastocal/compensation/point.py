@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from elastocal.cell import Array, Cell
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.text import did_you_mean, listed
 
 
@@ -34,20 +34,22 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
             return _marker(cell, next(iter(markers)))
         raise InputError(
             f"{cell.path or cell.name}: which point of the tool shall be at the targets? Give "
-            f"--point with a marker ({listed(markers)}) or with x,y,z in m in the flange frame, or "
-            "state [tool] load_point_m"
+            f"{option('point')} with a marker ({listed(markers)}) or with x,y,z in m in the flange "
+            "frame, or state [tool] load_point_m"
         )
     if text in markers:
         return _marker(cell, text)
     parts = text.split(",")
     if len(parts) == 1:
         raise InputError(
-            f"--point: '{text}' is no marker of the cell{did_you_mean(text, markers)}; its "
-            f"markers: {listed(markers)}; or give x,y,z in m in the flange frame"
+            f"{option('point')}: '{text}' is no marker of the cell{did_you_mean(text, markers)}; "
+            f"its markers: {listed(markers)}; or give x,y,z in m in the flange frame"
         )
-    place = numbers("--point", text, (3,), "x,y,z in m in the flange frame")
+    place = numbers(option("point"), text, (3,), "x,y,z in m in the flange frame")
     if np.abs(place).max() > 10:
-        raise InputError(f"--point: '{text}' is more than 10 m from the flange; give x,y,z in m")
+        raise InputError(
+            f"{option('point')}: '{text}' is more than 10 m from the flange; give x,y,z in m"
+        )
     return ToolPoint(place, None, f"point {text} m in the flange frame")
 
 

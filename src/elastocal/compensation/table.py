@@ -13,15 +13,14 @@ from elastocal.compensation.compensate import Compensation, compensate, nominal_
 from elastocal.compensation.point import ToolPoint
 from elastocal.compensation.targets import Targets, targets_at
 from elastocal.compensation.tool import CalibratedTool
-from elastocal.errors import InputError
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.errors import InputError, option
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array
 from elastocal.manipulator.limits import finite_ranges, joint_limits
 from elastocal.manipulator.reaching import Reaching
 
 MOST_POINTS = 200_000
 BETWEEN = 512  # points between those of the grid, on which interpolation is measured
-SOURCE = "--table"
 EXACT, FIRST_ORDER = "exact", "first order"
 LARGE = np.radians(2.0)  # rad (or m): a larger correction of a joint is no small correction
 NOMINAL_MISS = 1e-5  # m
@@ -66,7 +65,7 @@ class CorrectionTable:
     between: Array
 
 
-def joint_grid(arm: Calibrated, counts: tuple[int, ...]) -> Grid:
+def joint_grid(arm: CalibratedArm, counts: tuple[int, ...]) -> Grid:
     """`counts` levels per joint (one number for all) over the joint limits; one level: the middle.
 
     Raises InputError for a wrong number of counts or too many points.
@@ -81,20 +80,23 @@ def joint_grid(arm: Calibrated, counts: tuple[int, ...]) -> Grid:
 def box_grid(lower: Array, upper: Array, counts: tuple[int, ...], rotation: Array | None) -> Grid:
     """`counts` levels of x, y, z in a box of the base frame from `lower` to `upper` (3,) m."""
     if not (lower <= upper).all():
-        raise InputError("--box takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …")
+        raise InputError(
+            f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
+        )
     counts = _counts(counts, 3, "one number, or one each for x, y and z")
     axes = tuple(_levels(a, b, k) for a, b, k in zip(lower, upper, counts, strict=True))
     return Grid(axes, False, rotation)
 
 
 def _counts(counts: tuple[int, ...], n: int, what: str) -> tuple[int, ...]:
+    told = ",".join(map(str, counts))
     if len(counts) not in (1, n) or min(counts) < 1:
-        raise InputError(f"--grid takes {what}, 1 or more; found '{','.join(map(str, counts))}'")
+        raise InputError(f"{option('grid')} takes {what}, 1 or more; found '{told}'")
     counts = counts * n if len(counts) == 1 else counts
     size = int(np.prod([float(k) for k in counts]))
     if size > MOST_POINTS:
         raise InputError(
-            f"--grid {','.join(map(str, counts))}: {size:,} points, and {MOST_POINTS:,} is the "
+            f"{option('grid', told)}: {size:,} points, and {MOST_POINTS:,} is the "
             "most; give fewer levels to the joints that matter least (1 holds one in the middle)"
         )
     return counts
@@ -105,7 +107,7 @@ def _levels(low: float, high: float, count: int) -> Array:
 
 
 def correction_table(
-    arm: Calibrated,
+    arm: CalibratedArm,
     grid: Grid,
     point: ToolPoint,
     force: Array | None = None,
@@ -141,10 +143,10 @@ def correction_table(
 
 def _targets(grid: Grid, points: Array, force: Array | None) -> Targets:
     if grid.joints:
-        return targets_at(SOURCE, None, None, "base", force, q=points)
+        return targets_at(option("table"), None, None, "base", force, q=points)
     rotation = grid.rotation
     turned = None if rotation is None else np.broadcast_to(rotation, (len(points), 3, 3))
-    return targets_at(SOURCE, points, turned, "base", force)
+    return targets_at(option("table"), points, turned, "base", force)
 
 
 def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.compensation.point import numbers
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, option, require
 from elastocal.manipulator.chain import Array
 from elastocal.measurements import Measurements, read_measurements
 
@@ -67,17 +67,18 @@ def read_targets(
         require(
             frame == "base",
             f"{path}: targets by q1_deg … alone are where the nominal arm has the tool, which "
-            "stands in the base frame; leave --frame tracker away, or give x_mm,y_mm,z_mm",
+            f"stands in the base frame; leave {option('frame', 'tracker')} away, or give "
+            "x_mm,y_mm,z_mm",
         )
     require(
         len(table.marker_names) == 1,
         f"{path}: targets of the markers {', '.join(table.marker_names[:4])} … in one table; the "
-        "point of the tool is chosen by --point: split the table by marker",
+        f"point of the tool is chosen by {option('point')}: split the table by marker",
     )
     if force is not None:
         require(
             not table.force.any(),
-            f"{path}: the table has forces of its own; leave --load away or drop them",
+            f"{path}: the table has forces of its own; leave {option('load')} away or drop them",
         )
         table = replace(table, force=np.tile(force, (len(table), 1)))
     rotation = table.rotation
@@ -88,12 +89,12 @@ def read_targets(
 def one_target(text: str, frame: Frame, force: Array | None = None) -> Targets:
     """The target "x,y,z" in mm, or "x,y,z,rx,ry,rz" with a rotation vector in degrees."""
     what = "x,y,z in mm, or x,y,z,rx,ry,rz in mm and degrees (rotation vector)"
-    values = numbers("--target", text, (3, 6), what)
+    values = numbers(option("target"), text, (3, 6), what)
     position = values[None, :3] / 1e3
     rotation = None
     if len(values) == 6:
         rotation = Rotation.from_rotvec(np.radians(values[None, 3:])).as_matrix()
-    return targets_at("--target", position, rotation, frame, force)
+    return targets_at(option("target"), position, rotation, frame, force)
 
 
 def targets_at(

@@ -13,7 +13,7 @@ from elastocal.compensation.levels import share_of_levels
 from elastocal.compensation.point import ToolPoint
 from elastocal.compensation.total import Total
 from elastocal.manipulator import rigid
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array
 from elastocal.manipulator.inputs import row_inputs
 from elastocal.manipulator.reaching import ARM_LENGTH
@@ -31,7 +31,7 @@ class CalibratedTool:
     distorts (`tracker_distortion`) is no part of where the tool is.
     """
 
-    def __init__(self, arm: Calibrated, point: ToolPoint) -> None:
+    def __init__(self, arm: CalibratedArm, point: ToolPoint) -> None:
         self.calibrated, self.point = arm, point
         self.chain, self.cell = arm.model.chain, arm.model.cell
         self.x = arm.x

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.compensation.tool import CalibratedTool
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array
 from elastocal.manipulator.limits import finite_ranges, joint_limits
 
@@ -74,7 +74,7 @@ def undetermined(tool: CalibratedTool, rows: list[NDArray], seed: int) -> Undete
     return Undetermined(kept, left, mixing, sizes[left])
 
 
-def _sizes(arm: Calibrated, kept: NDArray[np.int64]) -> Array:
+def _sizes(arm: CalibratedArm, kept: NDArray[np.int64]) -> Array:
     """Typical deviation (parameters,) of each parameter; where none is known beforehand, the
     smallest value that was determined of its kind (the stiffest joint's compliance)."""
     parameters = arm.model.parameters
@@ -91,7 +91,7 @@ def _sizes(arm: Calibrated, kept: NDArray[np.int64]) -> Array:
     )
 
 
-def position_uncertainty(arm: Calibrated, A: Array, left: Undetermined) -> Uncertainty:
+def position_uncertainty(arm: CalibratedArm, A: Array, left: Undetermined) -> Uncertainty:
     """Σ_p = A_K Σ A_Kᵀ for A (n, 3, parameters) in m per unit, Σ of the determined parameters K.
 
     NaN where the result determined nothing.  A typical deviation of an open parameter moves the

@@ -53,7 +53,7 @@ def run_demo(
     progress("copying the example")
     cell_path, plan_path = _copy_example(folder)
     cell = read_cell(cell_path)
-    model = Model.from_cell(cell)
+    model = Model(cell)
     plan = read_plan(plan_path, joint_kinds=model.chain.kinds)
     rows = expand_plan(plan, tuple(cell.tool.markers), REPEATS, np.array(LOAD_N))
     rows = replace(rows, sigma=reading_sigma(folder)[rows.configuration])

@@ -25,7 +25,7 @@ from elastocal.design.select import Selection, select
 from elastocal.design.setup import Known, Pool, Setup, set_up
 from elastocal.design.shares import check_available, most_poses, shares_of
 from elastocal.design.target_poses import test_poses
-from elastocal.errors import InsufficientDataError, require
+from elastocal.errors import InsufficientDataError, option, require
 from elastocal.manipulator.model import Model
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.exact_plan import size_curve
@@ -74,7 +74,7 @@ class _Design:
             )
         self.cell, self.options = cell, options
         self.checkpoint, self.progress = checkpoint, progress
-        self.model = Model.from_cell(cell, options.done.marker_names if options.done else ())
+        self.model = Model(cell, options.done.marker_names if options.done else ())
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
@@ -202,7 +202,7 @@ class _Design:
             unit == "µm",
             f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria "
             f"{_joined(metric, 'and')}, not with {self.cell.design.criterion}; drop it, or "
-            "compare numbers of poses by a curve",
+            f"compare by {option('curve')}",
         )
         return (target * 1e6 / unit_value) ** 2
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.design.information import PoseInformation
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.identification.reduction import Reduction, reduce
 from elastocal.identification.selection import WORTH_A_COLUMN
 from elastocal.manipulator.effects import effect_of
@@ -138,21 +138,21 @@ def why(model: Model, found: Estimable, index: int) -> str:
     if index in r.kept:
         return (
             f"so many poses show less of {name} than their noise, and identification would hold "
-            "it; measure more poses or repeats, or state a prior (--knowledge)"
+            f"it; measure more poses or repeats, or state a prior ({option('knowledge')})"
         )
     if index in r.invisible:
         return (
             f"no feasible pose shows {name}: it moves no marker in any of them; change the load's "
-            f"direction or the limits, or leave it out (--fix {name})"
+            f"direction or the limits, or leave it out ({option('fixed', name)})"
         )
     if index in r.dropped:
         share = np.abs(r.mixing[:, list(r.dropped).index(index)]) / found.sizes[r.kept]
         partner = model.names[r.kept[int(share.argmax())]]
         return (
             f"no set of poses tells {name} from others ({partner} moves the markers in the same "
-            f"way); ask for {partner} instead, or hold one of them (--fix {name})"
+            f"way); ask for {partner} instead, or hold one of them ({option('fixed', name)})"
         )
-    return f"{name} is held; drop it from --fix"
+    return f"{name} is held; drop it from {option('fixed')}"
 
 
 def _sample(model: Model, q: Array, load: IntArray) -> IntArray:

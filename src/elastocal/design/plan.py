@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.above import Result
 from elastocal.design.order.execution import Execution
+from elastocal.design.plan_file import plan_rows
 from elastocal.design.random_plans import RandomPlans
 from elastocal.design.reasons import Predicted, Reason
 from elastocal.manipulator.model import Model
-from elastocal.notebook import ForNotebooks
+from elastocal.measurements import Measurements
 from elastocal.planning.criterion import Criterion
 
 Array = NDArray[np.float64]
@@ -87,11 +89,43 @@ class SizePoint:
     bound: float | None
 
 
-@dataclass(frozen=True)
-class Plan(ForNotebooks):
-    """q (N, n) in SI units, numbered by configuration; `load` (N,) the load state or −1 for all;
-    `group` (N,) into `levels`.  `value` is Φ, `reported` what the user knows it by, in `unit`;
-    `first` is the number of the first configuration: after those that were measured already."""
+@dataclass(frozen=True, repr=False)
+class Plan(Result):
+    """A measurement plan: poses in their order, what they promise, how far from the best they are.
+
+    Attributes:
+        model: The `Model` that it is for.
+        criterion: What was made small; `value` is it as the search has it (Φ), `reported` as people
+            know it, in `unit`.
+        q: Commanded joints (N, joints), in rad or m.
+        load: (N,), each pose's load state, an index into `forces`; −1 for all of them.
+        forces: Load states (L, 3), in N.
+        group: (N,), the level of each pose, an index into `levels` of the joint `level_joint`.
+        execution: The order of execution, with the points in between.
+        candidates: How many poses were tried, and which rule removed how many.
+        certificate: How far the plan is from the best: certified on the pool of candidates,
+            estimated on the continuum.
+        predicted: How far each parameter will be known.
+        reasons: What each pose is for.
+        targets: What the test poses were, in words.
+        seed: Of all random draws.
+        polished: How many poses were moved from their candidate.
+        curve: The criterion against the number of poses, where it was asked for.
+        bound_reported: The certificate's bound, in `unit`.
+        warnings: What to know before one measures, in sentences.
+        first: Number of the first configuration: after those that were measured already.
+        chance: What as many random poses would reach.
+
+    Examples:
+        >>> plan = ec.design(
+        ...     "cell.toml", poses=4, criterion="D", candidates=60, effort="quick",
+        ...     loads=[[0, 0, -2600]], levels={"joint2": np.radians([-25.24, -99.85])},
+        ... )
+        >>> len(plan), plan.q.shape, plan.unit
+        (4, (4, 6), 'log det')
+        >>> data = ec.simulate("cell.toml", plan, load=[0, 0, -2600])
+        >>> plan.save("plan4.csv")
+    """
 
     model: Model
     criterion: str
@@ -118,8 +152,25 @@ class Plan(ForNotebooks):
     first: int = 1
     chance: Chance | None = None
 
+    def __repr__(self) -> str:
+        sure = self.certificate.efficiency_pool
+        told = "" if sure is None else f", at least {100 * sure:.1f} % of the best of its pool"
+        return (
+            f"<Plan {self.model.chain.name}: {len(self)} poses by {self.criterion}, "
+            f"{self.reported:.4g} {self.unit}{told}>"
+        )
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def table(self) -> Measurements:
+        """The poses as a table for `simulate`, as the plan's file has them."""
+        rows = plan_rows(self.execution, self.configurations, self.group + 1, self.stated_forces)
+        return rows.table(self.model.chain.kinds)
+
     @property
     def configurations(self) -> tuple[str, ...]:
+        """Their names: numbers from `first` on."""
         return tuple(str(self.first + k) for k in range(len(self.q)))
 
     @property
@@ -137,7 +188,7 @@ class Plan(ForNotebooks):
         """The load states where the plan must state them row by row.
 
         Not where every pose is measured unloaded, or unloaded and under one load, which is what
-        `simulate --load` does to a plan without forces.
+        `simulate` does with a load to a plan without forces.
         """
         loaded = np.any(self.forces != 0, axis=1)
         usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2

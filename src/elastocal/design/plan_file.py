@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from elastocal.design.order.execution import Execution, Stop
 from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
-from elastocal.measurements import families
+from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.tables import column, csv_text
 from elastocal.text import is_label, json_text, quoted
+from elastocal.units import to_si
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -23,6 +24,7 @@ IntArray = NDArray[np.int64]
 SCHEMA = "elastocal/plan/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m, and a level of -25.24° reads so.
 DIGITS = 9
+UNITS = {"revolute": "deg", "prismatic": "mm"}
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,29 @@ class PlanRows:
     force: Array | None = None
     approach: IntArray | None = None
     notes: Mapping[str, Sequence[str]] | None = None
+
+    def table(self, joint_kinds: Sequence[str]) -> Measurements:
+        """What `measurement_reader.read_plan` reads of these rows once they are written."""
+        n = len(self.configuration)
+        labels = tuple(dict.fromkeys(self.configuration))
+        q = np.column_stack(
+            [
+                to_si(np.round(in_unit(values, kind), DIGITS), UNITS[kind])
+                for values, kind in zip(self.q.T, joint_kinds, strict=True)
+            ]
+        )
+        return Measurements(
+            source="plan",
+            row=np.arange(2, n + 2),
+            q=q,
+            configuration=np.array([labels.index(name) for name in self.configuration]),
+            configuration_labels=labels,
+            repeat=np.zeros(n, dtype=np.int64),
+            marker=np.zeros(n, dtype=np.int64),
+            marker_names=(DEFAULT_MARKER,),
+            force=np.zeros((n, 3)) if self.force is None else self.force,
+            approach=None if self.approach is None else self.approach.astype(float),
+        )
 
 
 def plan_rows(
@@ -105,10 +130,7 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
     known = families(joint_kinds)
     columns: dict[str, Sequence[str]] = {"configuration": rows.configuration}
     for stem, kind, values in zip(known["q"].units, joint_kinds, rows.q.T, strict=True):
-        if kind == "revolute":
-            columns[column(stem, "deg")] = [_number(v) for v in np.degrees(values)]
-        else:
-            columns[column(stem, "mm")] = [_number(v) for v in values * 1e3]
+        columns[column(stem, UNITS[kind])] = [_number(v) for v in in_unit(values, kind)]
     if rows.force is not None:
         for stem, values in zip(known["force"].units, rows.force.T, strict=True):
             columns[column(stem, "N")] = [repr(float(v) + 0.0) for v in values]
@@ -118,6 +140,11 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
     columns["level"] = [str(int(v)) for v in rows.level]
     columns["order"] = [str(int(v)) for v in rows.order]
     return columns | dict(rows.notes or {})
+
+
+def in_unit(values: Array, kind: str) -> Array:
+    """A joint's values in rad or m in the unit of the file."""
+    return np.degrees(values) if kind == "revolute" else values * 1e3
 
 
 def _number(value: float) -> str:

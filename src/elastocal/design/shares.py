@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell import Cell
-from elastocal.errors import InsufficientDataError, require
+from elastocal.errors import InsufficientDataError, option, require
 
 IntArray = NDArray[np.int64]
 
@@ -55,7 +55,7 @@ def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
     require(
         asked >= shares[k],
         f"{where}, but {drawn} candidates leave {asked} to choose from; ask for more "
-        "(--candidates, or [design] candidates)",
+        f"({option('candidates')}, or [design] candidates)",
     )
     raise InsufficientDataError(
         f"{where}, but only {available[k]} feasible candidates were found; plan fewer poses, or "

@@ -41,7 +41,7 @@ def prediction_rows(information: PoseInformation, targets: TargetPoses, x: Array
     A = np.zeros((len(targets.q), M, 3, len(model.parameters)))
     if by_marker.any():
         own = replace(model.cell.model, observe="position")
-        arm = Model(model.chain, replace(model.cell, model=own))
+        arm = Model.assembled(model.chain, replace(model.cell, model=own))
         which = np.flatnonzero(by_marker)
         code = np.tile(np.arange(M), len(which))
         table = _table(targets, np.repeat(which, M), code, markers)
@@ -85,7 +85,7 @@ def _with_points(model: Model, points: dict[str, Array]) -> Model:
     )
     spec = replace(cell.model, effects=effects, observe="position")
     tool = replace(cell.tool, markers=cell.tool.markers | points)
-    return Model(model.chain, replace(cell, model=spec, tool=tool))
+    return Model.assembled(model.chain, replace(cell, model=spec, tool=tool))
 
 
 def _places(choice: EffectChoice, model: Model) -> tuple[str, ...]:

@@ -132,7 +132,7 @@ def compute_columns(
     )
     extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
     key = "columns", spec.effects
-    whole = made_once(model, key, lambda: Model(chain, replace(cell, model=spec), extra))
+    whole = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
     at = dict(zip(model.names, base.x, strict=True)) | (found or {})
     x = np.array([at.get(p.name, p.nominal) for p in whole.parameters])
     seen = observe(table, whole.observe)

@@ -56,6 +56,7 @@ def diagnose(
     are too few configurations to tell an effect from noise.
     """
     options = options or DiagnosisOptions()
+    given, source = model, table.source
     check_table(model, table)
     _check_enough(table)
     table, left_out = thinned(table)
@@ -95,6 +96,8 @@ def diagnose(
         n_readings=scene.blocks.n,
         n_configurations=len(scene.blocks.member),
         model_keys=model_keys(base.model, findings),
+        model=given,
+        data=source,
         calibrated=base,
     )
 

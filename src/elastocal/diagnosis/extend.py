@@ -26,7 +26,7 @@ def extended(model: Model, items: Sequence[Item]) -> Model:
     nominal = replace(spec.nominal, settings=settings)
     cell: Cell = replace(model.cell, model=replace(spec, effects=tuple(effects), nominal=nominal))
     key = "extended", tuple(effects), repr(settings)
-    return made_once(model, key, lambda: Model(model.chain, cell))
+    return made_once(model, key, lambda: Model.assembled(model.chain, cell))
 
 
 def settings_of(item: Item) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, option, require
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.text import did_you_mean, listed
 
@@ -25,11 +25,12 @@ class DiagnosisOptions:
     def __post_init__(self) -> None:
         require(
             0 < self.false_alarm < 0.5,
-            f"the false-alarm rate takes a number between 0 and 0.5; found {self.false_alarm:g}",
+            f"{option('false_alarm')} takes a number between 0 and 0.5; found {self.false_alarm:g}",
         )
         for name in self.without:
             if name not in CATALOGUE:
                 raise InputError(
-                    f"--without: unknown effect '{name}'{did_you_mean(name, list(CATALOGUE))}; "
+                    f"{option('without')}: unknown effect '{name}'"
+                    f"{did_you_mean(name, list(CATALOGUE))}; "
                     f"the catalogue has: {listed(list(CATALOGUE))}"
                 )

@@ -57,7 +57,7 @@ def under_other_law(model: Model) -> Model:
     """The model with play under the law that it does not have."""
     spec = model.cell.model
     spec = replace(spec, play_side=LAWS[spec.play_side])  # type: ignore[arg-type]
-    return Model(model.chain, replace(model.cell, model=spec))
+    return Model.assembled(model.chain, replace(model.cell, model=spec))
 
 
 def _likeliest(scene: Scene, noise: NoiseValues) -> ModelSet:

@@ -40,7 +40,7 @@ def with_recorded_drivers(
     if not keys:
         return model
     cell = replace(model.cell, model=replace(spec, **keys))  # type: ignore[arg-type]
-    return Model(model.chain, cell)
+    return Model.assembled(model.chain, cell)
 
 
 def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:

@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
+from elastocal.above import Result
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.separate.result import ExtraPlan
 from elastocal.errors import option
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.result import Finding, Number
 from elastocal.manipulator.effects.base import Stage
-from elastocal.notebook import ForNotebooks
+from elastocal.manipulator.model import Model
 
 Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
 Interval = tuple[float, float]
@@ -189,11 +190,40 @@ class NoiseFloor:
     faulty: tuple[FaultyReading, ...] = ()
 
 
-@dataclass(frozen=True)
-class Diagnosis(ForNotebooks):
-    """The whole answer.  `p_value`: of what was found, against the whole family of hypotheses.
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Result):
+    """Why the real arm still differs from the model.
 
-    `findings` are the judgements about it, the verdict first, each with its numbers and what to do.
+    Attributes:
+        verdict: "explained", "nothing_significant", "unknown_effect" or "ambiguous".
+        gap: 3-D rms marker errors on held-out poses, in m: nominal, calibrated, explained, floor.
+        budget: The waterfall from the nominal arm to the noise floor, `Step` by step.
+        effects: What is held to be real, each a `Finding`.
+        candidates: Every hypothesis that was tried, best first.
+        indistinguishable: Sets that these data cannot tell apart.
+        location: Where the gap lies.
+        noise: The noise that the data themselves show.
+        structure: What the residual depends on, without naming an effect.
+        probability_nothing: That no effect is missing.
+        probability_unknown: That something without a name is at work.
+        p_value: Of what was found, against the whole family of hypotheses.
+        curves: The shape of an unknown dependence.
+        untested: Effects that the data cannot test, and what to record so that they can.
+        findings: The judgements about it, the verdict first, each with its numbers and what to do.
+        warnings: What to know before one relies on it, in sentences.
+        n_readings: Number of readings; `n_configurations` that of configurations.
+        extra: Poses that tell rivals apart, where they were asked for.
+        model_keys: Keys of [model] that the effects found rest on.
+        model: The model that was diagnosed; `data` names its measurements.
+        calibrated: The arm as it was fitted before any effect was added.
+
+    Examples:
+        >>> why = ec.diagnose("cell.toml", "data.csv")
+        >>> why.verdict, why.effects[0].effect, why.location.where
+        ('explained', 'link_bending', 'link4')
+        >>> why.gap.calibrated > why.gap.noise_floor
+        True
+        >>> why.save("diagnosis.json")
     """
 
     verdict: Verdict
@@ -216,6 +246,9 @@ class Diagnosis(ForNotebooks):
     extra: ExtraPlan | None = field(default=None)
     # Keys of [model] that the effects found rest on, beyond their own names.
     model_keys: dict[str, str] = field(default_factory=dict)
+    # What was diagnosed: the model as it was given, and the name of its measurements.
+    model: Model | None = field(default=None, repr=False, compare=False)
+    data: str = ""
     # The arm as it was fitted before any effect was added, and its residuals.
     calibrated: Baseline | None = field(default=None, repr=False, compare=False)
 
@@ -244,6 +277,11 @@ class Diagnosis(ForNotebooks):
     @property
     def findings(self) -> tuple[Finding, ...]:
         return tuple(_findings(self))
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{f.effect} at {f.where}" for f in self.effects)
+        robot = "" if self.model is None else f" {self.model.chain.name}"
+        return f"<Diagnosis{robot}: {self.verdict}{', ' + found if found else ''}>"
 
 
 def _findings(d: Diagnosis) -> Iterator[Finding]:

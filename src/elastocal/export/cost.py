@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from elastocal.cell import Array
-from elastocal.errors import InsufficientDataError
+from elastocal.errors import InsufficientDataError, option
 from elastocal.export.kept import Conditions, Kept, Valued
 from elastocal.export.pieces import evaluate_pieces
 from elastocal.manipulator.limits import finite_ranges, joint_limits
@@ -69,7 +69,8 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
     if not settled.any():
         raise InsufficientDataError(
             f"none of {poses} random poses has a static equilibrium under the load "
-            f"{kept.conditions.force.tolist()} N; check --load and the compliances of the result"
+            f"{kept.conditions.force.tolist()} N; check {option('load')} and the "
+            "compliances of the result"
         )
     effects = []
     for omission in kept.omissions:

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from elastocal.errors import option
 from elastocal.export.check import check_chain, check_rest
 from elastocal.export.cost import Cost, cost_of
 from elastocal.export.dh import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
@@ -16,15 +17,15 @@ from elastocal.export.kept import Conditions, Kept, Valued, keep
 from elastocal.export.mjcf import RIGID, calibrated_mjcf
 from elastocal.export.parameters import (
     cost_json,
+    estimates_of,
     held_values,
     parameter_document,
-    read_estimates,
 )
 from elastocal.export.pieces import Pieces, evaluate_pieces
 from elastocal.export.urdf import Frames, calibrated_urdf
 from elastocal.export.urdf_new import BASE, FLANGE, new_urdf
 from elastocal.export.yaml_text import to_yaml
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array, Chain
 from elastocal.manipulator.effects import effect_of
 from elastocal.text import json_text
@@ -77,7 +78,7 @@ class Exported:
 
 
 def export(
-    calibrated: Calibrated, wish: Wish, progress: Callable[[str], None] = lambda _: None
+    calibrated: CalibratedArm, wish: Wish, progress: Callable[[str], None] = lambda _: None
 ) -> Exported:
     """The calibrated arm as the text of a file.
 
@@ -85,7 +86,7 @@ def export(
     where no random pose has an equilibrium under the load, and ElastocalError where the text,
     read back, is another arm than the model.
     """
-    estimates = read_estimates(calibrated)
+    estimates = estimates_of(calibrated)
     kept = keep(calibrated, elastic=wish.format == "mjcf", conditions=wish.conditions)
     pieces = evaluate_pieces(kept.exported, wish.conditions)
     progress("what the format cannot hold")
@@ -109,7 +110,7 @@ Written = tuple[str, float | None, str, list[str], float | None]
 
 
 def _written(
-    calibrated: Calibrated,
+    calibrated: CalibratedArm,
     wish: Wish,
     kept: Kept,
     pieces: Pieces,
@@ -129,7 +130,7 @@ def _written(
     return json_text(document) + "\n", None, "", [], None
 
 
-def _note(calibrated: Calibrated, wish: Wish) -> str:
+def _note(calibrated: CalibratedArm, wish: Wish) -> str:
     """One line for a comment in the file: where its numbers come from, what they hold for."""
     cell = calibrated.model.cell
     source = Path(calibrated.source).name
@@ -141,7 +142,7 @@ def _note(calibrated: Calibrated, wish: Wish) -> str:
     return told
 
 
-def _urdf(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
+def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
     from elastocal.manipulator.urdf import read_urdf
 
     robot = calibrated.model.cell.robot
@@ -161,7 +162,7 @@ def _urdf(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Wri
     return text, check_chain(text, ".urdf", read, chain, kept, wish.seed), "pinocchio", [], None
 
 
-def _mjcf(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
+def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
     cell = calibrated.model.cell
     inertias: tuple[Array, ...] = ()
     if pieces.masses and cell.robot.urdf is not None:
@@ -203,7 +204,7 @@ def _compensator(part: Valued) -> dict[str, float] | None:
     return {name.partition(".")[2]: v for name, v in values.items()} | {"joint": joint}
 
 
-def _dh(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
+def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
     from elastocal.manipulator.dh import read_dh
 
     convention = CONVENTIONS[wish.format]
@@ -225,13 +226,13 @@ def _dh(calibrated: Calibrated, wish: Wish, kept: Kept, pieces: Pieces) -> Writt
     return text, checked, "elastocal's own reader of DH tables", [], beta
 
 
-def _warnings(calibrated: Calibrated, cost: Cost) -> list[str]:
+def _warnings(calibrated: CalibratedArm, cost: Cost) -> list[str]:
     found = []
     spec = calibrated.model.cell.model
     elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
     if elastic and not cost.force.any() and not spec.link_gravity:
         found.append(
-            "no load is given, so compliances cost nothing here: state one with --load "
+            f"no load is given, so compliances cost nothing here: state one with {option('load')} "
             "(N, in the tracker's axes)"
         )
     if spec.torque == "measured":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.text import did_you_mean
 
 ENDINGS = {
@@ -27,7 +27,7 @@ def format_of(path: Path, asked: str | None) -> str:
     if asked is not None:
         if asked.lower() not in FORMATS:
             raise InputError(
-                f"--format takes one of {', '.join(FORMATS)}; found '{asked}'"
+                f"{option('format')} takes one of {', '.join(FORMATS)}; found '{asked}'"
                 f"{did_you_mean(asked.lower(), FORMATS)}"
             )
         return asked.lower()
@@ -35,6 +35,6 @@ def format_of(path: Path, asked: str | None) -> str:
     if found is None:
         raise InputError(
             f"{path}: the ending '{path.suffix}' tells no format; use one of "
-            f"{', '.join(ENDINGS)}, or name it: --format {'|'.join(FORMATS)}"
+            f"{', '.join(ENDINGS)}, or name it by {option('format')}: {', '.join(FORMATS)}"
         )
     return found

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from elastocal.cell import Array, Cell
-from elastocal.manipulator.calibrated import Calibrated
+from elastocal.errors import option
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.effects.base import Format
 from elastocal.manipulator.effects.compliances import JointCompliance
@@ -89,7 +90,7 @@ class Kept:
     of_the_measurement: tuple[str, ...]
 
 
-def keep(calibrated: Calibrated, elastic: bool, conditions: Conditions) -> Kept:
+def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Kept:
     """Split the calibrated model into what a rigid or an elastic format holds and the rest.
 
     Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
@@ -130,10 +131,10 @@ def keep(calibrated: Calibrated, elastic: bool, conditions: Conditions) -> Kept:
 
 
 def _option(need: str) -> str:
-    return {"time": "--time-s", "temperature": "--temperature-c"}[need]
+    return option({"time": "time_s", "temperature": "temperature_c"}[need])
 
 
-def _part(calibrated: Calibrated, names: Collection[str]) -> Valued:
+def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
     """The calibrated model with the effects `names` alone."""
     cell = calibrated.model.cell
     spec = cell.model
@@ -148,7 +149,7 @@ def _part(calibrated: Calibrated, names: Collection[str]) -> Valued:
 
 
 def _valued(like: Model, cell: Cell, values: dict[str, float]) -> Valued:
-    model = Model(like.chain, cell)
+    model = Model.assembled(like.chain, cell)
     return Valued(model, np.array([values[name] for name in model.names]))
 
 
@@ -181,7 +182,7 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     if spec.deflection_model == "linear" and only in (None, LINEAR):
         spec = replace(spec, deflection_model="equilibrium")
         changed.append((LINEAR, "springs settle under the load at the deflected pose, eq. (3) not"))
-    model = Model(part.model.chain, replace(cell, model=spec))
+    model = Model.assembled(part.model.chain, replace(cell, model=spec))
     negative = [p.name for p in model.parameters if p.lower == 0.0 and values[p.name] < 0.0]
     if negative and only in (None, NEGATIVE):
         values |= dict.fromkeys(negative, 0.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,25 +9,21 @@ from typing import Any
 from elastocal.export.cost import Cost
 from elastocal.export.pieces import Pieces
 from elastocal.export.rigid_text import rpy
-from elastocal.files import read_text
-from elastocal.manipulator.calibrated import MOST_BYTES, Calibrated
+from elastocal.manipulator.calibrated import CalibratedArm
 from elastocal.manipulator.chain import Array
 
 SCHEMA = "elastocal/parameters/1"
 KEYS = ("value", "unit", "std", "ci95", "identifiable", "combined_with", "nominal", "held", "note")
 
 
-def read_estimates(calibrated: Calibrated) -> list[dict[str, Any]]:
-    """Per parameter of the result file, in the model's order: name and what identify says of it.
+def estimates_of(calibrated: CalibratedArm) -> list[dict[str, Any]]:
+    """Per parameter, in the model's order: name and what identify says of it.
 
-    What an older file does not have is null.
+    What an older result does not have is null.
     """
-    # read_calibrated has checked names and held values of this file.
-    written = json.loads(read_text(calibrated.source, "result of identify", MOST_BYTES))
-    by_name = {entry["name"]: entry for entry in written["parameters"]}
     return [
-        {"name": name} | {key: _finite(by_name[name].get(key)) for key in KEYS}
-        for name in calibrated.model.names
+        {"name": name} | {key: _finite(entry.get(key)) for key in KEYS}
+        for name, entry in zip(calibrated.model.names, calibrated.entries, strict=True)
     ]
 
 
@@ -38,7 +33,7 @@ def held_values(estimates: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def parameter_document(
-    calibrated: Calibrated, estimates: list[dict[str, Any]], pieces: Pieces, cost: Cost
+    calibrated: CalibratedArm, estimates: list[dict[str, Any]], pieces: Pieces, cost: Cost
 ) -> dict[str, Any]:
     """Everything to be written: estimates, the geometry they make, and that geometry's cost.
 

@@ -17,7 +17,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from elastocal.cell import Robot
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.export.pieces import Pieces
 from elastocal.export.rigid_text import origin_attributes
 from elastocal.export.urdf_edit import UrdfText, element, read_urdf_text
@@ -156,7 +156,7 @@ def _fixed(tree: Tree, text: UrdfText, new: str, parent: str, child: str, T: Arr
         what = f"joint '{name}'" if old is not None else f"link '{new}'"
         raise InputError(
             f"{tree.path}: {what} stands where export would add its own; rename it, "
-            "or leave the frame out (--no-frames, or no --base-frame)"
+            f"or leave the frame out ({option('frames', False)}, or no {option('base_frame')})"
         )
     return [element("link", {"name": new}), fixed_joint(name, parent, child, T)]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.manipulator.limits import joint_limits
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import Observations
@@ -140,7 +140,7 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
         match = model.meant_by(name)
         if not match:
             raise InputError(
-                f"cannot fix '{name}': the model has no such parameter, place or effect"
+                f"{option('fixed', name)}: the model has no such parameter, place or effect"
                 f"{did_you_mean(name, model.all_names)}"
             )
         held |= set(match)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.identification.cluster_by_parts import cluster_by_parts, worth_clustering
 from elastocal.identification.covariance.cluster import cluster_robust
 from elastocal.identification.covariance.estimate import Covariance
@@ -70,8 +70,8 @@ def intervals_of(
         return _by_t(classical, x)
     if problem.large:
         raise InputError(
-            f"--intervals {kind} needs B as a whole, which a table of this size does not allow; "
-            "use cr1 or classical"
+            f"{option('intervals', kind)} needs B as a whole, which a table of this size does not "
+            "allow; use cr1 or classical"
         )
     size = solution.sizes[fit.columns]
     B, e = solution.problem.weights.apply(fit.B * size), fit.whitened

@@ -69,9 +69,18 @@ class KnowledgeTable(Table):
 
 @dataclass(frozen=True)
 class Knowledge:
-    """Constraints and prior as stated, in SI units; `physical` adds those of the model.
+    """What is known of the parameters besides the readings, in SI units.
 
-    `source` names where they were stated in messages.
+    Attributes:
+        physical: Adds the constraints that physics puts on the model: no negative compliance.
+        constraints: Bounds, equalities and matrices.
+        prior: A Gaussian prior.
+        source: Where it was stated, for messages.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv", knowledge=ec.Knowledge(physical=True))
+        >>> fit["joint3.compliance"].ci95[0] > 0
+        True
     """
 
     physical: bool = False

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InsufficientDataError, require
+from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.constrained.constraints import (
     Bounds,
     Constraints,
@@ -69,7 +69,7 @@ def fitted_columns(
     if unknown:
         raise InsufficientDataError(
             f"readings, prior and equalities do not determine {listed(unknown)}, which an equality "
-            "names; hold it (--fix) or state a prior for it, or drop the equality"
+            f"names; hold it ({option('fixed')}) or state a prior for it, or drop the equality"
         )
     partners: dict[int, None] = {}
     for k, c in enumerate(reduction.kept.tolist()):

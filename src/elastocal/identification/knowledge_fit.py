@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse, stats
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.identification.constrained.constraints import Constraints
 from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.constrained.nonlinear import ConstrainedFit, constrained_fit
@@ -68,7 +68,7 @@ def fit_with_knowledge(
     if problem.large:
         raise InputError(
             "constraints and priors need B as a whole, which a table of this size does not allow: "
-            "fit a part of the table, or --bounded for the physical bounds alone"
+            f"fit a part of the table, or {option('bounded', True)} for the physical bounds alone"
         )
     constraints = (options.constraints or Constraints()) + own_bounds(solution)
     prior, name = options.prior, "huber" if options.resolved == "huber" else "squares"

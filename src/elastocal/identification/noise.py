@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from elastocal.cell import Tracker
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.manipulator.observation import Observations
 from elastocal.tracker_noise import available_noise, need, position_covariance
 
@@ -104,7 +104,7 @@ def _available(seen: Observations, tracker: Tracker) -> str:
 
 
 def _given(seen: Observations, covariance: Array | None) -> Weights:
-    need(covariance is not None, "weights 'covariance' need a matrix (--covariance FILE)")
+    need(covariance is not None, f"weights 'covariance' need a matrix ({option('covariance')})")
     matrix = np.asarray(covariance, dtype=float)
     n = len(seen.value)
     need(

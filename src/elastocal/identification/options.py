@@ -8,14 +8,14 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.identification.constrained.constraints import Constraints
 from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.intervals import IntervalKind
 from elastocal.identification.noise import WeightKind
 from elastocal.identification.variance.structure import noise_models
-from elastocal.text import did_you_mean
+from elastocal.text import did_you_mean, quoted
 
 Method = Literal[
     "auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "tukey", "l1", "student-t"
@@ -59,14 +59,15 @@ class Options:
     def __post_init__(self) -> None:
         for name, value, valid in (
             ("method", self.method, METHODS),
-            ("noise model", self.noise, noise_models()),
-            ("kind of intervals", self.intervals, INTERVALS),
-            ("way with faulty readings", self.faulty, get_args(FaultyReadings)),
+            ("noise", self.noise, noise_models()),
+            ("weights", self.weights, get_args(WeightKind)),
+            ("intervals", self.intervals, INTERVALS),
+            ("outliers", self.faulty, get_args(FaultyReadings)),
         ):
             if value not in valid:
                 raise InputError(
-                    f"there is no {name} '{value}'{did_you_mean(value, valid)}; there are "
-                    f"{', '.join(valid)}"
+                    f"{option(name)} takes one of {', '.join(valid)}; found {quoted(value)}"
+                    f"{did_you_mean(str(value), valid)}"
                 )
         if self.noise != "auto" and self.resolved != "reml":
             raise InputError(
@@ -92,8 +93,8 @@ class Options:
         valid = ("auto", "bootstrap") if self.resolved == "huber" else WITH_KNOWLEDGE
         if self.intervals not in valid:
             raise InputError(
-                f"--intervals {self.intervals} knows of neither constraints nor a prior; with "
-                f"these and this method there are {', '.join(valid)}"
+                f"{option('intervals', self.intervals)} knows of neither constraints nor a prior; "
+                f"with these and this method there are {', '.join(valid)}"
             )
 
     @property

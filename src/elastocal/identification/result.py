@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, KeysView
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.above import Result
+from elastocal.errors import UnknownNameError
 from elastocal.identification.constrained.minimise import ActiveConstraint
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outlier import Outlier
 from elastocal.identification.residual_summary import ResidualSummary
 from elastocal.identification.robust.report import OutlierReport
-from elastocal.manipulator.calibrated import nominal_flange_rows
+from elastocal.manipulator.calibrated import CalibratedArm, nominal_flange_rows
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import COMPONENTS, Observations
-from elastocal.notebook import ForNotebooks
 
 Array = NDArray[np.float64]
 
@@ -27,13 +30,21 @@ LOPSIDED = 0.1  # difference of the halves of an interval that one half width ca
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter.  `value`, `std`, `ci95` are None unless the data determine it alone.
+    """What the data say of one parameter, in SI units.
 
-    `dof` are the degrees of freedom of the t distribution behind `ci95`, infinite for a normal one.
-
-    `held` is the value the fitted model uses for it: the estimate where there is one, else the
-    value at which it was kept or the share of a combination that was put on it.  It is needed
-    to predict, and it is not an estimate.
+    Attributes:
+        name: As "joint2.compliance".
+        unit: Its unit.
+        nominal: Its nominal value.
+        held: The value the fitted model uses for it: the estimate where there is one, else the
+            value at which it was kept or the share of a combination that was put on it.  It is
+            needed to predict, and it is not an estimate.
+        value: The estimate; None, as `std` and `ci95`, unless the data determine it alone.
+        std: Its standard deviation.
+        ci95: Lower and upper end of its 95 % interval.
+        dof: Degrees of freedom of the t distribution behind `ci95`, infinite for a normal one.
+        combined_with: Names that the data know only together with it.
+        note: Why there is no value, and what else there is to know.
     """
 
     name: str
@@ -49,6 +60,7 @@ class Estimate:
 
     @property
     def identifiable(self) -> bool:
+        """Do the data determine it alone?"""
         return self.value is not None
 
 
@@ -132,19 +144,50 @@ class Finding:
         }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Calibration(ForNotebooks):
-    """What `identify` found.
+@dataclass(frozen=True, repr=False)
+class Calibration(Result):
+    """What `identify` found: a mapping from parameter names to `Estimate`s, and all around it.
 
-    `x` (parameters,) are the values the model uses; `covariance` (determined, determined) goes
-    with `determined`, the kept parameters in order (alone or as first member of a combination).
-    `residual` (rows,) observed minus predicted in m (rad); `held_out` the same with each
-    configuration predicted by a fit to the others.  `sigma` is the residual's standard
-    deviation per whitened row (in m where unit weights were used), with `dof` degrees of freedom.
-    `active` are the constraints that hold with equality; `prior_share` says by parameter what
-    share of its information the prior gave, 0 to 1 (empty without a prior; parameters that
-    equalities fix are left out).  `findings` are the judgements about all this, each with its
-    numbers and what to do; `warnings` says those in sentences that call for attention.
+    Attributes:
+        model: The `Model` that was fitted.
+        method: The method that was used.
+        noise: The noise model and what was estimated of it.
+        estimates: An `Estimate` per parameter, in the model's order; `fit["joint2.compliance"]`
+            is one of them.
+        combinations: Sums of parameters that the data determine although not each member.
+        x: Values (parameters,) that the model uses, in SI units.
+        determined: The kept parameters in order, alone or as first member of a combination.
+        covariance: (determined, determined), theirs.
+        correlations: Pairs of names with |ρ| over 0.9, strongest first.
+        observations: The readings that were fitted, as observations.
+        residual: (rows,), observed minus predicted, in m (rad).
+        held_out: The same with each configuration predicted by a fit to the others.
+        sigma: Standard deviation of the residual per whitened row (in m with unit weights).
+        dof: Its degrees of freedom.
+        residual_rms: 3-D rms of `residual`, in m.
+        heldout_rms: That of `held_out`; infinite where none could be held out.
+        nominal_rms: That of the nominal arm, placed but not calibrated.
+        converged: Whether the fit converged; `reason` says how it ended.
+        outliers: Readings beyond the noise that had a part in the fit.
+        excluded: Readings beyond the noise that were set apart.
+        findings: The judgements about all this, each with its numbers and what to do.
+        warnings: What to know before one relies on the result, in sentences.
+        test: Errors on the readings given as `test`, None without.
+        active: Constraints that hold with equality.
+        prior_share: By parameter the share of its information that the prior gave, 0 to 1; empty
+            without a prior.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv")
+        >>> fit
+        <Calibration kuka_kr270_2: 9 of 10 parameters, held-out 124 µm>
+        >>> stiff = fit["joint3.compliance"]
+        >>> stiff.value, stiff.std, stiff.ci95, stiff.unit
+        (4.1...e-07, 1...e-09, (4.1...e-07, 4.1...e-07), 'rad/(N*m)')
+        >>> fit["joint1.compliance"].identifiable, len(fit), fit.covariance.shape, fit.B.shape
+        (False, 10, (9, 9), (810, 10))
+        >>> [name for name in fit if not fit[name].identifiable]
+        ['joint1.compliance']
     """
 
     model: Model
@@ -181,19 +224,64 @@ class Calibration(ForNotebooks):
         """Readings beyond the noise, whether they had a part in the fit or were set apart."""
         return self.outliers + self.excluded
 
-    def estimate(self, name: str) -> Estimate:
-        """The estimate of one parameter by name; KeyError lists what exists."""
-        for e in self.estimates:
-            if e.name == name:
-                return e
-        raise KeyError(f"no parameter '{name}'; there are {[e.name for e in self.estimates]}")
+    def __getitem__(self, name: str) -> Estimate:
+        """The estimate of the parameter `name`; UnknownNameError with the nearest name."""
+        found = self._by_name.get(name)
+        if found is None:
+            raise UnknownNameError.of("parameter", name, self._by_name)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        """The parameters' names, in the model's order."""
+        return iter(self._by_name)
+
+    def __len__(self) -> int:
+        return len(self.estimates)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._by_name
+
+    def keys(self) -> KeysView[str]:
+        """The parameters' names; with `[]` it makes dict(fit)."""
+        return self._by_name.keys()
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self._by_name)
+
+    @cached_property
+    def _by_name(self) -> dict[str, Estimate]:
+        return {e.name: e for e in self.estimates}
+
+    def __repr__(self) -> str:
+        known = sum(e.identifiable for e in self.estimates)
+        held = f", held-out {self.heldout_rms * 1e6:.3g} µm" if self.heldout_rms < np.inf else ""
+        return f"<Calibration {self.model.chain.name}: {known} of {len(self)} parameters{held}>"
+
+    @property
+    def B(self) -> Array:
+        """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
+        seen = self.observations
+        return self.model.regressor(seen.table, self.x, observations=seen).B
+
+    @cached_property
+    def arm(self) -> CalibratedArm:
+        """The calibrated arm, in memory: to be commanded (`compensate`), posed and saved."""
+        return CalibratedArm(
+            self.model,
+            self.x,
+            self.determined,
+            self.covariance,
+            self.observations.table.source,
+            tuple(_estimate_json(e) for e in self.estimates),
+        )
 
     def combination(self, first: str) -> Combination:
-        """The combination whose first member is `first`."""
+        """The combination whose first member is `first`; UnknownNameError where there is none."""
         for c in self.combinations:
             if next(iter(c.terms)) == first:
                 return c
-        raise KeyError(f"no combination starts with '{first}'")
+        firsts = [next(iter(c.terms)) for c in self.combinations]
+        raise UnknownNameError.of("combination that starts with", first, firsts)
 
     def finding(self, *kinds: str) -> Finding | None:
         """The first finding of one of these kinds; None where there is none."""

@@ -186,7 +186,7 @@ def _fit(cell: Cell, table: Measurements, spherical: bool) -> NominalFit:
 def _rigid(cell: Cell, markers: tuple[str, ...]) -> Model:
     """The nominal arm without effects, its markers at the flange."""
     tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in markers})
-    return Model.from_cell(replace(cell, tool=tool, model=ModelSpec()))
+    return Model(replace(cell, tool=tool, model=ModelSpec()))
 
 
 def _error(model: Model, table: Measurements) -> float:

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import casadi as ca
 
 from elastocal.cell import Cell
+from elastocal.cell.work_cell import read_cell
 from elastocal.errors import InputError
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.effects import CATALOGUE
 from elastocal.manipulator.effects.base import Effect
 from elastocal.text import did_you_mean, listed
+
+
+def cell_of(cell: Cell | str | Path) -> Cell:
+    """The cell itself, or that of a cell file; InputError where the file is wrong."""
+    if isinstance(cell, Cell):
+        return cell
+    return read_cell(cell, known_effects=tuple(CATALOGUE))
 
 
 def load_chain(cell: Cell) -> Chain:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.manipulator.arm import Arm
 from elastocal.measurements import Measurements
 
@@ -75,3 +75,20 @@ def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
             "row"
         )
     return _one_hot(nearest, len(levels))
+
+
+def given_force(load: ArrayLike | None) -> NDArray[np.float64] | None:
+    """The option `load` as a force (3,) in N, None where it is not given.
+
+    Raises InputError unless it is three finite numbers.
+    """
+    if load is None:
+        return None
+    try:
+        force = np.asarray(load, dtype=float)
+    except (TypeError, ValueError):
+        force = np.zeros(0)
+    if force.shape != (3,) or not np.isfinite(force).all():
+        found = " ".join(f"{v:g}" for v in force) if force.ndim == 1 and len(force) else load
+        raise InputError(f"{option('load')} takes three finite numbers in N; found {found}")
+    return force

@@ -5,20 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from elastocal.cell import Cell, EffectChoice
-from elastocal.errors import ElastocalError
+from elastocal.errors import ElastocalError, require
 from elastocal.manipulator.backend import summary
 from elastocal.manipulator.chain import Array, Chain
-from elastocal.manipulator.choice import load_chain
+from elastocal.manipulator.choice import cell_of, load_chain
 from elastocal.manipulator.effects.base import Effect
 from elastocal.manipulator.inputs import row_inputs
 from elastocal.manipulator.observation import Observations, observe
+from elastocal.manipulator.parameter import Parameter
 from elastocal.manipulator.symbolic import SymbolicArm
-from elastocal.measurements import Measurements
+from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
+from elastocal.text import listed
 
 
 @dataclass(frozen=True)
@@ -40,41 +43,194 @@ class Regression:
 
 
 class Model:
-    """p_i = h(q_i, f_i, …; X) for a chain with effects; CasADi differentiates it exactly.
+    """p_i = h(q_i, f_i, …; X) for an arm with effects; CasADi differentiates it exactly.
 
-    `parameters` are those of all active effects, in order; `nominal` their nominal values.
-    `extra` effects with their places act besides those that the cell chooses.  `backend` is
-    "auto", "numpy" or "compiled"; None follows `set_default_backend` and ELASTOCAL_BACKEND.
+    Attributes:
+        cell: The `Cell` that it models.
+        chain: The nominal kinematic chain of the robot.
+        parameters: `Parameter`s of all active effects, in the order of every vector x and of the
+            columns of B.
+        names: Their names.
+        nominal: Their nominal values x (parameters,), in SI units.
+        observe: What a reading is: "position", "deflection", "pose" or "distance".
+
+    Args:
+        cell: A cell file (TOML), or a `Cell` built in Python.
+        markers: The markers' names where the cell lists none; default one, "M1".  Every verb
+            takes them from the table where neither says them.
+        backend: What evaluates it: "auto", "numpy" or "compiled"; None follows
+            `set_default_backend` and the environment variable ELASTOCAL_BACKEND.
+
+    Raises:
+        InputError: The cell, or a file that it names, is wrong; the message says where.
+
+    Examples:
+        >>> model = ec.Model("cell.toml")
+        >>> model
+        <Model ...: kuka_kr270_2, 6 joints, 10 parameters of joint_compliance; observes deflection>
+        >>> model.names[:2]
+        ('joint1.compliance', 'joint2.compliance_level1')
+        >>> plan = model.read_plan("plan.csv")
+        >>> model.pose(plan.q[0])[:3, 3].round(3)
+        array([...])
+        >>> model.B(model.read("data.csv")).shape
+        (810, 10)
     """
 
     def __init__(
         self,
+        cell: Cell | str | Path,
+        markers: Sequence[str] = (),
+        backend: str | None = None,
+    ) -> None:
+        cell = cell_of(cell)
+        self._markers_stated = bool(cell.tool.markers)
+        if not self._markers_stated:
+            cell = _with_markers(cell, tuple(markers) or (DEFAULT_MARKER,))
+        self._assemble(load_chain(cell), cell, (), backend)
+
+    @classmethod
+    def assembled(
+        cls,
         chain: Chain,
         cell: Cell,
         extra: Sequence[tuple[Effect, str]] = (),
         backend: str | None = None,
+    ) -> Model:
+        """The model of a chain that is there already; `cell` says all else.
+
+        `extra` effects with their places act besides those that the cell chooses.
+        """
+        model = cls.__new__(cls)
+        model._markers_stated = True
+        model._assemble(chain, cell, extra, backend)
+        return model
+
+    def _assemble(
+        self, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]], backend: str | None
     ) -> None:
         self.chain, self.cell = chain, cell
         self.observe = cell.model.observe
         self._symbolic = SymbolicArm(chain, cell, extra, backend)
-        self.parameters = self._symbolic.parameters
+        self.parameters: tuple[Parameter, ...] = self._symbolic.parameters
 
-    @classmethod
-    def from_cell(cls, cell: Cell, marker_names: tuple[str, ...] = ()) -> Model:
-        """Load the cell's robot and switch its effects on.
+    def __repr__(self) -> str:
+        effects = listed(dict.fromkeys(p.effect for p in self.parameters), 6) or "no effect"
+        return (
+            f"<Model {self.cell.name}: {self.chain.name}, {self.chain.n_joints} joints, "
+            f"{len(self.parameters)} parameters of {effects}; observes {self.observe}>"
+        )
 
-        `marker_names` are the table's markers where the cell lists none.
+    def read(self, path: str | Path) -> Measurements:
+        """The measurements of a CSV or Parquet file, in SI units.
+
+        Args:
+            path: The table; its columns are those that the model observes, units stand in the
+                header.
+
+        Raises:
+            InputError: The table is wrong; the message names file, line, column and the text.
+
+        Examples:
+            >>> data = ec.Model("cell.toml").read("data.csv")
+            >>> len(data), data.q.shape, data.marker_names
+            (540, (540, 6), ('M1', 'M2', 'M3'))
         """
-        if not cell.tool.markers:
-            names = marker_names or ("M1",)
-            tool = replace(cell.tool, markers={name: np.zeros(3) for name in names})
-            cell = replace(cell, tool=tool)
-        return cls(load_chain(cell), cell)
+        markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
+        return read_measurements(
+            path, joint_kinds=self.chain.kinds, marker_names=markers, observe=self.observe
+        )
+
+    def read_plan(self, path: str | Path) -> Measurements:
+        """The poses of a plan (CSV): configuration, q1_deg …, and forces where it states them.
+
+        Raises:
+            InputError: As `read` does.
+
+        Examples:
+            >>> len(ec.Model("cell.toml").read_plan("plan.csv"))
+            15
+        """
+        return read_plan(path, joint_kinds=self.chain.kinds)
+
+    def table(
+        self, q: ArrayLike, force: ArrayLike | None = None, position: ArrayLike | None = None
+    ) -> Measurements:
+        """A table of readings that no file states, one configuration per row, of one marker.
+
+        Args:
+            q: Commanded joints (n, joints) or (joints,), in rad or m.
+            force: Forces (n, 3) or (3,) in N at the load point, in the data's frame; default none.
+            position: Measured positions (n, 3) in m in the data's frame, where there are any.
+
+        Raises:
+            InputError: A shape does not fit.
+
+        Examples:
+            >>> model = ec.Model("cell.toml")
+            >>> table = model.table([0.1, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600])
+            >>> model.deflection(table).shape
+            (1, 6)
+        """
+        joints = np.atleast_2d(np.asarray(q, dtype=float))
+        n = len(joints)
+        require(
+            joints.shape == (n, self.chain.n_joints),
+            f"q takes {self.chain.n_joints} joints per row; found an array of shape {np.shape(q)}",
+        )
+        return Measurements(
+            source="table",
+            row=np.arange(1, n + 1),
+            q=joints,
+            configuration=np.arange(n),
+            configuration_labels=tuple(map(str, range(1, n + 1))),
+            repeat=np.zeros(n, dtype=np.int64),
+            marker=np.zeros(n, dtype=np.int64),
+            marker_names=tuple(self.cell.tool.markers)[:1] or (DEFAULT_MARKER,),
+            force=np.zeros((n, 3)) if force is None else _rows_of_three("force", force, n),
+            position=None if position is None else _rows_of_three("position", position, n),
+        )
+
+    def pose(
+        self, q: ArrayLike, x: ArrayLike | None = None, force: ArrayLike | None = None
+    ) -> NDArray:
+        """The flange's pose in the data's frame, T_tracker_flange, deflections included.
+
+        Args:
+            q: Commanded joints (joints,) or (n, joints), in rad or m.
+            x: Parameter values (parameters,) in SI units; default the nominal ones.
+            force: As for `table`.
+
+        Returns:
+            (4, 4), or (n, 4, 4) where q has rows; NaN where there is no static equilibrium.
+
+        Raises:
+            InputError: A shape does not fit, or an active effect needs more than joints and
+                force (a time, a temperature): then `flange_poses` takes a table.
+
+        Examples:
+            >>> ec.Model("cell.toml").pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0]).shape
+            (4, 4)
+        """
+        poses = self.flange_poses(self.table(q, force), None if x is None else np.asarray(x))
+        return poses[0] if np.ndim(q) == 1 else poses
+
+    def with_markers_of(self, *tables: Measurements) -> Model:
+        """This model with the markers of the tables, where the cell lists none."""
+        names = tuple(dict.fromkeys(name for t in tables for name in t.marker_names))
+        if self._markers_stated or not names or names == tuple(self.cell.tool.markers):
+            return self
+        cell = _with_markers(self.cell, names)
+        model = Model.assembled(self.chain, cell, backend=self._symbolic.backend)
+        model._markers_stated = False
+        return model
 
     def with_effects(self, effects: tuple[EffectChoice, ...]) -> Model:
         """The same arm with another choice of effects."""
         spec = replace(self.cell.model, effects=effects)
-        return Model(self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend)
+        return Model.assembled(
+            self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend
+        )
 
     @cached_property
     def rigid(self) -> Model:
@@ -82,7 +238,9 @@ class Model:
         spec = self.cell.model
         nominal = replace(spec.nominal, base_position=None, base_rotation=None)
         spec = replace(spec, effects=(), observe="position", nominal=nominal, link_gravity=False)
-        return Model(self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend)
+        return Model.assembled(
+            self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -123,7 +281,22 @@ class Model:
         )
 
     def deflection(self, table: Measurements, x: Array | None = None) -> NDArray:
-        """Elastic deflections θ (n_rows, springs) at equilibrium; NaN where none is found."""
+        """Elastic deflections θ at static equilibrium.
+
+        Args:
+            table: Readings, or a plan: what a table says of joints and loads.
+            x: Parameter values (parameters,) in SI units; default the nominal ones.
+
+        Returns:
+            (n_rows, springs) in rad or m, one column per spring of the active effects; NaN where
+            no equilibrium is found.
+
+        Examples:
+            >>> model = ec.Model("cell.toml")
+            >>> loaded = model.table([0.1, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600])
+            >>> bool(abs(model.deflection(loaded)).max() < 0.01)
+            True
+        """
         x = self.nominal if x is None else np.asarray(x)
         return self._settle(row_inputs(self._symbolic.arm, table), x)
 
@@ -153,14 +326,47 @@ class Model:
         x: Array | None = None,
         observations: Observations | None = None,
     ) -> NDArray:
-        """Predicted observations (rows,) at parameter values x (default nominal).
+        """Predicted observations.
 
-        `observations` spares pairing the table anew.  Rows without an equilibrium are NaN.
+        Args:
+            table: Readings, or rows of `simulate`: what was commanded and how it was loaded.
+            x: Parameter values (parameters,) in SI units; default the nominal ones.
+            observations: What `observe` made of the table, which spares pairing it anew.
+
+        Returns:
+            (rows,), observations × components in m (rad), in the table's order; NaN where there
+            is no static equilibrium.
+
+        Examples:
+            >>> model = ec.Model("cell.toml")
+            >>> model.predict(model.read("data.csv")).shape
+            (810,)
         """
         x = self.nominal if x is None else np.asarray(x)
         inputs = row_inputs(self._symbolic.arm, table)
         h = self._symbolic.tape("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
         return (observations or observe(table, self.observe)).apply(h).ravel()
+
+    def B(self, table: Measurements, x: Array | None = None) -> NDArray:
+        """The regressor B = ∂prediction/∂X (eq. 4 of Klimchik et al. 2013) of a whole table.
+
+        Args:
+            table: Readings.
+            x: Parameter values (parameters,) at which to differentiate; default the nominal ones.
+
+        Returns:
+            (rows, parameters), in m (rad) per unit of each parameter.
+
+        Raises:
+            InputError: The table lacks a column that the model needs.
+            ElastocalError: A pose has no static equilibrium under its load.
+
+        Examples:
+            >>> model = ec.Model("cell.toml")
+            >>> model.B(model.read("data.csv")).shape
+            (810, 10)
+        """
+        return self.regressor(table, x).B
 
     def regressor(
         self,
@@ -202,3 +408,19 @@ class Model:
         x = self.nominal if x is None else np.asarray(x)
         inputs = row_inputs(self._symbolic.arm, table)
         return self._symbolic.tape("frames")(*inputs, x, self._settle(inputs, x))
+
+
+def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
+    """The cell with these markers, all nominally at the flange's origin."""
+    return replace(cell, tool=replace(cell.tool, markers={name: np.zeros(3) for name in names}))
+
+
+def _rows_of_three(what: str, values: ArrayLike, n: int) -> Array:
+    """(n, 3) from one row or n of them."""
+    found = np.asarray(values, dtype=float)
+    require(
+        found.shape in ((3,), (n, 3)),
+        f"{what} takes three numbers, or three for each of {n} rows; found an array of shape "
+        f"{found.shape}",
+    )
+    return np.broadcast_to(found, (n, 3)).copy()

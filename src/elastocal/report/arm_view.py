@@ -22,8 +22,9 @@ from elastocal.errors import ElastocalError
 from elastocal.manipulator.chain import Chain
 from elastocal.manipulator.model import Model
 from elastocal.manipulator.observation import Observations
-from elastocal.report.figures import ARM, FAINT, INK, SERIES, drawn
+from elastocal.report.figures import ARM, FAINT, SERIES, drawn
 from elastocal.report.formatting import length, printable, short_name
+from elastocal.report.plan_picture import INK
 from elastocal.report.plan_view import first_stops, joint_text
 
 if TYPE_CHECKING:

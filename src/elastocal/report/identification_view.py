@@ -103,7 +103,7 @@ def combination_truth(result: Calibration, combination: Combination, truth: Trut
     (first, _), *rest = combination.terms.items()
     if any(name not in truth for name in combination.terms):
         return None
-    shift = sum(f * (truth[name] - result.estimate(name).held) for name, f in rest)
+    shift = sum(f * (truth[name] - result[name].held) for name, f in rest)
     return truth[first] + shift
 
 

@@ -1,4 +1,4 @@
-"""What results show in a notebook: HTML, figures and data frames (found by elastocal.notebook)."""
+"""What results show in a notebook: HTML, figures and data frames (found by elastocal.above)."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.manipulator.effects.compliances import JointCompliance
 from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
@@ -64,7 +64,8 @@ def expand_plan(
     if load is not None:
         if np.any(plan.force != 0):
             raise InputError(
-                f"{plan.source}: the plan has forces of its own; leave --load away or drop them"
+                f"{plan.source}: the plan has forces of its own; leave {option('load')} away "
+                "or drop them"
             )
         forces = [plan.force, plan.force + load]
     parts = [

@@ -50,7 +50,7 @@ def test_the_flange_is_where_the_model_puts_it(seed, tmp_path):
     chain, given_cell = random_chain(seed, tmp_path), placed_cell(seed)
     q = np.random.default_rng(seed).uniform(-2, 2, (20, chain.n_joints))
     found = Kinematics(given_cell, chain).poses(q, DOWN).flange
-    expected = Model(chain, given_cell).flange_poses(table(q))
+    expected = Model.assembled(chain, given_cell).flange_poses(table(q))
     assert np.allclose(found, expected, atol=1e-12)
 
 

@@ -49,10 +49,10 @@ def base() -> Baseline:
     spec = replace(
         cell.model, effects=(*cell.model.effects, *choices(["gear_eccentricity:joint3"]))
     )
-    truth = Model(chain, replace(cell, model=spec))
+    truth = Model.assembled(chain, replace(cell, model=spec))
     sizes = {"joint3.eccentricity_sin": 2e-4, "joint3.eccentricity_cos": -1e-4}
     read = simulate(truth, table, values_from(truth, sizes), 3)
-    return fit_baseline(Model(chain, cell), read)
+    return fit_baseline(Model.assembled(chain, cell), read)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Ar
         model.cell.model.nominal, settings={"joint2": {"time_constant_s": TIME_CONSTANT}}
     )
     spec = replace(model.cell.model, effects=effects, nominal=nominal)
-    whole = Model(model.chain, replace(model.cell, model=spec))
+    whole = Model.assembled(model.chain, replace(model.cell, model=spec))
     fitted = dict(zip(model.names, base.x, strict=True))
     x = np.array([fitted.get(p.name, 0.0) for p in whole.parameters])
     B = whole.regressor(table, x).B

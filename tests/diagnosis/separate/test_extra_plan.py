@@ -57,7 +57,7 @@ def test_one_pose_fewer_would_not_do(narrow, few) -> None:
     less = plan_extra(*narrow, diagnosis_of({ECCENTRIC: 0.5, SCALE: 0.5}), most=few.n_poses - 1)
     assert less.n_poses == few.n_poses - 1
     assert less.probability_after < 0.97
-    assert any("--poses" in text for text in less.advice)
+    assert any("`poses`" in text for text in less.advice)
 
 
 def test_the_plan_repeats_the_load_states_after_the_campaign(narrow, few) -> None:
@@ -76,11 +76,11 @@ def test_the_plan_repeats_the_load_states_after_the_campaign(narrow, few) -> Non
 
 
 def test_the_written_plan_can_be_measured(narrow, few, tmp_path) -> None:
-    from elastocal.cli.diagnosis_files import write_extra_poses
+    from elastocal.saving import save_extra_poses
 
     model, _ = narrow
     path = tmp_path / "extra.csv"
-    write_extra_poses(path, few.plan, model.chain.kinds)
+    save_extra_poses(path, few.plan, model.chain.kinds)
     read = read_plan(path, joint_kinds=model.chain.kinds)
     rows = expand_plan(read, tuple(model.cell.tool.markers))
     assert np.isfinite(simulate(model, rows, model.nominal, 0).position).all()
@@ -230,7 +230,7 @@ def test_a_cell_without_room_says_which_rule_is_in_the_way(narrow) -> None:
     model, table = narrow
     weak = replace(model.cell, workspace=Workspace(torque_limits=(1e-3,) * 6))
     pair = diagnosis_of({ECCENTRIC: 0.7, SCALE: 0.3})
-    extra = plan_extra(Model(model.chain, weak), table, pair)
+    extra = plan_extra(Model.assembled(model.chain, weak), table, pair)
     assert not extra.separable and extra.plan is None
     assert extra.probability_after == pytest.approx(0.7)
     assert "torque" in extra.advice[0]

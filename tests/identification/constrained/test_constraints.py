@@ -127,7 +127,7 @@ def system_matrix():
 
 
 def test_physics_of_an_arm_is_non_negative_compliances():
-    model = Model.from_cell(
+    model = Model(
         kr270_cell(("joint_offset", "joint_compliance", "off_axis_compliance", "base_compliance"))
     )
     demanded = physical_constraints(model)

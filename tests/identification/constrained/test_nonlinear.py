@@ -32,7 +32,7 @@ BEARING_X, BEARING_Y = "joint2.off_axis_compliance_x", "joint2.off_axis_complian
 
 @lru_cache
 def arm() -> Model:
-    return Model.from_cell(
+    return Model(
         kr270_cell(("joint_compliance", "off_axis_compliance:joint2"), observe="deflection")
     )
 

@@ -164,7 +164,7 @@ FITTED = ("joint2.compliance", "joint3.compliance", "joint2.offset", "joint3.off
 def arm(names=FITTED, sigma=5e-5):
     """A loaded planar arm, the named parameters fitted to noisy readings, the rest at the truth."""
     nominal = Nominal(joint_compliance=(2e-5,) * 3)
-    model = Model(planar_chain(3), cell_of(SPRINGS, nominal=nominal))
+    model = Model.assembled(planar_chain(3), cell_of(SPRINGS, nominal=nominal))
     table = table_at(random_poses(model.chain, 8, 0), [[0, 0, 0], [0, 0, -500.0]])
     rng = np.random.default_rng(1)
     truth = true_values(model, rng, anywhere=False)

@@ -27,7 +27,7 @@ NAMES = ("huber", "tukey", "l1", "student-t")
 
 def arm_problem(seed, share=0.0, sigma=SIGMA, poses=40):
     """Base and marker of an arm, from a start that is 5 mm or mrad off in every parameter."""
-    model = Model(planar_chain(), cell_of(PLACED))
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
     rng = np.random.default_rng(seed)
     truth = true_values(model, rng)
     plan = table_at(random_poses(model.chain, poses, seed))

@@ -48,7 +48,7 @@ def model(
     """The only marker and the load point are at `tip` in the flange frame."""
     point = np.array(tip, dtype=float)
     spec.setdefault("nominal", Nominal(settings=settings or {}))
-    return Model(
+    return Model.assembled(
         chain,
         Cell(
             "stick",

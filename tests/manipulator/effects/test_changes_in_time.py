@@ -58,7 +58,7 @@ def test_a_bumped_tracker_shifts_all_later_readings_rigidly() -> None:
         base_rotation=Rotation.from_rotvec([0.1, 0.2, 1.5]).as_matrix(),
         settings={"tracker": {"jump_time_s": 3000.0}},
     )
-    m = Model(chain, kr270_cell(["base_frame", "frame_jump"], nominal=nominal))
+    m = Model.assembled(chain, kr270_cell(["base_frame", "frame_jump"], nominal=nominal))
     table = random_table(chain, 8, seed=2)
     jump = np.array([1e-3, -2e-3, 3e-3, 4e-3, 5e-3, -6e-3])
     before = m.predict(table).reshape(-1, 3)
@@ -76,7 +76,9 @@ def test_a_bumped_tracker_shifts_all_later_readings_rigidly() -> None:
 def test_a_slipped_marker_moves_alone_and_from_then_on() -> None:
     chain = kr270_chain()
     nominal = Nominal(settings={"marker:M2": {"slip_time_s": 3000.0}})
-    m = Model(chain, kr270_cell(["marker_position", "marker_slip:marker:M2"], nominal=nominal))
+    m = Model.assembled(
+        chain, kr270_cell(["marker_position", "marker_slip:marker:M2"], nominal=nominal)
+    )
     table = random_table(chain, 8, seed=2)
     x = m.nominal
     x[-3:] = 1e-3, 2e-3, -2e-3
@@ -96,8 +98,8 @@ def test_a_link_grows_by_its_strain_once_warm() -> None:
 def test_all_links_grow_alike() -> None:
     chain = kr270_chain()
     table = random_table(chain, 4, seed=3)
-    together = Model(chain, kr270_cell(["thermal_expansion:all"]))
-    each = Model(chain, kr270_cell([f"thermal_expansion:link{i}" for i in (1, 2, 3, 6)]))
+    together = Model.assembled(chain, kr270_cell(["thermal_expansion:all"]))
+    each = Model.assembled(chain, kr270_cell([f"thermal_expansion:link{i}" for i in (1, 2, 3, 6)]))
     assert len(each.parameters) == 4
     grown = together.predict(table, np.array([1e-3]))
     np.testing.assert_allclose(grown, each.predict(table, np.full(4, 1e-3)), atol=1e-14)

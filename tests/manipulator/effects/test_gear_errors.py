@@ -81,13 +81,13 @@ def test_an_order_of_a_place_wins_over_the_list() -> None:
 
 def test_a_coupled_wrist_moves_as_if_commanded_so() -> None:
     chain = kr270_chain()
-    m = Model(chain, kr270_cell(["wrist_coupling"]))
+    m = Model.assembled(chain, kr270_cell(["wrist_coupling"]))
     table = random_table(chain, 6, seed=1)
     a, b, c = 3e-3, -2e-3, 5e-3
     q = table.q.copy()
     q[:, 4] += a * table.q[:, 3]
     q[:, 5] += b * table.q[:, 3] + c * table.q[:, 4]
-    expected = Model(chain, kr270_cell()).predict(replace(table, q=q))
+    expected = Model.assembled(chain, kr270_cell()).predict(replace(table, q=q))
     np.testing.assert_allclose(m.predict(table, np.array([a, b, c])), expected, atol=1e-14)
 
 

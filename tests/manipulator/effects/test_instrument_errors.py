@@ -72,5 +72,5 @@ def test_a_marker_at_the_instrument_or_above_it_has_a_derivative() -> None:
 def test_distances_know_no_tracker() -> None:
     cell = kr270_cell(["tracker_distortion"], "distance")
     with pytest.raises(InputError, match=r'no place on robot .* observe = "distance"'):
-        Model(stick("zyyz", (1.0,) * 4), cell)
+        Model.assembled(stick("zyyz", (1.0,) * 4), cell)
     assert CATALOGUE["tracker_distortion"].places(stick("z"), kr270_cell()) == ("tracker",)

@@ -17,7 +17,9 @@ from elastocal.manipulator.model import Model
 
 
 def model_with(settings: dict[str, dict[str, float]], *effects: str, **spec) -> Model:
-    return Model(kr270_chain(), kr270_cell(effects, nominal=Nominal(settings=settings), **spec))
+    return Model.assembled(
+        kr270_chain(), kr270_cell(effects, nominal=Nominal(settings=settings), **spec)
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,9 +116,11 @@ def test_every_effect_vanishes_at_its_nominal_parameters() -> None:
     settings |= {f"marker:{name}": {"slip_time_s": 3e3} for name in MARKERS}
     nominal = Nominal(COMPLIANCE, settings=settings)
     table = random_table(chain, 4, seed=9)
-    plain = Model(chain, kr270_cell(["joint_compliance"], nominal=nominal, link_gravity=True))
+    plain = Model.assembled(
+        chain, kr270_cell(["joint_compliance"], nominal=nominal, link_gravity=True)
+    )
     names = set(CATALOGUE) - {"joint_compliance"}
-    all_of_it = Model(
+    all_of_it = Model.assembled(
         chain,
         kr270_cell(["joint_compliance", *names], nominal=nominal, link_gravity=True),
     )

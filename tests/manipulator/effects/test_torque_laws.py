@@ -110,7 +110,7 @@ def test_no_pose_and_no_mounting_exceeds_the_weights_torque(seed: int) -> None:
     chain = kr270_chain()
     k = 1e-12  # rigid enough to read the torque of the nominal pose from the deflection
     nominal = Nominal((k,) * 6, base_rotation=Rotation.random(rng=seed).as_matrix())
-    m = Model(chain, kr270_cell(["joint_compliance"], link_gravity=True, nominal=nominal))
+    m = Model.assembled(chain, kr270_cell(["joint_compliance"], link_gravity=True, nominal=nominal))
     table = random_table(chain, 300, seed=seed, force=np.zeros(3), markers=("M1",))
     largest = np.abs(m.deflection(table) / k).max(axis=0)
     bounds = np.array([weight_torque(chain, i) for i in range(6)])

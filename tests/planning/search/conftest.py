@@ -110,6 +110,6 @@ def case() -> Callable[..., Case]:
             workspace=workspace or Workspace(),
             design=DesignSpec(**{"loads": LOAD} | (design or {})),
         )
-        return Case(Model(chain, cell))
+        return Case(Model.assembled(chain, cell))
 
     return build

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from elastocal.diagnosis.separate.rivals import RivalSet
+from elastocal.errors import option
 from elastocal.manipulator.effects import effect_of
 
 
@@ -27,7 +28,7 @@ def too_few_advice(n: int, probability: float, reachable: float) -> str:
     """That the plan stays below what was aimed at."""
     return (
         f"{n} poses reach a probability of {probability:.2f} only; many more would reach "
-        f"{reachable:.2f}: allow more poses (--poses), or repeat each of them"
+        f"{reachable:.2f}: allow more poses ({option('poses')}), or repeat each of them"
     )
 
 

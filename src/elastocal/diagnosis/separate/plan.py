@@ -58,7 +58,7 @@ def plan_extra(
     notes: list[str] = []
     if model.cell.model.torque == "measured":
         spec = replace(model.cell.model, torque="computed")
-        model = Model(model.chain, replace(model.cell, model=spec))
+        model = Model.assembled(model.chain, replace(model.cell, model=spec))
         notes.append("torques of poses not measured yet are computed from load and weights")
     table, _ = thinned(table)
     model = with_recorded_drivers(model, table, diagnosis)

@@ -1,0 +1,115 @@
+"""What a result asks of the layers above it, found by name: the only way up.
+
+How a result looks is known by `elastocal.report`, and how it is written to a file by
+`elastocal.saving`; both lie above the packages whose results they serve, and import them.  A
+result therefore does not import its views and writers; it asks for them by name when they are
+wanted, as one asks for a plug-in.  Import order, start-up time and the layers stay as they are.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+VIEWS = "elastocal.report.notebook"
+PAGES = "elastocal.report.result_pages"
+WRITERS = "elastocal.saving"
+
+
+class Saved:
+    """Gives an object `save`."""
+
+    def save(self, path: str | Path, **how: Any) -> None:
+        """Write it to a file as the command line does, whole or not at all.
+
+        Args:
+            path: The file.  A `Calibration` becomes JSON, or where the name ends in .csv the table
+                of its residuals; a `Plan` a CSV and the JSON beside it; a `Diagnosis` JSON; a
+                `Compensation` the table of commands (CSV); a `CalibratedArm` what the ending
+                says: .urdf, .xml or .mjcf (MuJoCo), .csv (DH table), .yaml, .json.
+            **how: For an arm: `format` (as "mdh"), `load` (3,) N, `time_s`, `temperature_c`,
+                `frames`, `base_frame`, `poses` and `seed`, as `elastocal export` has them.
+
+        Raises:
+            InputError: The file cannot be written, or not in this format.
+
+        Examples:
+            >>> arm = ec.identify("cell.toml", "data.csv").arm
+            >>> arm.save("calibrated.urdf")
+            >>> arm.save("modified_dh.csv", format="mdh")
+        """
+        import_module(WRITERS).save(self, path, **how)
+
+
+class Result(Saved):
+    """What every result of a verb offers: `report`, `plot`, `to_dataframe`, `save`, HTML."""
+
+    def __str__(self) -> str:
+        """The result as the command line prints it: tables and sentences."""
+        return str(_view(self).text(self))
+
+    def _repr_html_(self) -> str:
+        """The result as HTML, which notebooks show of themselves; text of the user is escaped."""
+        return str(_view(self).html(self))
+
+    def report(
+        self, path: str | Path, *, inputs: Any = None, command: str | None = None,
+        seed: int | None = None,
+    ) -> None:  # fmt: skip
+        """Write the result's report: one HTML page that needs no network.
+
+        Args:
+            path: The page.
+            inputs: Files that the result came from, which the page names with their SHA-256;
+                default the cell and the tables, as far as they are files.
+            command: The command line that repeats the run, where there is one.
+            seed: The seed of the run, to be named.
+
+        Raises:
+            InputError: An input cannot be read, or the page not written.
+
+        Examples:
+            >>> fit = ec.identify("cell.toml", "data.csv")
+            >>> commands = ec.compensate(fit, [1.8, 0.0, 0.9], load=[0, 0, -2600])
+            >>> commands.report("commands.html", inputs=["cell.toml", "data.csv"])
+        """
+        import_module(PAGES).write_page(self, Path(path), inputs, command, seed)
+
+    def plot(self, kind: str | None = None, interactive: bool = False) -> Any:
+        """A figure of the result.
+
+        Args:
+            kind: Which of the result's figures; default the first.  A `Calibration` has
+                "residuals" and "parameters", a `Plan` "poses" and "intervals", a `Diagnosis`
+                "budget" and "candidates", a `Compensation` "errors" and "uncertainty".
+            interactive: A figure to zoom and hover.
+
+        Returns:
+            matplotlib's Figure, or plotly's where `interactive`.
+
+        Raises:
+            InputError: There is no such figure; the message names those that there are.
+
+        Examples:
+            >>> figure = ec.identify("cell.toml", "data.csv").plot("parameters")
+            >>> figure.savefig("parameters.png")
+        """
+        return _view(self).plot(self, kind, interactive)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """The result's main table as a pandas data frame; units stand in the column names.
+
+        Examples:
+            >>> frame = ec.identify("cell.toml", "data.csv").to_dataframe()
+            >>> list(frame.columns[:4])
+            ['parameter', 'unit', 'value', 'std']
+        """
+        return _view(self).frame(self)
+
+
+def _view(result: object) -> Any:
+    return import_module(VIEWS).view_of(result)

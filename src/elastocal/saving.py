@@ -1,0 +1,190 @@
+"""Every result as a file, in the form that its verb of the command line writes.
+
+`Result.save` and `CalibratedArm.save` find `save` by name (elastocal.above); the command line
+calls the function of the kind.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from elastocal.errors import InputError, option, require
+from elastocal.files import atomic_write_text
+from elastocal.manipulator.inputs import given_force
+from elastocal.text import json_text
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from elastocal.compensation.compensate import Compensation
+    from elastocal.design.plan import Plan
+    from elastocal.diagnosis.result import Diagnosis
+    from elastocal.export.export import Wish
+    from elastocal.identification.result import Calibration
+    from elastocal.manipulator.calibrated import CalibratedArm
+    from elastocal.measurements import Measurements
+
+# One verb's result should not load another verb: each function imports what it needs.
+
+
+def save(result: Any, path: str | Path, **how: Any) -> None:
+    """Write a result or a calibrated arm; the class decides what, `how` are its options."""
+    WRITERS[type(result).__name__](result, Path(path), **how)
+
+
+def save_calibration(fit: Calibration, path: Path) -> None:
+    """The result as JSON (schema elastocal/identification/1), or its residuals as CSV."""
+    if path.suffix.lower() == ".csv":
+        return save_residuals(fit, path)
+    atomic_write_text(path, json_text(fit.to_json()) + "\n")
+
+
+def save_residuals(fit: Calibration, path: Path) -> None:
+    """One row per observation: its residual and its held-out residual (CSV)."""
+    rows = fit.residual_table()
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    atomic_write_text(path, text.getvalue())
+
+
+def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
+    """plan.csv, which people measure by, and plan.json (schema elastocal/plan/1) beside it.
+
+    `command` is the command line that repeats the design.  Raises InputError for a path that ends
+    in .json, since that of the summary is made of it.
+    """
+    from elastocal.design.plan_file import plan_rows, write_plan, write_plan_json
+
+    require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
+    rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
+    write_plan(path, rows, plan.model.chain.kinds)
+    repeat = {"command": command, "backend": plan.model.backend_report()}
+    write_plan_json(path.with_suffix(".json"), plan.to_json() | repeat)
+
+
+def save_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
+    """The diagnosis as JSON (schema elastocal/diagnosis/1)."""
+    from elastocal.diagnosis.published import publish
+
+    assert diagnosis.model is not None  # `diagnose` states it
+    content = publish(diagnosis, diagnosis.model, diagnosis.data)
+    atomic_write_text(path, json_text(content) + "\n")
+
+
+def save_compensation(found: Compensation, path: Path, partial: bool = False) -> None:
+    """The table of commands (CSV).
+
+    Raises InsufficientDataError where targets are not reached, unless `partial`: their rows are
+    then left empty.
+    """
+    from elastocal.compensation.commands_file import check_reached, commands_csv
+
+    if not partial:
+        check_reached(found)
+    atomic_write_text(path, commands_csv(found, found.chain.kinds))
+
+
+def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
+    """The calibrated arm for other programs; `how` as for `wish_of`.
+
+    Raises InputError where the format cannot be written for this robot, InsufficientDataError
+    where no random pose has a static equilibrium under the load, and ElastocalError where the
+    text, read back, is another arm than the model.
+    """
+    from elastocal.export.export import export
+
+    atomic_write_text(path, export(arm, wish_of(path, **how)).text)
+
+
+def wish_of(
+    path: Path,
+    format: str | None = None,
+    load: ArrayLike | None = None,
+    frames: bool = True,
+    base_frame: bool = False,
+    temperature_c: float | None = None,
+    time_s: float | None = None,
+    poses: int = 500,
+    seed: int = 0,
+) -> Wish:
+    """How to export an arm, checked.
+
+    Args:
+        path: The file to write.
+        format: urdf, mjcf, dh, mdh (modified DH), yaml or json; None goes by the file's ending.
+        load: Force (3,) in N at the load point (data's axes) to state costs under; default none.
+        frames: URDF: links for markers and load point.
+        base_frame: URDF: the data's frame above the robot's base.
+        temperature_c: Temperature in °C to write the arm at, where it depends on it.
+        time_s: Time in s to write the arm at, where it depends on it.
+        poses: Random poses to find costs at, drawn with `seed`.
+        seed: Of these poses.
+
+    Raises:
+        InputError: An option is wrong; the message names it.
+    """
+    from elastocal.export.export import Wish
+    from elastocal.export.formats import format_of
+    from elastocal.export.kept import Conditions
+    from elastocal.export.urdf import Frames
+
+    chosen = format_of(path, format)
+    for name, value in (("temperature_c", temperature_c), ("time_s", time_s)):
+        if value is not None and not np.isfinite(value):
+            raise InputError(f"{option(name)} takes a finite number; found {value}")
+    force = given_force(load)
+    return Wish(
+        format=chosen,
+        frames=Frames(tool=frames, base=base_frame),
+        conditions=Conditions(np.zeros(3) if force is None else force, time_s, temperature_c),
+        poses=poses,
+        seed=seed,
+    )
+
+
+def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str]) -> None:
+    """Write visits (rows of `plan`, in the order of measuring) as plan.csv, which `simulate` reads.
+
+    Angles in degrees, travel in mm, force, approach direction and time where the plan has them.  A
+    pose that is visited again under the same force is a configuration of its own: 4, 4/2, ….
+    Raises InputError where the place cannot be written.
+    """
+    from elastocal.design.plan_file import PlanRows, write_plan
+
+    names = []
+    visits: Counter[tuple[int, bytes]] = Counter()
+    for code, force in zip(plan.configuration, plan.force + 0.0, strict=True):
+        visits[key := (int(code), force.tobytes())] += 1
+        again = f"/{visits[key]}" if visits[key] > 1 else ""
+        names.append(plan.configuration_labels[code] + again)
+    approach = None if plan.approach is None else plan.approach.astype(np.int64)
+    # `simulate` takes the time of a plan's row as that of its readings.
+    time = {} if plan.time is None else {"time_s": [repr(float(t)) for t in plan.time]}
+    rows = PlanRows(
+        configuration=tuple(names),
+        q=plan.q,
+        level=np.ones(len(plan), dtype=np.int64),
+        order=np.arange(1, len(plan) + 1),
+        force=plan.force,
+        approach=approach,
+        notes=time,
+    )
+    write_plan(path, rows, kinds)
+
+
+WRITERS: dict[str, Callable[..., Any]] = {
+    "Calibration": save_calibration,
+    "Plan": save_plan,
+    "Diagnosis": save_diagnosis,
+    "Compensation": save_compensation,
+    "CalibratedArm": save_arm,
+}

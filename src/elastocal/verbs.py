@@ -1,0 +1,734 @@
+"""The verbs of the front door: design, simulate, identify, diagnose, compensate.
+
+Each takes the model first (or a cell, or the path of one) and its options as keyword arguments;
+it checks them, makes the option objects that the packages below work with, and calls them.  What
+the command line shares with Python in making sense of options stands here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from elastocal.cell import Cell, Motion, TargetBox, TargetPath, TargetPose
+from elastocal.errors import InputError, option, require
+from elastocal.manipulator.calibrated import CalibratedArm
+from elastocal.manipulator.choice import cell_of
+from elastocal.manipulator.inputs import given_force
+from elastocal.manipulator.model import Model
+from elastocal.measurements import Measurements
+from elastocal.text import did_you_mean, listed, quoted
+
+if TYPE_CHECKING:
+    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation.point import ToolPoint
+    from elastocal.compensation.targets import Targets
+    from elastocal.design.options import DesignOptions, Effort
+    from elastocal.design.plan import Plan
+    from elastocal.diagnosis.result import Diagnosis
+    from elastocal.identification.constrained.constraints import Constraints
+    from elastocal.identification.constrained.prior import GaussianPrior
+    from elastocal.identification.intervals import IntervalKind
+    from elastocal.identification.knowledge import Knowledge
+    from elastocal.identification.noise import WeightKind
+    from elastocal.identification.options import FaultyReadings, Method
+    from elastocal.identification.result import Calibration
+
+# One verb should not load another: each imports the package that it calls.
+
+AnyModel: TypeAlias = Model | Cell | str | Path
+Table: TypeAlias = Measurements | str | Path
+Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
+Progress: TypeAlias = Callable[[str], None]
+T = TypeVar("T")
+
+OPEN = ("ambiguous", "unknown_effect")  # verdicts whose rivals more poses may tell apart
+
+
+def design(
+    model: AnyModel,
+    *,
+    poses: int | None = None,
+    criterion: str | None = None,
+    target: float | None = None,
+    curve: Sequence[int] = (),
+    fixed: str | Sequence[str] = (),
+    augment: Table | None = None,
+    knowledge: Knowledge | str | Path | None = None,
+    prior: Literal["none", "typical"] | Prior | None = None,
+    effort: Effort = "normal",
+    candidates: int | None = None,
+    repeats: int | None = None,
+    loads: ArrayLike | None = None,
+    load_choice: bool | None = None,
+    repeatability: float | None = None,
+    marker_sigma: Mapping[str, float] | None = None,
+    levels: Mapping[str, Sequence[float]] | None = None,
+    per_level: Sequence[int] | None = None,
+    interest: str | Sequence[str] | None = None,
+    combination: Mapping[str, float] | None = None,
+    robust: Literal["none", "average", "worst"] | None = None,
+    robust_samples: int | None = None,
+    test_poses: ArrayLike | Sequence[TargetPose] | None = None,
+    test_path: str | Path | TargetPath | None = None,
+    test_box: tuple[ArrayLike, ArrayLike] | TargetBox | None = None,
+    motion: Motion | None = None,
+    seed: int = 0,
+    jobs: int = 1,
+    progress: Progress | None = None,
+) -> Plan:
+    """Which poses should I measure?
+
+    Candidates that the cell allows; their information by the symbolic model's B; a convex
+    relaxation, which bounds every plan; exchange and polish; the order of execution.  What is
+    None is as the cell's [design] says, or its default.
+
+    Args:
+        model: The model, or a cell, or the path of a cell file.
+        poses: Number of poses.
+        criterion: What is to become small: "test_pose" (error at the test poses), "D", "A", "E",
+            "G", "I", "c", "O1" to "O5".
+        target: Find the smallest number of poses that reaches this error, in m; goes with the
+            criteria test_pose, I and G, and instead of `poses`.
+        curve: Numbers of poses to compare.
+        fixed: Parameters, places or effects held as known.
+        augment: Measurements already done, or their file, which the plan adds to.
+        knowledge: `Knowledge`, or a knowledge file (TOML); its priors count for a plan.
+        prior: "typical" takes every parameter's typical size as its prior, "none" none; or what
+            is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
+        effort: How hard to search: "quick", "normal" or "thorough".
+        candidates: Feasible candidates to choose from, over all levels.
+        repeats: Readings per pose and load state.
+        loads: Forces (L, 3) in N at the load point, in the data's frame.
+        load_choice: Choose one load for each pose, instead of measuring all of them there.
+        repeatability: Standard deviation in m, per direction, of what a configuration's readings
+            have in common.
+        marker_sigma: Standard deviation in m per marker, instead of the tracker's noise.
+        levels: One joint with the values (rad or m) that it is to be measured at.
+        per_level: Number of poses of each level.
+        interest: Parameters, places or effects that D, A, E and O count.
+        combination: Factor by parameter, for the criterion c.
+        robust: Average over, or worst of, `robust_samples` draws of the parameters.
+        robust_samples: Their number.
+        test_poses: Joints (k, joints) in rad or m where the position must be right.
+        test_path: A table (CSV) of such places.
+        test_box: Lower and upper corner (3,) in m of a box of such places, in the data's frame.
+        motion: How the arm moves between poses, which decides their order.
+        seed: Of all random draws.
+        jobs: Processes; −1 for all cores.
+        progress: Is told what is done.
+
+    Returns:
+        The `Plan`: poses in their order, what they promise, how far from the best they are.
+
+    Raises:
+        InputError: Cell and options contradict themselves or each other; the message names the
+            keyword or the cell's key.
+        InsufficientDataError: No pose is feasible, or none shows a parameter that counts.
+
+    Examples:
+        >>> plan = ec.design(
+        ...     "cell.toml", poses=6, criterion="D", candidates=100, effort="quick",
+        ...     loads=[[0, 0, -2600]], levels={"joint2": np.radians([-25.24, -99.85])},
+        ... )
+        >>> plan
+        <Plan kuka_kr270_2: 6 poses by D, ...>
+        >>> plan.save("six.csv")
+    """
+    from elastocal.design.design import design as run
+
+    cell, options = design_request(
+        model, poses=poses, criterion=criterion, target=target, curve=curve, fixed=fixed,
+        augment=augment, knowledge=knowledge, prior=prior, effort=effort, candidates=candidates,
+        repeats=repeats, loads=loads, load_choice=load_choice, repeatability=repeatability,
+        marker_sigma=marker_sigma, levels=levels, per_level=per_level, interest=interest,
+        combination=combination, robust=robust, robust_samples=robust_samples,
+        test_poses=test_poses, test_path=test_path, test_box=test_box, motion=motion, seed=seed,
+        jobs=jobs,
+    )  # fmt: skip
+    return run(cell, options, progress=progress or _silent)
+
+
+def design_request(
+    model: AnyModel,
+    *,
+    curve: Sequence[int] = (),
+    fixed: str | Sequence[str] = (),
+    augment: Table | None = None,
+    knowledge: Knowledge | str | Path | None = None,
+    prior: Literal["none", "typical"] | Prior | None = None,
+    effort: str = "normal",
+    seed: int = 0,
+    jobs: int = 1,
+    **asked: Any,
+) -> tuple[Cell, DesignOptions]:
+    """The cell with [design] as `asked`, and how to search; options as for `design`.
+
+    Raises InputError that names the keyword.
+    """
+    from elastocal.design.options import DesignOptions
+
+    cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
+    if isinstance(prior, str):
+        asked["prior"], prior = prior, None
+    cell = replace(cell, design=_design_of(cell, asked))
+    known = Model(cell) if augment is not None or knowledge is not None else None
+    done = None
+    if augment is not None and known is not None:
+        own = model if isinstance(model, Model) else known
+        done = _table("augment", own, augment)
+        known = own.with_markers_of(done)
+        cell = cell if own is known else replace(cell, tool=known.cell.tool)
+    stated, notes = (None, ()) if known is None else _prior_of(knowledge, known)
+    require(
+        stated is None or prior is None,
+        f"{option('prior')} and {option('knowledge')} both state what is known; drop one",
+    )
+    options = DesignOptions(
+        effort=effort,  # type: ignore[arg-type]
+        seed=_whole("seed", seed, 0),
+        jobs=jobs,
+        fixed=_names("fixed", fixed),
+        prior=_gaussian(prior) if stated is None else stated,
+        done=done,
+        curve=tuple(sorted({_whole("curve", n) for n in curve})),
+        notes=notes,
+    )
+    return cell, options
+
+
+def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
+    """[design] of the cell with what is asked for, checked, in its place."""
+    from elastocal.planning.criteria import CRITERIA
+
+    chosen = {key: value for key, value in asked.items() if value is not None}
+    for key, least in (("poses", 1), ("candidates", 1), ("repeats", 1), ("robust_samples", 1)):
+        if key in chosen:
+            chosen[key] = _whole(key, chosen[key], least)
+    for key, names in (
+        ("criterion", tuple(CRITERIA)),
+        ("prior", ("none", "typical")),
+        ("robust", ("none", "average", "worst")),
+    ):
+        if key in chosen:
+            _one_of(key, chosen[key], names)
+    for key, zero in (("target", False), ("repeatability", True)):
+        if key in chosen:
+            chosen[key] = _length(key, chosen[key], zero)
+    if "poses" in chosen and "target" in chosen:
+        raise InputError(
+            f"{option('poses', chosen['poses'])} and {option('target', chosen['target'])}: a "
+            "target asks for the number of poses; drop one"
+        )
+    if "loads" in chosen:
+        chosen["loads"] = _vectors("loads", chosen["loads"])
+    if "marker_sigma" in chosen:
+        for name, value in chosen["marker_sigma"].items():
+            _one_of("marker_sigma", name, tuple(cell.tool.markers))
+            _length("marker_sigma", value)
+    if "levels" in chosen:
+        require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
+        chosen["levels"] = {k: tuple(map(float, v)) for k, v in chosen["levels"].items()}
+        chosen.setdefault("per_level", ())
+    if "interest" in chosen:
+        chosen["interest"] = _names("interest", chosen["interest"])
+    if "test_poses" in chosen:
+        poses = chosen["test_poses"]
+        if not all(isinstance(pose, TargetPose) for pose in poses):
+            poses = [TargetPose(q) for q in np.atleast_2d(np.asarray(poses, dtype=float))]
+        chosen["test_poses"] = tuple(poses)
+    if isinstance(chosen.get("test_path"), str | Path):
+        chosen["test_path"] = TargetPath(Path(chosen["test_path"]))
+    if "test_box" in chosen and not isinstance(chosen["test_box"], TargetBox):
+        lower, upper = _vectors("test_box", chosen["test_box"])
+        require(bool((lower < upper).all()), f"{option('test_box')} takes lower < upper corners")
+        chosen["test_box"] = TargetBox(lower, upper)
+    if "per_level" in chosen:
+        chosen["per_level"] = tuple(_whole("per_level", n, 1) for n in chosen["per_level"])
+    # What the cell says of the number of poses gives way to what is asked for here.
+    number = {"per_level": (), "target": None} if "poses" in chosen else {}
+    if chosen.get("per_level"):
+        number = {"poses": sum(chosen["per_level"]), "target": None}
+    return replace(cell.design, **(number | chosen))
+
+
+def _prior_of(
+    knowledge: Knowledge | str | Path | None, model: Model
+) -> tuple[GaussianPrior | None, tuple[str, ...]]:
+    """What a knowledge file says that counts for a plan, and a sentence on what does not."""
+    from elastocal.identification.constrained.constraints import Constraints
+
+    known = knowledge_of(knowledge)
+    if known is None:
+        return None, ()
+    prior = known.of(model)[1]
+    if prior is None:
+        raise InputError(
+            f"{known.source}: states no prior, and only priors count for a plan; add "
+            f'[prior."joint2.compliance"] with mean and std, or leave {option("knowledge")} out'
+        )
+    left_out = known.physical or known.constraints != Constraints()
+    note = (
+        f"{known.source}: only its priors count for a plan; bounds, equalities and matrices do not"
+    )
+    return prior, (note,) if left_out else ()
+
+
+def simulate(
+    model: AnyModel,
+    plan: Plan | Table | ArrayLike,
+    *,
+    values: Mapping[str, float] | ArrayLike | None = None,
+    draw: float = 0.0,
+    load: ArrayLike | None = None,
+    repeats: int = 1,
+    noise: bool = True,
+    seed: int = 0,
+) -> Measurements:
+    """What would I measure, if …?
+
+    Args:
+        model: The model, or a cell, or the path of a cell file.
+        plan: The poses: a `Plan`, its file, a table, or joints (n, joints) in rad or m.
+        values: True parameter values in SI units, by name (the others are nominal) or all of them
+            (parameters,).
+        draw: Draw true values: typical sizes times this, at random; `values` win over them.
+        load: Force (3,) in N at the load point: every pose is measured without and with it.
+        repeats: Readings per pose and load state.
+        noise: Whether the readings have the noise that plan or cell state; else they are exact.
+        seed: Of all random draws.
+
+    Returns:
+        The `Measurements`, one row per pose, repeat, load state and marker.
+
+    Raises:
+        InputError: A name is unknown, a pose beyond the limits, or without static equilibrium.
+
+    Examples:
+        >>> truth = {"joint3.compliance": 3.4e-7}
+        >>> data = ec.simulate("cell.toml", "plan.csv", values=truth, load=[0, 0, -2600])
+        >>> len(data), data.position.shape
+        (90, (90, 3))
+        >>> ec.identify("cell.toml", data)["joint3.compliance"].ci95
+        (3.3...e-07, 3.4...e-07)
+    """
+    from elastocal.identification.checks import check_limits
+    from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
+    from elastocal.simulation.simulate import simulate as run
+
+    force = given_force(load)
+    factor = np.asarray(draw, dtype=float)
+    require(
+        factor.shape == () and bool(0 <= factor < np.inf),
+        f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw}",
+    )
+    repeats = _whole("repeats", repeats, 1)
+    made = _model(model)
+    poses = _poses(made, plan)
+    check_limits(made, poses)
+    rng = np.random.default_rng(_whole("seed", seed, 0))
+    drawn = draw_errors(made, float(draw), rng) if draw else {}
+    if values is None or isinstance(values, Mapping):
+        x = values_from(made, drawn | dict(values or {}))
+    else:
+        x = np.asarray(values, dtype=float)
+        require(
+            x.shape == (len(made.parameters),) and bool(np.isfinite(x).all()),
+            f"{option('values')} takes {len(made.parameters)} finite numbers, one per parameter, "
+            f"or some of them by name; found an array of shape {x.shape}",
+        )
+    rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)
+    return run(made, rows, x, rng, noise=noise)
+
+
+def _poses(model: Model, plan: Plan | Table | ArrayLike) -> Measurements:
+    from elastocal.design.plan import Plan
+
+    if isinstance(plan, Plan):
+        return plan.table()
+    if isinstance(plan, Measurements):
+        return plan
+    return model.read_plan(plan) if isinstance(plan, str | Path) else model.table(plan)
+
+
+def identify(
+    model: AnyModel,
+    data: Table,
+    *,
+    test: Table | None = None,
+    fixed: str | Sequence[str] = (),
+    method: Method = "auto",
+    noise: str = "auto",
+    weights: WeightKind = "auto",
+    covariance: ArrayLike | None = None,
+    intervals: IntervalKind = "auto",
+    outliers: FaultyReadings = "auto",
+    bounded: bool = False,
+    physical: bool = False,
+    knowledge: Knowledge | str | Path | None = None,
+    prior: Prior | None = None,
+    constraints: Constraints | None = None,
+    seed: int = 0,
+    jobs: int = 1,
+    progress: Progress | None = None,
+) -> Calibration:
+    """What are the parameters of my arm, and how sure are we?
+
+    Start by registration; a minimal complete set of parameters; search for faulty readings; then
+    by default weights from a noise model whose variances restricted likelihood estimates, and
+    intervals that know they are estimated.
+
+    Args:
+        model: The model, or a cell, or the path of a cell file.
+        data: The readings, or their file.
+        test: Readings that are never fitted, on which the result is tested.
+        fixed: Parameters, places or effects held at their start.
+        method: "auto" is "reml" unless `weights` are stated; "ols" is eq. (6) of Klimchik et al.
+            2013, "wls" eq. (10) with stated noise, "eq14" and "eq14-residual" its weights; "huber",
+            "tukey" (MM), "l1" and "student-t" are robust.
+        noise: Noise that reml estimates: "auto", "independent", "axis", "marker", "groups",
+            "polar" or "stated"; with "+configuration" what a configuration's readings share.
+        weights: Stated noise to take as it is: "none", "rows", "axis", "polar", "covariance".
+        covariance: Noise covariance (rows, rows) in m², for the weights "covariance".
+        intervals: "auto" goes with the method; "classical", "hc0" to "hc4", "cr0" to "cr3" (by
+            configuration), "wild", "bootstrap", "profile".
+        outliers: Readings beyond the noise: "auto" leaves them out unless they are a tenth or
+            more, "drop" always, "keep" never.  They are listed in any case.
+        bounded: Keep parameters inside their physical bounds.
+        physical: No negative compliance, no compliance matrix that yields energy.
+        knowledge: What is known besides: `Knowledge`, or a knowledge file (TOML).
+        prior: What is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
+        constraints: Bounds, equalities and matrices, besides those of `knowledge`.
+        seed: Of multi-start, searches and bootstraps.
+        jobs: Processes of a bootstrap; −1 for all cores.
+        progress: Is told what is done.
+
+    Returns:
+        The `Calibration`: estimates with intervals, what could not be known, the calibrated arm.
+
+    Raises:
+        InputError: Data contradict robot or cell, or an option is wrong; the message names the
+            keyword, or file, line and column.
+        InsufficientDataError: The data cannot determine the model; the message says what to
+            measure.
+
+    Examples:
+        >>> model = ec.Model("cell.toml")
+        >>> fit = ec.identify(model, model.read("data.csv"), fixed=["joint1.compliance"])
+        >>> fit["joint2.compliance_level1"].identifiable
+        True
+        >>> fit.save("result.json")
+    """
+    from elastocal.identification.identify import identify as run
+    from elastocal.identification.options import Options
+
+    options = Options(
+        method=method,
+        noise=noise,
+        weights=weights,
+        covariance=None if covariance is None else np.asarray(covariance, dtype=float),
+        intervals=intervals,
+        fixed=_names("fixed", fixed),
+        bounded=bounded,
+        faulty=outliers,
+        seed=_whole("seed", seed, 0),
+        jobs=jobs,
+    )
+    known = knowledge_of(knowledge, physical)
+    made = _model(model)
+    table = _table("data", made, data)
+    kept_back = None if test is None else _table("test", made, test)
+    made = made.with_markers_of(*(t for t in (table, kept_back) if t is not None))
+    prior = _gaussian(prior)
+    if known is not None:
+        stated, known_prior = known.of(made)
+        constraints = stated if constraints is None else stated + constraints
+        require(
+            prior is None or known_prior is None,
+            f"{option('prior')} and {option('knowledge')} both state a prior; drop one",
+        )
+        prior = prior or known_prior
+    if prior is not None or constraints is not None:
+        options = replace(options, constraints=constraints, prior=prior)
+    return run(made, table, options, kept_back, progress or _silent)
+
+
+def diagnose(
+    model: AnyModel,
+    data: Table,
+    *,
+    without: str | Sequence[str] = (),
+    false_alarm: float = 0.05,
+    extra_poses: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Why does the real arm still differ from the model?
+
+    The cell's effects are fitted; noise floor and faulty readings come first; every effect of the
+    catalogue at every place, and smooth dependences without a name, are then judged by their
+    marginal likelihood; what is claimed has to beat the whole family under sign flips.
+
+    Args:
+        model: The model, or a cell, or the path of a cell file.
+        data: The readings, or their file.
+        without: Effects taken out of the catalogue.
+        false_alarm: Probability that something is claimed where nothing is.
+        extra_poses: Where rivals are left, seek the fewest poses, at most this many, that tell
+            them apart (`Diagnosis.extra`); None seeks none.
+        seed: Of the sign flips and the draws behind intervals.
+        progress: Is told what is done.
+
+    Returns:
+        The `Diagnosis`: verdict, effects, candidates, where the gap lies, the budget of the gap.
+
+    Raises:
+        InputError: Data contradict robot or cell, or an option is wrong.
+        InsufficientDataError: There are too few configurations to tell an effect from noise.
+
+    Examples:
+        >>> why = ec.diagnose("cell.toml", "data.csv")
+        >>> why
+        <Diagnosis kuka_kr270_2: explained, link_bending at link4>
+        >>> [step.step for step in why.budget]
+        ['base_frame', 'compliance', 'link_bending:link4', 'noise_floor']
+        >>> why.effects[0].probability > 0.9
+        True
+    """
+    from elastocal.diagnosis.diagnose import diagnose as run
+    from elastocal.diagnosis.options import DiagnosisOptions
+
+    options = DiagnosisOptions(_whole("seed", seed, 0), _names("without", without), false_alarm)
+    if extra_poses is not None:
+        _whole("extra_poses", extra_poses, 1)
+    made = _model(model)
+    table = _table("data", made, data)
+    made = made.with_markers_of(table)
+    tell = progress or _silent
+    found = run(made, table, options, tell)
+    if extra_poses is not None and found.verdict in OPEN:
+        found = with_extra_poses(made, table, found, extra_poses, seed, tell)
+    return found
+
+
+def with_extra_poses(
+    model: Model, table: Measurements, found: Diagnosis, most: int, seed: int, progress: Progress
+) -> Diagnosis:
+    """The diagnosis with the fewest of at most `most` poses that tell its rivals apart."""
+    from elastocal.diagnosis.separate.plan import plan_extra
+
+    progress("looking for poses that tell the rivals apart")
+    extra = plan_extra(model, table, found, most=most, seed=seed, progress=progress)
+    return replace(found, extra=extra)
+
+
+def compensate(
+    arm: CalibratedArm | Calibration,
+    targets: Targets | str | Path | ArrayLike,
+    *,
+    load: ArrayLike | None = None,
+    frame: Literal["base", "tracker"] = "base",
+    point: str | ArrayLike | None = None,
+    near: ArrayLike | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Compensation:
+    """Which commands put the tool where it has to be?
+
+    Solves the calibrated arm, under its load, for every target within the joint limits, nearest
+    to the nominal command where joints or a free rotation leave a choice.
+
+    Args:
+        arm: `fit.arm`, or the `Calibration` itself, or what `read_calibrated` gives.
+        targets: Positions (n, 3) or (3,) in m of the tool's point, poses (n, 4, 4) or (4, 4) of
+            the tool, or a table of targets (CSV or Parquet).
+        load: Force (3,) in N at the load point, in `frame`, where the table states none.
+        frame: Frame of targets and forces: "base" (as identified) or "tracker".
+        point: Point of the tool: a marker, or (3,) in m in the flange frame; default the load
+            point, or the only marker.
+        near: Joints (joints,) in rad or m whose posture to begin near.
+        seed: Of the postures that are tried.
+        progress: Is told what is done.
+
+    Returns:
+        The `Compensation`: commands, predicted errors before and after, uncertainty, and what
+        became of every target.
+
+    Raises:
+        InputError: Targets or an option are wrong; the message names the keyword, or file and
+            line.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv")
+        >>> down = [[1.8, 0.0, 0.9], [1.8, 0.2, 0.9]]
+        >>> commands = ec.compensate(fit.arm, down, load=[0, 0, -2600])
+        >>> commands
+        <Compensation kuka_kr270_2: 2 of 2 targets reached>
+        >>> bool(commands.before.max() > 1e-3), bool(commands.after.max() < 1e-9)
+        (True, True)
+    """
+    from elastocal.compensation.compensate import compensate as run
+    from elastocal.compensation.targets import FRAMES
+    from elastocal.identification.result import Calibration
+
+    if isinstance(arm, Calibration):
+        arm = arm.arm
+    if not isinstance(arm, CalibratedArm):
+        raise InputError(
+            f"{option('arm')} takes a calibrated arm, as fit.arm or what read_calibrated gives; "
+            f"found {type(arm).__name__}"
+        )
+    force = given_force(load)
+    _one_of("frame", frame, FRAMES)
+    chain = arm.model.chain
+    start = None if near is None else np.asarray(near, dtype=float)
+    require(
+        start is None or (start.shape == (chain.n_joints,) and bool(np.isfinite(start).all())),
+        f"{option('near')} takes {chain.n_joints} joints in rad or m; found {near!r}",
+    )
+    where = _tool_point(arm.model.cell, point)
+    wanted = _targets(targets, chain.kinds, frame, force)
+    return run(arm, wanted, where, start, _whole("seed", seed, 0), progress or _silent)
+
+
+def _tool_point(cell: Cell, point: str | ArrayLike | None) -> ToolPoint:
+    from elastocal.compensation.point import tool_point
+
+    if point is None or isinstance(point, str):
+        return tool_point(cell, point)
+    place = np.asarray(point, dtype=float)
+    require(place.shape == (3,), f"{option('point')} takes a marker or three numbers in m")
+    return tool_point(cell, ",".join(repr(float(v)) for v in place))
+
+
+def _targets(
+    targets: Targets | str | Path | ArrayLike,
+    kinds: tuple[str, ...],
+    frame: Literal["base", "tracker"],
+    force: NDArray[np.float64] | None,
+) -> Targets:
+    from elastocal.compensation.targets import Targets, read_targets, targets_at
+
+    if isinstance(targets, Targets):
+        return targets
+    if isinstance(targets, str | Path):
+        return read_targets(targets, kinds, frame, force)
+    try:
+        found = np.asarray(targets, dtype=float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if found.shape in ((3,), (4, 4)):
+        found = found[None]
+    oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
+    if not (oriented or (found.ndim == 2 and found.shape[1] == 3)) or not np.isfinite(found).all():
+        raise InputError(
+            f"{option('targets')} takes positions (n, 3) in m, poses (n, 4, 4) or a file; found an "
+            f"array of shape {np.shape(targets)}"
+        )
+    if oriented:
+        return targets_at("targets", found[:, :3, 3], found[:, :3, :3], frame, force)
+    return targets_at("targets", found, None, frame, force)
+
+
+# What the verbs take
+
+
+def _silent(message: str) -> None:
+    """Who asks for no progress is told none."""
+
+
+def _model(given: AnyModel) -> Model:
+    return given if isinstance(given, Model) else Model(_checked_cell(given))
+
+
+def _checked_cell(given: Any) -> Cell | str | Path:
+    if isinstance(given, Cell | str | Path):
+        return given
+    raise InputError(
+        f"{option('model')} takes a Model, a Cell or the path of a cell file; found "
+        f"{type(given).__name__}"
+    )
+
+
+def _table(name: str, model: Model, given: Table) -> Measurements:
+    if isinstance(given, Measurements):
+        return given
+    if isinstance(given, str | Path):
+        return model.read(given)
+    raise InputError(
+        f"{option(name)} takes measurements (Model.read, Model.table) or the path of their table; "
+        f"found {type(given).__name__}"
+    )
+
+
+def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:
+    """What a file and the option `physical` state together; None where neither was given."""
+    from elastocal.identification.knowledge import Knowledge, read_knowledge
+
+    if given is None:
+        return Knowledge(physical=True, source=option("physical", True)) if physical else None
+    known = given if isinstance(given, Knowledge) else read_knowledge(given)
+    return replace(known, physical=known.physical or physical)
+
+
+def _gaussian(prior: Prior | None) -> GaussianPrior | None:
+    from elastocal.identification.constrained.prior import GaussianPrior
+
+    if prior is None or isinstance(prior, GaussianPrior):
+        return prior
+    require(isinstance(prior, Mapping), f"{option('prior')} takes mean and std by parameter")
+    return GaussianPrior.from_dict(prior)
+
+
+def _names(name: str, given: str | Sequence[str]) -> tuple[str, ...]:
+    """One name or several, as a tuple."""
+    names = (given,) if isinstance(given, str) else tuple(given)
+    for each in names:
+        require(isinstance(each, str), f"{option(name)} takes names; found {quoted(each)}")
+    return names
+
+
+def _whole(name: str, given: Any, least: int | None = None) -> int:
+    whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
+    more = "" if least is None else f", {least} or more"
+    require(
+        whole and (least is None or given >= least),
+        f"{option(name)} takes a whole number{more}; found {quoted(given)}",
+    )
+    return int(given)
+
+
+def _length(name: str, given: Any, zero: bool = False) -> float:
+    number = isinstance(given, int | float | np.number) and not isinstance(given, bool)
+    require(
+        number and np.isfinite(given) and (given > 0 or (zero and given == 0)),
+        f"{option(name)} takes a {'number, 0 or more,' if zero else 'positive number'} in m; "
+        f"found {quoted(given)}",
+    )
+    return float(given)
+
+
+def _vectors(name: str, given: Any) -> NDArray[np.float64]:
+    """(k, 3) finite numbers."""
+    try:
+        found = np.atleast_2d(np.asarray(given, dtype=float))
+    except (TypeError, ValueError):
+        found = np.zeros((1, 0))
+    require(
+        found.ndim == 2 and found.shape[1] == 3 and bool(np.isfinite(found).all()),
+        f"{option(name)} takes rows of three finite numbers; found {quoted(given)}",
+    )
+    return found
+
+
+def _one_of(name: str, given: Any, valid: Sequence[str]) -> None:
+    require(
+        given in valid,
+        f"{option(name)} {quoted(given)} is unknown{did_you_mean(str(given), valid)}; there are "
+        f"{listed(valid)}",
+    )

@@ -1,0 +1,65 @@
+"""The public names explain themselves, and the examples in their docstrings run."""
+
+import doctest
+import inspect
+
+import numpy as np
+import pytest
+
+import elastocal as ec
+from elastocal.above import Result, Saved
+from elastocal.demo import run_demo
+
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+VERBS = ("design", "simulate", "identify", "diagnose", "compensate")
+# Methods of the public classes that their users call; the rest is told in the class's text.
+METHODS = [
+    (ec.Model, ("read", "read_plan", "table", "pose", "predict", "deflection", "B")),
+    (ec.CalibratedArm, ("pose",)),
+    (Saved, ("save",)),
+    (Result, ("report", "plot", "to_dataframe")),
+]
+SHOWN = {name: getattr(ec, name) for name in ec.__all__}
+SHOWN |= {f"{cls.__name__}.{m}": getattr(cls, m) for cls, names in METHODS for m in names}
+# Data classes without an example of their own: `read_cell`, `Model.read` and the verbs show them.
+BARE = {"Cell", "Robot", "Tool", "Tracker", "Workspace", "Measurements", "Effect", "Parameter"}
+BARE |= {name for name in ec.__all__ if name.endswith("Error")}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The files of the demo."""
+    made = tmp_path_factory.mktemp("examples")
+    run_demo(made)
+    return made
+
+
+def sections(thing):
+    text = inspect.getdoc(thing) or ""
+    return {line for line in text.splitlines() if line.endswith(":") and " " not in line}
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_every_public_name_has_a_docstring_with_an_example(name):
+    assert len(inspect.getdoc(SHOWN[name]) or "") > 40
+    assert name in BARE or "Examples:" in sections(SHOWN[name])
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_every_option_of_a_verb_is_explained(name):
+    text = inspect.getdoc(SHOWN[name])
+    assert {"Args:", "Returns:", "Raises:", "Examples:"} <= sections(SHOWN[name])
+    for option, parameter in inspect.signature(SHOWN[name]).parameters.items():
+        assert f"\n    {option}: " in text
+        assert parameter.annotation is not inspect.Parameter.empty
+
+
+@pytest.mark.parametrize("name", [name for name in SHOWN if name not in BARE])
+def test_the_examples_run(name, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    finder = doctest.DocTestFinder(recurse=False)
+    (example,) = finder.find(SHOWN[name], name, globs={"ec": ec, "np": np})
+    assert example.examples
+    told = []
+    doctest.DocTestRunner(optionflags=FLAGS).run(example, out=told.append)
+    assert not told, "".join(told)

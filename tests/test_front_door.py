@@ -1,0 +1,421 @@
+"""`import elastocal as ec`: its names, what they cost, and the day's work from plan to commands."""
+
+import ast
+import inspect
+import json
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import elastocal as ec
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cli import app
+from elastocal.demo import LOAD_N, run_demo
+from elastocal.design.options import DesignOptions
+from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.errors import option, options_as_flags
+from elastocal.identification.options import Options
+
+HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")
+LOAD = list(LOAD_N)
+TARGETS = np.array([[1.8, 0.0, 0.9], [1.8, 0.2, 0.9], [1.7, -0.2, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The demo's files, and a second set of readings that was kept back."""
+    made = tmp_path_factory.mktemp("front")
+    run_demo(made)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        result = command("simulate", "cell.toml", "plan.csv", "-o", "kept_back.csv", "--seed", "7",
+                         "--load", *map(str, LOAD), "--repeats", "2",
+                         "--set", "joint3.compliance=4.1e-7")  # fmt: skip
+        assert result.exit_code == 0
+    return made
+
+
+@pytest.fixture(autouse=True)
+def in_folder(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+
+
+@pytest.fixture(scope="module")
+def model(folder):
+    return ec.Model(folder / "cell.toml")
+
+
+@pytest.fixture(scope="module")
+def fit(model, folder):
+    data, kept_back = model.read(folder / "data.csv"), model.read(folder / "kept_back.csv")
+    return ec.identify(model, data, fixed=["joint1.compliance"], test=kept_back)
+
+
+@pytest.fixture(scope="module")
+def plan(model):
+    return ec.design(
+        model, poses=4, criterion="test_pose", test_poses=[[0.3, -0.4405, 0.6, 0.2, 0.5, 0.1]],
+        loads=[LOAD], levels={"joint2": np.radians([-25.24, -99.85])}, candidates=60,
+        effort="quick", fixed="joint1",
+    )  # fmt: skip
+
+
+def command(*words):
+    return CliRunner().invoke(app, list(words))
+
+
+# Names
+
+
+def test_about_twenty_names_are_listed_and_all_are_there():
+    assert 20 <= len(ec.__all__) <= 30
+    assert set(ec.__all__) <= set(dir(ec))
+    assert all(getattr(ec, name) is not None for name in ec.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'identity'"):
+        ec.identity  # noqa: B018
+
+
+def test_type_checkers_see_the_same_homes_as_the_interpreter():
+    tree = ast.parse(Path(ec.__file__).read_text(encoding="utf-8"))
+    imports = {
+        alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("elastocal.")
+        for alias in node.names
+    }
+    assert sorted(imports) == sorted(ec.__all__)
+    assert imports.items() <= ec._HOME.items()
+
+
+def test_the_verbs_are_not_hidden_by_packages_of_their_names():
+    code = "import elastocal as ec, elastocal.verbs as v; ec.Plan; assert ec.design is v.design"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_importing_elastocal_loads_nothing_heavy():
+    code = f"import sys, elastocal; dir(elastocal); print([m for m in {HEAVY} if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_importing_elastocal_takes_no_time():
+    code = "import time; t = time.perf_counter(); import elastocal; print(time.perf_counter() - t)"
+    runs = [subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+            for _ in range(3)]  # fmt: skip
+    assert min(float(run.stdout) for run in runs) < 0.1
+
+
+def test_an_error_is_at_hand_without_the_rest():
+    code = "import sys, elastocal as ec; ec.InputError; print('numpy' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert run.stdout.strip() == "False"
+
+
+# The day's work
+
+
+def test_a_model_is_made_of_a_file_a_cell_or_a_path(folder):
+    cell = ec.read_cell("cell.toml")
+    built = ec.Cell(name=cell.name, path=None, robot=ec.Robot(urdf=folder / "kr270_2.urdf"),
+                    tool=cell.tool, tracker=cell.tracker, model=cell.model)  # fmt: skip
+    names = {ec.Model(given).names for given in ("cell.toml", folder / "cell.toml", cell, built)}
+    assert len(names) == 1
+
+
+def test_every_verb_takes_model_cell_and_path_alike(model):
+    plan = model.read_plan("plan.csv")
+    given = (model, model.cell, "cell.toml")
+    found = [ec.simulate(each, plan, load=LOAD, seed=3).position for each in given]
+    assert all(np.array_equal(found[0], other) for other in found)
+
+
+def test_simulate_is_that_of_the_command_line(model):
+    data = ec.simulate(
+        model, "plan.csv", values={"joint3.compliance": 4.1e-7}, load=LOAD, repeats=2, seed=7
+    )
+    read = model.read("kept_back.csv")
+    assert np.array_equal(data.position, read.position) and np.array_equal(data.q, read.q)
+
+
+def test_a_calibration_is_a_mapping_of_estimates(fit):
+    found = fit["joint3.compliance"]
+    assert found.ci95[0] < found.value < found.ci95[1]
+    assert (found.unit, found.identifiable, found.combined_with) == ("rad/(N*m)", True, ())
+    assert not fit["joint1.compliance"].identifiable
+    assert list(fit) == list(fit.model.names) == fit._ipython_key_completions_()
+    assert len(fit) == 10 and "joint2.compliance" not in fit
+    assert dict(fit)["joint3.compliance"] is found
+    assert fit.covariance.shape == (9, 9) and fit.B.shape == (len(fit.residual), 10)
+
+
+def test_a_wrong_name_is_an_input_error_with_the_nearest(fit):
+    with pytest.raises(ec.InputError, match=r"did you mean 'joint3\.compliance'") as caught:
+        fit["joint3.complience"]
+    assert isinstance(caught.value, KeyError)
+    assert not str(caught.value).startswith(("'", '"'))
+
+
+def test_B_is_the_slope_of_the_prediction(fit):
+    k, step = fit.model.names.index("joint3.compliance"), 1e-10
+    x = fit.x + step * np.eye(len(fit.x))[k]
+    seen = fit.observations
+    moved, still = (fit.model.predict(seen.table, v, seen) for v in (x, fit.x))
+    np.testing.assert_allclose((moved - still) / step, fit.B[:, k], rtol=1e-4, atol=1.0)
+
+
+def test_identify_is_that_of_the_command_line(fit):
+    done = command("identify", "cell.toml", "data.csv", "--test", "kept_back.csv", "--fix",
+                   "joint1.compliance", "-o", "line.json", "--quiet")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    fit.save("front.json")
+    mine, other = (json.loads(Path(f"{name}.json").read_text()) for name in ("front", "line"))
+    assert Path(mine.pop("data")).name == other.pop("data")
+    assert mine == other
+
+
+def test_residuals_are_those_of_the_command_line(fit):
+    done = command("identify", "cell.toml", "data.csv", "--fix", "joint1.compliance",
+                   "--residuals", "line.csv", "--quiet")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    fit.save("front.csv")
+    assert Path("front.csv").read_text() == Path("line.csv").read_text()
+
+
+def test_a_plan_saves_itself_and_is_simulated_as_its_file_is(plan, model):
+    plan.save("plan4.csv")
+    written = json.loads(Path("plan4.json").read_text())
+    assert written["n_poses"] == len(plan) == 4 and written["criterion"] == "test_pose"
+    read, direct = model.read_plan("plan4.csv"), plan.table()
+    assert np.array_equal(read.q, direct.q) and np.array_equal(read.force, direct.force)
+    assert read.configuration_labels == direct.configuration_labels
+    assert list(plan.to_dataframe()["configuration"]) == ["1", "2", "3", "4"]
+
+
+def test_design_is_that_of_the_command_line(plan):
+    cell = Path("cell.toml").read_text() + (
+        "[design]\nloads_N = [[0, 0, -2600]]\nlevels = {joint2_deg = [-25.24, -99.85]}\n"
+        "test_pose = [{q_si = [0.3, -0.4405, 0.6, 0.2, 0.5, 0.1]}]\n"
+    )
+    Path("design.toml").write_text(cell)
+    done = command("design", "design.toml", "-o", "line.csv", "--poses", "4", "--candidates", "60",
+                   "--criterion", "test_pose", "--effort", "quick", "--fix", "joint1",
+                   "-q")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    plan.save("front.csv")
+    assert Path("front.csv").read_text() == Path("line.csv").read_text()
+
+
+def test_diagnose_is_that_of_the_command_line(model):
+    why = ec.diagnose(model, "data.csv", seed=1)
+    done = command("diagnose", "cell.toml", "data.csv", "-o", "line.json", "--seed", "1", "-q")
+    assert done.exit_code == 0, done.output
+    why.save("front.json")
+    assert Path("front.json").read_text() == Path("line.json").read_text()
+    assert why.budget and why.verdict in ("explained", "unknown_effect", "ambiguous")
+
+
+def test_the_arm_of_a_fit_is_that_of_its_file(fit):
+    fit.save("result.json")
+    arm = ec.read_calibrated("cell.toml", "result.json")
+    assert np.array_equal(fit.arm.x, arm.x) and fit.arm.determined == arm.determined
+    assert np.array_equal(fit.arm.covariance, arm.covariance)
+    q = [0.2, -0.44, 0.8, 0.1, 0.4, 0.0]
+    assert np.array_equal(fit.arm.pose(q, LOAD), arm.pose([q], [LOAD])[0])
+    fit.arm.save("mine.urdf", load=LOAD)
+    arm.save("file.urdf", load=LOAD)
+    mine, other = (Path(f"{name}.urdf").read_text() for name in ("mine", "file"))
+    assert mine.replace("data.csv", "").replace(str(Path.cwd()) + "/", "") == other.replace(
+        "result.json", ""
+    )
+
+
+def test_compensate_is_that_of_the_command_line(fit):
+    fit.save("result.json")
+    rows = [",".join(f"{v * 1e3:g}" for v in target) for target in TARGETS]
+    Path("targets.csv").write_text("x_mm,y_mm,z_mm\n" + "\n".join(rows) + "\n")
+    done = command("compensate", "cell.toml", "result.json", "targets.csv", "-o", "line.csv",
+                   "--load", *map(str, LOAD), "-q")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    commands = ec.compensate(fit, "targets.csv", load=LOAD)
+    commands.save("front.csv")
+    assert Path("front.csv").read_text() == Path("line.csv").read_text()
+    in_memory = ec.compensate(fit.arm, TARGETS, load=LOAD)
+    np.testing.assert_allclose(in_memory.q, commands.q, atol=1e-12)
+    assert len(in_memory) == 3 and in_memory.reached.all()
+
+
+def test_targets_may_be_poses(fit):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, :3] = np.diag([1.0, -1.0, -1.0])
+    poses[:, :3, 3] = [[1.7, 0.0, 1.0], [1.7, 0.1, 1.0]]
+    commands = ec.compensate(fit.arm, poses, load=LOAD)
+    assert commands.reached.all() and (commands.after < 1e-8).all() and (commands.turn < 0.1).all()
+
+
+def test_every_result_reports_plots_and_tabulates_itself(fit, plan):
+    commands = ec.compensate(fit.arm, TARGETS, load=LOAD)
+    for result in (plan, commands):
+        result.report("report.html")
+        page = Path("report.html").read_text()
+        assert page.startswith("<!doctype html>") and "To repeat this" in page
+        assert len(result.to_dataframe()) == len(result)
+        assert result.plot().axes
+        assert repr(result).startswith(f"<{type(result).__name__} ") and "\n" not in repr(result)
+    with pytest.raises(ec.InputError, match="no figure 'pose'"):
+        plan.plot("pose")
+
+
+def test_a_report_names_the_files_it_came_from(fit):
+    fit.report("report.html")
+    page = Path("report.html").read_text()
+    assert "data.csv" in page and "cell.toml" in page and page.count("SHA-256") == 2
+
+
+def test_reprs_are_one_line(model, fit):
+    assert repr(fit).startswith("<Calibration kuka_kr270_2: 9 of 10 parameters, held-out ")
+    for thing in (model, fit, fit.arm):
+        assert len(repr(thing)) < 200 and "\n" not in repr(thing)
+
+
+def test_a_cell_without_markers_takes_those_of_the_table(folder):
+    text = Path("cell.toml").read_text()
+    start, end = text.index("[tool.markers_m]"), text.index("[tracker]")
+    bare = (text[:start] + text[end:]).replace('["joint_compliance"]', '["marker_position"]')
+    Path("bare.toml").write_text(bare.replace('"deflection"', '"position"'))
+    model = ec.Model("bare.toml")
+    data = model.read("data.csv")
+    assert data.marker_names == ("M1", "M2", "M3")
+    assert model.names[0] == "marker:M1.x" and len(model.names) == 3
+    assert len(ec.identify(model, data)) == 9
+
+
+def test_arrays_become_tables(model):
+    q = np.array([[0.1, -0.4405, 0.5, 0.0, 0.5, 0.0]])
+    exact = ec.simulate(model, q, noise=False)
+    assert len(exact) == 3  # markers
+    table = model.table(q, position=exact.position[:1])
+    assert np.array_equal(table.position, exact.position[:1])
+    with pytest.raises(ec.InputError, match="q takes 6 joints per row"):
+        model.table([[0.1, 0.2]])
+
+
+# Wrong options
+
+
+# What the command line writes, and how it says in text what Python says otherwise.
+OF_FILES = {"output", "report", "residuals", "program", "picture", "plan", "cell_out", "truth"}
+OF_TEXT = {"json", "quiet", "help", "set", "no_noise", "target", "partial", "poses", "fix"}
+OF_A_TABLE = {"table", "grid", "box", "rotation"}
+
+
+@pytest.mark.parametrize("verb", ["design", "simulate", "identify", "diagnose", "compensate"])
+def test_every_flag_of_a_verb_is_a_keyword_of_it(verb):
+    parameters = typer.main.get_command(app).commands[verb].params
+    flags = {p.opts[-1][2:].replace("-", "_") for p in parameters if p.opts[-1].startswith("--")}
+    keywords = set(inspect.signature(getattr(ec, verb)).parameters)
+    assert flags - OF_FILES - OF_TEXT - OF_A_TABLE <= keywords
+
+
+@pytest.mark.parametrize(
+    ("verb", "kind", "renamed"),
+    [
+        ("identify", Options, {"faulty": "outliers"}),
+        ("design", DesignOptions, {"done": "augment", "notes": "knowledge"}),
+        ("design", DesignSpec, {}),
+        ("diagnose", DiagnosisOptions, {}),
+    ],
+)
+def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
+    keywords = set(inspect.signature(getattr(ec, verb)).parameters)
+    assert {renamed.get(f.name, f.name) for f in fields(kind)} <= keywords
+
+
+@pytest.mark.parametrize(
+    ("verb", "options", "named"),
+    [
+        ("design", {"poses": 0}, "`poses` takes a whole number, 1 or more; found 0"),
+        ("design", {"poses": 2.5}, "`poses` takes a whole number"),
+        ("design", {"criterion": "test_poes"}, "`criterion` .*did you mean 'test_pose'"),
+        ("design", {"poses": 3, "target": 1e-5}, "poses=3 and target=1e-05: a target"),
+        ("design", {"target": -1.0}, "`target` takes a positive number in m"),
+        ("design", {"effort": "fast"}, "effort 'fast' is unknown"),
+        ("design", {"loads": [1, 2]}, "`loads` takes rows of three finite numbers"),
+        ("design", {"prior": "some"}, "`prior` 'some' is unknown"),
+        ("design", {"robust": "all"}, "`robust` 'all' is unknown"),
+        ("identify", {"method": "olss"}, "`method` takes one of .*did you mean 'ols'"),
+        ("identify", {"outliers": "dropp"}, "`outliers` takes one of auto, drop, keep"),
+        ("identify", {"noise": "white"}, "`noise` takes one of"),
+        ("identify", {"weights": "cell"}, "`weights` takes one of"),
+        ("identify", {"intervals": "hc9"}, "`intervals` takes one of"),
+        ("identify", {"fixed": "joint9"}, r"fixed=\['joint9'\]: the model has no such"),
+        ("identify", {"seed": -1}, "`seed` takes a whole number"),
+        ("identify", {"test": 5}, "`test` takes measurements"),
+        ("diagnose", {"without": "backlsh"}, "`without`: unknown effect 'backlsh'.*'backlash'"),
+        ("diagnose", {"false_alarm": 0.7}, "`false_alarm` takes a number between"),
+        ("diagnose", {"extra_poses": 0}, "`extra_poses` takes a whole number"),
+        ("simulate", {"load": [0, 1]}, "`load` takes three finite numbers"),
+        ("simulate", {"draw": -1.0}, "`draw` takes a factor"),
+        ("simulate", {"values": {"joint3": 1.0}}, "no parameter 'joint3'"),
+        ("compensate", {"frame": "tool"}, "`frame` 'tool' is unknown"),
+        ("compensate", {"point": "M9"}, "`point`: 'M9' is no marker"),
+        ("compensate", {"near": [0, 0]}, "`near` takes 6 joints"),
+    ],
+)
+def test_a_wrong_option_is_named_by_its_keyword(verb, options, named, model, fit):
+    first = {
+        "design": (model,), "identify": (model, "data.csv"), "diagnose": (model, "data.csv"),
+        "simulate": (model, "plan.csv"), "compensate": (fit, TARGETS),
+    }[verb]  # fmt: skip
+    with pytest.raises(ec.InputError, match=named) as caught:
+        getattr(ec, verb)(*first, **options)
+    assert "--" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: ec.identify(3.5, "data.csv"), "`model` takes a Model, a Cell or the path"),
+        (lambda: ec.identify("cell.toml", [1, 2]), "`data` takes measurements"),
+        (lambda: ec.compensate("cell.toml", TARGETS), "`arm` takes a calibrated arm"),
+        (lambda: ec.identify("sell.toml", "data.csv"), r"sell\.toml: no such file"),
+    ],
+)
+def test_a_wrong_argument_is_named(call, named):
+    with pytest.raises(ec.InputError, match=named):
+        call()
+
+
+def test_targets_of_another_shape_are_refused(fit):
+    with pytest.raises(ec.InputError, match=r"`targets` takes positions \(n, 3\)"):
+        ec.compensate(fit, [[1.0, 2.0]])
+
+
+def test_an_option_is_a_keyword_here_and_a_flag_on_the_command_line():
+    assert option("fixed", "joint1") == "fixed=['joint1']" and option("seed") == "`seed`"
+    with options_as_flags():
+        assert option("fixed", "joint1") == "--fix joint1" and option("seed") == "--seed"
+        assert option("frames", False) == "--no-frames" and option("base_frame") == "--base-frame"
+    assert option("outliers", "drop") == "outliers='drop'"
+
+
+def test_the_command_line_names_flags(folder):
+    done = command("identify", "cell.toml", "data.csv", "--fix", "joint9")
+    assert done.exit_code == 2
+    assert "--fix joint9: the model has no such parameter" in done.output
+
+
+def test_progress_is_told(model):
+    told = []
+    ec.identify(model, "data.csv", progress=told.append)
+    assert "finding the start" in told
+
+
+def test_unknown_keywords_are_an_error_of_python(model):
+    with pytest.raises(TypeError, match="methd"):
+        ec.identify(model, "data.csv", methd="ols")
