@@ -159,7 +159,7 @@ def noisy_days(folder: Path) -> Path:
     text = CELL.replace("three_lobes.py", "noise_by_day.py").replace("sigma_um = 10\n", "")
     cell.write_text(text, encoding="utf-8")
     write_example(folder, "noise_by_day.py")
-    model = Model.from_cell(read_cell(cell))
+    model = Model(read_cell(cell))
     table = unloaded(model.chain, 60)
     day = table.configuration % 3
     exact = model.predict(table).reshape(-1, 3)
