@@ -131,6 +131,10 @@ MISTAKES = {
     "effect": (lambda: ModelSpec(effects=[":joint2"]), r"effects\[0\] takes \"effect\" or"),
     "twice": (lambda: ModelSpec(effects=["a", "a"]), "repeats 'a'"),
     "matrix": (lambda: Nominal(base_rotation=[0, 0, 90]), r"base_rotation takes an array \(3, 3\)"),
+    "spring": (
+        lambda: Nominal(gravity_compensator={"joint": "joint2", "arm": 1.0}),
+        "gravity_compensator: unknown key arm; missing unit: did you mean arm_m",
+    ),
     "not a part": (lambda: Cell("a", robot="arm.urdf"), "Cell: robot takes an instance of Robot"),
     "two robots": (lambda: Robot(urdf="a", dh="b"), "exactly one of urdf and dh"),
     "marker": (lambda: Tool(markers={" ": [0, 0, 0]}), "marker name ' '"),

@@ -28,6 +28,7 @@ from elastocal.config import (
     Table,
     Text,
     Vector3,
+    checked,
     key,
     numbers,
     required,
@@ -279,6 +280,11 @@ class Nominal:
         form=dict[str, dict[str, float]],
         default_factory=dict,
     )
+
+    def __post_init__(self) -> None:
+        spring = self.gravity_compensator or {"joint": "joint1"}
+        listed = {k: list(v) if isinstance(v, tuple) else v for k, v in spring.items()}
+        checked(CompensatorTable, listed, "Nominal: gravity_compensator")
 
 
 @record
