@@ -103,7 +103,8 @@ def combination_truth(result: Calibration, combination: Combination, truth: Trut
     (first, _), *rest = combination.terms.items()
     if any(name not in truth for name in combination.terms):
         return None
-    shift = sum(f * (truth[name] - result.estimate(name).held) for name, f in rest)
+    held = {e.name: e.held for e in result.estimates}
+    shift = sum(f * (truth[name] - held[name]) for name, f in rest)
     return truth[first] + shift
 
 
