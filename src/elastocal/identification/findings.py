@@ -36,6 +36,7 @@ WORSE, CHANCE = 1.25, 0.01
 MANY = 0.05  # share of the readings fitted, above which those beyond the noise are no accidents
 NOT_NORMAL = 0.01  # p-value below which standardised residuals are not normal
 FEW_DOF_PER_PARAMETER = 1.0
+MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
 ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
 
 # How a parameter stands, in the order in which they are told.
@@ -78,6 +79,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         *(f for f in of_solution if f.kind != "ill_conditioned"),
         *_faulty(result),
         *_undetermined(result),
+        *_prior(result),
         *_shape(result),
         *_test(result),
     ]
@@ -215,6 +217,18 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
         )  # fmt: skip
 
 
+def _prior(result: Calibration) -> Iterator[Finding]:
+    """Parameters of which the prior says more than the readings, the most so first."""
+    shares = result.prior_share
+    names = sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n])
+    if names:
+        yield Finding(
+            "mostly_prior", "note",
+            {"parameters": tuple(names), "share": tuple(shares[n] for n in names)},
+            "Measure poses that load them more.",
+        )  # fmt: skip
+
+
 def standings(result: Calibration) -> dict[str, str]:
     """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, INVISIBLE or FIXED."""
     first = {next(iter(c.terms)) for c in result.combinations}
@@ -349,11 +363,10 @@ def _not_held_out(_: Calibration, f: Finding) -> list[str]:
 
 
 def _ill_conditioned(_: Calibration, f: Finding) -> list[str]:
-    names = f.numbers["parameters"]
-    assert isinstance(names, tuple)
+    names = ", ".join(map(str, f.listed("parameters")))
     return [
         f"Ill-conditioned (condition number {f.number('condition_number'):.1e} after scaling): "
-        f"the data barely separate {', '.join(map(str, names))}. {f.remedy}"
+        f"the data barely separate {names}. {f.remedy}"
     ]
 
 
@@ -441,16 +454,16 @@ _TOLD: dict[str, Callable[[Calibration, Finding], list[str]]] = {
     "faulty_readings": _faulty_readings,
     "many_faulty_readings": _many_faulty,
 }
-# Of these the warning says what to do.
-SAID_IN_WARNING = (
+# Of these the warning, or the line on the prior, says what to do.
+TOLD_ELSEWHERE = (
     "not_converged", "few_degrees_of_freedom", "ill_conditioned", "at_bound", "beyond_bound",
-    "many_faulty_readings",
+    "many_faulty_readings", "mostly_prior",
 )  # fmt: skip
 
 
 def next_steps(result: Calibration) -> list[Finding]:
     """Findings whose remedy is still to be told, each remedy once."""
-    steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in SAID_IN_WARNING}
+    steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in TOLD_ELSEWHERE}
     order = [f for f in result.findings if f.remedy and steps.get(f.remedy) is f]
     trust = [f for f in order if f.kind == "trust"]
     return [f for f in order if f.kind != "trust"] + trust

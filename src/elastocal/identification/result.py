@@ -133,6 +133,11 @@ class Finding:
         value = self.numbers[name]
         return value if isinstance(value, float | int) else math.inf
 
+    def listed(self, name: str) -> tuple[float | str, ...]:
+        """Those of the numbers that are several."""
+        value = self.numbers[name]
+        return value if isinstance(value, tuple) else ()
+
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, strings and lists; what is not finite is None."""
         numbers = {

@@ -179,7 +179,7 @@ def how_well_it_predicts(result: Calibration) -> str:
                 f"; the {nominal_arm(result)} is off by {length(nominal)}, "
                 f"{significant(nominal / held, 2)} times as much"
             )
-        elif math.isfinite(nominal):
+        elif result.finding("no_better_than_nominal") is not None:
             text += f", no better than the nominal arm ({length(nominal)})"
         text += "."
         if result.finding("fit_flatters") is not None:

@@ -19,7 +19,6 @@ from elastocal.report.formatting import display, length, plain, printable, signi
 from elastocal.tracker_noise import available_noise
 
 MOST_NAMED = 6
-MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
 METHODS = {
     "reml": "generalised least squares, weights estimated by restricted likelihood (REML)",
     "ols": "ordinary least squares, all readings weighted alike",
@@ -186,10 +185,11 @@ def prior_line(result: Calibration) -> str | None:
     shares = result.prior_share
     if not shares:
         return None
-    mostly = sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n])
-    if not mostly:
+    found = result.finding("mostly_prior")
+    if found is None:
         largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
         return f"No estimate is mostly prior (largest share {_percent(largest)})."
+    mostly = [str(name) for name in found.listed("parameters")]
     named = ", ".join(f"{printable(n)} {_percent(shares[n])}" for n in mostly[:MOST_NAMED])
     more = len(mostly) - MOST_NAMED
     text = f"Mostly prior, share of the information: {named}" + (

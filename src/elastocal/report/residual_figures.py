@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from elastocal.identification.error_budget import ErrorBudget
+from elastocal.identification.estimates import CORRELATED
 from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.manipulator.observation import Observations
@@ -286,7 +287,6 @@ CELLS = 6  # of the work space's longest side
 FEWEST = 3  # readings from which on a cell is told
 MOST_IN_MATRIX = 48  # of the correlation matrix
 MOST_WRITTEN = 16  # parameters up to which the numbers are written into it
-STRONG = 0.9
 
 
 def over_time(seen: Observations, residuals: Residuals) -> str:
@@ -391,7 +391,7 @@ def correlation_matrix(result: Calibration) -> str:
                 if n <= MOST_WRITTEN:
                     text = f"{value:+.2f}".replace("-", "−")
                     axes.text(j, i, text, ha="center", va="center", fontsize=7)
-                elif abs(value) > STRONG:
+                elif abs(value) > CORRELATED:
                     axes.text(j, i, "+" if value > 0 else "−", ha="center", va="center", fontsize=8)
         shown = [short_name(name, MOST_LABELS) for name in names]
         axes.set_yticks(range(1, n), shown[1:], fontsize=8 if n < 30 else 6.5)
