@@ -193,7 +193,7 @@ def test_a_test_load_that_no_reading_shows_is_refused_with_its_parameter(criteri
         "test pose 1",
         "joint1.compliance",
         "load's direction",
-        "--fix",
+        "fixed=[",
         'criterion = "D"',
     ):
         assert part in message

@@ -251,10 +251,10 @@ def test_a_bootstrap_does_not_depend_on_the_number_of_processes():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "olss"}, "no method 'olss' (did you mean 'ols'?)"),
+        ({"method": "olss"}, "student-t; found 'olss' (did you mean 'ols'?)"),
         ({"noise": "group"}, "(did you mean 'groups'?)"),
-        ({"intervals": "hc5"}, "no kind of intervals 'hc5'"),
-        ({"faulty": "ignore"}, "no way with faulty readings 'ignore'"),
+        ({"intervals": "hc5"}, "`intervals` takes one of auto, classical, hc0"),
+        ({"faulty": "ignore"}, "`outliers` takes one of auto, drop, keep; found 'ignore'"),
         ({"method": "ols", "noise": "groups"}, "is estimated by the method reml"),
         ({"method": "wls", "weights": "none"}, "choose the method ols"),
         ({"method": "eq14", "weights": "rows"}, "choose the method wls"),
