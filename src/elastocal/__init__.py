@@ -13,14 +13,12 @@ Every name is loaded when it is first used, so that `import elastocal` costs not
 """
 
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from elastocal.cell import Cell, Robot, Tool, Tracker
-    from elastocal.cell.work_cell import read_cell
-    from elastocal.cell.workspace_rules import Workspace
+    from elastocal.cell import Cell, Robot, Tool, Tracker, Workspace, read_cell
     from elastocal.compensation.compensate import Compensation
     from elastocal.design.plan import Plan
     from elastocal.diagnosis.result import Diagnosis
@@ -37,15 +35,34 @@ if TYPE_CHECKING:
     from elastocal.manipulator.model import Model
     from elastocal.manipulator.parameter import Parameter
     from elastocal.measurements import Measurements
+    from elastocal.plugins import register_criterion, register_effect, register_noise_model
     from elastocal.verbs import compensate, design, diagnose, identify, simulate
 
 __version__ = "0.1.0"
 
+
+def loaded_on_demand(
+    package: str, homes: Mapping[str, Sequence[str]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Returns `__getattr__` and `__dir__` of a package whose names are loaded when they are used.
+
+    `homes` gives the names that each module has (PEP 562).
+    """
+    home_of = {name: home for home, names in homes.items() for name in names}
+
+    def load(name: str) -> Any:
+        if name not in home_of:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        value = getattr(import_module(home_of[name]), name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return load, lambda: sorted({*vars(sys.modules[package]), *home_of})
+
+
 # Where each name lives; a test holds this against the imports above.
 _HOMES = {
-    "elastocal.cell": ("Cell", "Robot", "Tool", "Tracker"),
-    "elastocal.cell_reader": ("read_cell",),
-    "elastocal.cell_workspace": ("Workspace",),
+    "elastocal.cell": ("Cell", "Robot", "Tool", "Tracker", "Workspace", "read_cell"),
     "elastocal.compensation.compensate": ("Compensation",),
     "elastocal.design.plan": ("Plan",),
     "elastocal.diagnosis.result": ("Diagnosis",),
@@ -65,7 +82,6 @@ _HOMES = {
     "elastocal.plugins": ("register_criterion", "register_effect", "register_noise_model"),
     "elastocal.verbs": ("compensate", "design", "diagnose", "identify", "simulate"),
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "CalibratedArm",
@@ -93,28 +109,11 @@ __all__ = [
     "identify",
     "read_calibrated",
     "read_cell",
+    "register_criterion",
+    "register_effect",
+    "register_noise_model",
     "simulate",
 ]
 
 
-def __getattr__(name: str) -> Any:
-    home = _HOME.get(name)
-    if home is None:
-        raise AttributeError(f"module 'elastocal' has no attribute '{name}'")
-    value = globals()[name] = getattr(import_module(home), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
-
-class _Front(ModuleType):
-    """Keeps `design` the verb: importing the package elastocal.design would take its name."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name == "design" and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Front
+__getattr__, __dir__ = loaded_on_demand(__name__, _HOMES)
