@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell import read_cell
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.limits import finite_ranges, joint_limits
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import read_cell
 from elastocal.measurements import Measurements
+from elastocal.model import Model, finite_ranges, joint_limits
+from elastocal.model.effects import CATALOGUE
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")
 LOAD_N = (0.0, 0.0, -2600.0)

@@ -24,12 +24,10 @@ import numpy as np
 from peer_kr270 import Arm, evolved, prepared
 from peer_tools import ONE_THREAD, Row, Seconds, peer, required, seconds_of, starts, table, timed
 
-from elastocal.design.problem import DesignProblem
-from elastocal.planning.criteria import DeterminantCriterion
-from elastocal.planning.exact_plan import exact_plan, round_weights
+from elastocal.planning import DesignProblem, DeterminantCriterion, relax, round_weights
+from elastocal.planning.exact_plan import exact_plan
 from elastocal.planning.exchange import exchange
 from elastocal.planning.polish import polish
-from elastocal.planning.relaxation import relax
 
 SEED = 1
 POOL, POSES = 1000, 30  # of the UR10

@@ -26,9 +26,7 @@ from bench_part import Part, Table, run_alone
 from evaluation_numpy import NumpyRegressor
 from evaluation_rivals import BareC, Mapped, buffered_loop, function_of, python_loop
 
-from elastocal.manipulator.inputs import row_inputs
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.tape import Tape
+from elastocal.model import BatchFunction, Model, row_inputs
 
 ROWS = {"tiny": (300, 2000), "short": (300, 10_000, 100_000, 1_000_000)}
 ROWS["full"] = ROWS["short"]
@@ -51,8 +49,8 @@ class Ways:
         self.f = function_of(inputs, outputs)
         by_hand = NumpyRegressor(model)
         tapes = {
-            REPLAY: Tape(inputs, outputs, "numpy"),
-            COMPILED: Tape(inputs, outputs, "compiled"),
+            REPLAY: BatchFunction(inputs, outputs, "numpy"),
+            COMPILED: BatchFunction(inputs, outputs, "compiled"),
         }
         loops = {LOOP: python_loop, BUFFER: buffered_loop}
         self.run: dict[str, Callable] = {

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.manipulator.compiled_build import find_compiler
+from elastocal.model import find_compiler
 
 Array = NDArray[np.float64]
 MAPPED = 10_000  # rows of one call of a mapped function

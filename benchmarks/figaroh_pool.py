@@ -29,11 +29,7 @@ from figaroh.calibration.calibration_tools import (
     select_identifiable_parameters,
 )
 from figaroh.calibration.parameter import add_base_name, add_pee_name
-from figaroh.optimal.base_optimal_calibration import (
-    BaseOptimalCalibration,
-    Detmax,
-    SOCPOptimizer,
-)
+from figaroh.optimal.base_optimal_calibration import BaseOptimalCalibration, Detmax, SOCPOptimizer
 from figaroh.tools.load_robot import load_robot
 
 MARKER_M = "0.1 0.05 0.1"  # off the last axis, so that the marker sees all that a position can

@@ -22,28 +22,20 @@ with clock.step("import"):
     import numpy as np
 
     # What reading would import when first called.
-    import elastocal.cell
-    import elastocal.manipulator.effects
-    import elastocal.manipulator.urdf
-    import elastocal.measurements  # noqa: F401
-    from elastocal.cli.identify import load_inputs
+    from elastocal.cli.identify_command import load_inputs
+    from elastocal.identification import Options, Problem, Weights, sizes_and_check, start_values
     from elastocal.identification.identify import identify
-    from elastocal.identification.noise import Weights
-    from elastocal.identification.options import Options
-    from elastocal.identification.solve import Problem, settle, sizes_and_check
-    from elastocal.identification.start import start_values
-    from elastocal.manipulator.backend import set_default_backend
-    from elastocal.manipulator.model import Model
-    from elastocal.manipulator.observation import observe
+    from elastocal.identification.solve import settle
     from elastocal.measurements import Measurements
+    from elastocal.model import Model, observe, set_default_backend
 
 
 def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
     """Values (parameters,) of least squares in a minimal complete set, and the size of that set."""
-    seen = observe(table, model.observe)
+    observed = observe(table, model.observe)
     every = np.arange(len(model.parameters))
     weights = Weights("none", None, False, "")
-    problem = Problem(model, seen, weights, start_values(model, table), every)
+    problem = Problem(model, observed, weights, start_values(model, table), every)
     settled = settle(problem, sizes_and_check(problem))
     settled.fit.cofactor()
     return settled.fit.x, len(settled.reduction.kept)

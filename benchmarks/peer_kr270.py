@@ -11,18 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
-from elastocal.cell import read_cell
-from elastocal.design.candidates import draw
-from elastocal.design.feasibility.feasibility import Feasibility
-from elastocal.design.joint_space import joint_space
-from elastocal.design.problem import DesignProblem
-from elastocal.design.readings import load_states
-from elastocal.design.setup import Known, Pool, Setup, set_up
-from elastocal.design.target_poses import test_poses
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
-from elastocal.planning.criteria import TraceCriterion
-from elastocal.planning.polish import Searches
+from elastocal.cell.work_cell import read_cell
+from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
+from elastocal.planning import (
+    DesignProblem,
+    Feasibility,
+    FeasiblePool,
+    Known,
+    Searches,
+    Setup,
+    TraceCriterion,
+    draw,
+    joint_space,
+    load_states,
+    set_up,
+)
+from elastocal.planning.test_poses import test_poses
 
 Array = NDArray[np.float64]
 
@@ -57,7 +62,7 @@ class Arm:
     """The problem of `poses` poses, and ρ₀ of any others."""
 
     setup: Setup
-    pool: Pool
+    pool: FeasiblePool
     searches: Searches
     n_targets: int
 

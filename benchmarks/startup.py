@@ -19,7 +19,7 @@ from bench_part import Part, Table, run_alone
 
 REPEATS = {"tiny": 1, "short": 5, "full": 9}
 IMPORTS = ("pass", "import elastocal", "import numpy", "import casadi",
-           "from elastocal.manipulator.model import Model",
+           "from elastocal.model.manipulator import Model",
            "from elastocal.identification.identify import identify")  # fmt: skip
 # Not in one model: a distance sensor sees no position, a marker's orientation no position; payload
 # and weights act without being named.
@@ -62,7 +62,7 @@ def child() -> None:
     """Seconds of building the arm, imports apart, and of the first and second B of 60 poses."""
     from bench_arms import GEOMETRY, kr270, poses
 
-    from elastocal.manipulator.effects import CATALOGUE
+    from elastocal.model.effects import CATALOGUE
 
     clock = time.process_time
     with tempfile.TemporaryDirectory() as folder:

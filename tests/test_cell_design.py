@@ -12,7 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from elastocal.cell import DesignSpec, read_cell
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell.work_cell import read_cell
 from elastocal.errors import InputError
 
 CELL = """

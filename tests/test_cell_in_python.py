@@ -7,25 +7,19 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from elastocal.cell import (
+from elastocal.cell.arm_description import (
     CartesianNoise,
-    Cell,
-    DesignSpec,
     EffectChoice,
-    HalfSpace,
     ModelSpec,
-    Motion,
     Nominal,
     PolarNoise,
     Robot,
-    Solid,
-    TargetBox,
-    TargetPose,
     Tool,
     Tracker,
-    Visibility,
-    Workspace,
 )
+from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPose
+from elastocal.cell.work_cell import Cell
+from elastocal.cell.workspace_rules import HalfSpace, Solid, Visibility, Workspace
 from elastocal.errors import InputError
 
 FILE = """

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.cell import Workspace, read_cell
 from elastocal.cell.file_keys import Spot, direction
+from elastocal.cell.work_cell import read_cell
+from elastocal.cell.workspace_rules import Workspace
 from elastocal.errors import InputError
 
 CELL = """

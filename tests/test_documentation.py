@@ -8,10 +8,10 @@ import pytest
 import typer
 from support.robots import KR270
 
-from elastocal.cell import read_cell
-from elastocal.cli import app
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import read_cell
+from elastocal.cli.app import app
+from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

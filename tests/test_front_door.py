@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 
 import elastocal as ec
 from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.cli import app
+from elastocal.cli.app import app
 from elastocal.demo import LOAD_N, run_demo
-from elastocal.design.options import DesignOptions
-from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.diagnosis import DiagnosisOptions
 from elastocal.errors import option, options_as_flags
-from elastocal.identification.options import Options
+from elastocal.identification import Options
+from elastocal.planning import DesignOptions
 
 HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")
 LOAD = list(LOAD_N)
@@ -90,7 +90,8 @@ def test_type_checkers_see_the_same_homes_as_the_interpreter():
         for alias in node.names
     }
     assert sorted(imports) == sorted(ec.__all__)
-    assert imports.items() <= ec._HOME.items()
+    home = {name: f"elastocal.{room}" for room, names in ec.ROOMS.items() for name in names.split()}
+    assert imports.items() <= home.items()
 
 
 def test_the_verbs_are_not_hidden_by_packages_of_their_names():
@@ -164,8 +165,8 @@ def test_a_wrong_name_is_an_input_error_with_the_nearest(fit):
 def test_B_is_the_slope_of_the_prediction(fit):
     k, step = fit.model.names.index("joint3.compliance"), 1e-10
     x = fit.x + step * np.eye(len(fit.x))[k]
-    seen = fit.observations
-    moved, still = (fit.model.predict(seen.table, v, seen) for v in (x, fit.x))
+    observed = fit.observations
+    moved, still = (fit.model.predict(observed.table, v, observed) for v in (x, fit.x))
     np.testing.assert_allclose((moved - still) / step, fit.B[:, k], rtol=1e-4, atol=1.0)
 
 

@@ -12,14 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.errors import InputError
-from elastocal.tables import (
-    NO_UNIT,
-    Family,
-    csv_text,
-    layout_of_columns,
-    match_columns,
-    read_table,
-)
+from elastocal.tables import NO_UNIT, Family, csv_text, layout_of_columns, match_columns, read_table
 
 FAMILIES = {
     family.name: family

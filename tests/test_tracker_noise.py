@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.calibration import table_at
 
-from elastocal.cell import CartesianNoise, PolarNoise, Tracker
+from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError
 from elastocal.tracker_noise import available_noise, polar_axes, position_covariance
 

@@ -9,10 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from style import ROOT, Colours, draw, plt
 
-from elastocal.cell import read_cell
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import read_cell
 from elastocal.measurements import read_plan
-from elastocal.simulation.simulate import expand_plan, simulate, values_from
+from elastocal.model import Model
+from elastocal.simulation import expand_plan, values_from
+from elastocal.simulation.simulate import simulate
 
 TUTORIAL = ROOT / "docs" / "tutorial"
 TRUTH = {

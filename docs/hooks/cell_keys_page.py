@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pydantic import BaseModel
 
-from elastocal.cell import Cell, table_of
+from elastocal.cell.file_keys import table_of
+from elastocal.cell.work_cell import Cell
 from elastocal.config import tables_in
 
 HEAD = """# Keys of the cell file

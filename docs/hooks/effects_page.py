@@ -8,12 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from elastocal import demo
-from elastocal.cell import Cell, read_cell
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.choice import load_chain
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.effects.base import Effect
-from elastocal.manipulator.parameter import ParameterSpec, Setting
+from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.model import Chain, ParameterSpec, Setting, load_chain
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.base import Effect
 from elastocal.report.formatting import display
 
 STAGES = {

@@ -13,15 +13,22 @@ import numpy as np
 from draw import World
 from numpy.typing import NDArray
 
-from elastocal.cell import read_cell
-from elastocal.diagnosis.baseline import Baseline, fit_baseline
-from elastocal.diagnosis.gram import Grams, scales_of
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.noise import NoiseValues, NoisyData
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import read_cell
+from elastocal.diagnosis import (
+    Baseline,
+    DiagnosisData,
+    Grams,
+    Hypothesis,
+    NoiseValues,
+    NoisyData,
+    diagnosis_data_of,
+    fit_baseline,
+    possible,
+    project,
+    scales_of,
+)
 from elastocal.measurements import Measurements, read_measurements
+from elastocal.model import Model
 
 Array = NDArray[np.float64]
 
@@ -48,8 +55,8 @@ def distances(base: Baseline, world: World, without: tuple[str, ...] = ()) -> li
     settings, and s the width of its size prior.  `distance` is the smaller of the two.  Effects
     that the tool went `without` are no rivals.
     """
-    hypotheses, _ = possible(base.model, base.seen.table)
-    scene = scene_of(base, hypotheses)
+    hypotheses, _ = possible(base.model, base.observed.table)
+    scene = diagnosis_data_of(base, hypotheses)
     known = {(h.name, h.where): h for h in hypotheses}
     noise = NoiseValues(1 / world.noise.stated, world.noise.repeatability, 1e-6)
     whole = world.noise_free(world.visits)
@@ -79,7 +86,9 @@ def _explained(grams: Grams, h: Hypothesis) -> float:
     return float(grams.of_hypothesis(h).explained(float(scales_of(h).max())).max())
 
 
-def _beside(scene: Scene, data: NoisyData, h: Hypothesis, settings: dict[str, float]) -> NoisyData:
+def _beside(
+    scene: DiagnosisData, data: NoisyData, h: Hypothesis, settings: dict[str, float]
+) -> NoisyData:
     """The data with the columns of an effect that is there too."""
     C = scene.packed(h, np.array([settings[s.key] for s in h.settings]))
     return data.with_columns(C, np.full(C.shape[2], scales_of(h).max() ** -2.0))
@@ -95,7 +104,7 @@ def true_reduction(base: Baseline, answer: dict[str, Any], extended: Path, fresh
     start = dict(zip(base.model.names, base.x, strict=True))
     start |= {p["name"]: p["value"] for e in answer["effects"] for p in e["parameters"]}
     x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
-    after = fit_baseline(model, base.seen.table, x0=x0)
+    after = fit_baseline(model, base.observed.table, x0=x0)
     table = read(base.model, fresh)
     e0, e1 = (_error(fit.model, fit.x, table) for fit in (base, after))
     return 1 - e1 / e0

@@ -112,8 +112,8 @@ def _one_effect(every: Records) -> Iterator[Row]:
 def _alike(found: Sequence[Record]) -> Iterator[Row]:
     both = [both_reported(r["truth"], _rival(r), r["answer"]) for r in found]
     yield share("alike for any poses", "both reported", both, 0.95)
-    seen = [b for r, b in zip(found, both, strict=True) if _from_nothing(r) >= FAR]
-    yield share("… with d ≥ 5 from nothing", "both reported", seen)
+    observed = [b for r, b in zip(found, both, strict=True) if _from_nothing(r) >= FAR]
+    yield share("… with d ≥ 5 from nothing", "both reported", observed)
     yield share("alike for any poses", "one claimed with > 90 %",
                 [sure(r["answer"]) for r in found], at_most=0.05)  # fmt: skip
 

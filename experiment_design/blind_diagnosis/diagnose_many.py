@@ -15,7 +15,7 @@ import sys
 import time
 import traceback
 
-from elastocal.cli import app
+from elastocal.cli.app import app
 
 MESSAGE = 2000  # characters
 

@@ -20,7 +20,7 @@ def power(d: float, parameters: int) -> float:
     return float(ncx2.sf(least, parameters, d**2)) if d > 0 else LEVEL / CANDIDATES
 
 
-def seen(found: Sequence[Record]) -> str:
+def observed(found: Sequence[Record]) -> str:
     """The share of these worlds in which something was found, beside that power."""
     told = [r["answer"] is not None and _something(r) for r in found]
     able = [

@@ -13,16 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from arm_data import ArmSpec
 from chance import Values, log_uniform, positive, sign, spread
-from places import (
-    Places,
-    Site,
-    all_or_one,
-    at_joints,
-    at_links,
-    compensators,
-    markers,
-    only,
-)
+from places import Places, Site, all_or_one, at_joints, at_links, compensators, markers, only
 from world import Effect
 
 SPREAD = (0.6, 1.7)

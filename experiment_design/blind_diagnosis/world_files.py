@@ -86,8 +86,8 @@ def write_table(world: World, visits: Visits, readings: Array, path: Path) -> No
         force = [f"{v + 0.0:.3f}" for v in visits.force[i]]
         late = [f"{visits.time[i] / 60:.3f}", *[f"{int(a):d}" for a in visits.approach[i]]]
         for k, name in enumerate(world.spec.marker_names):
-            seen = [f"{v:.9f}" for v in readings[i, k]] + [f"{v:.2f}" for v in sigma[i, k]]
-            lines.append(",".join([str(pose), "0", name, *joints, *force, *seen, *late]))
+            observed = [f"{v:.9f}" for v in readings[i, k]] + [f"{v:.2f}" for v in sigma[i, k]]
+            lines.append(",".join([str(pose), "0", name, *joints, *force, *observed, *late]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

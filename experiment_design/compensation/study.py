@@ -23,16 +23,12 @@ from joblib import Parallel, delayed
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from elastocal.cell import read_cell
-from elastocal.compensation.compensate import compensate, nominal_flanges
-from elastocal.compensation.point import tool_point
-from elastocal.compensation.targets import read_targets
-from elastocal.manipulator.calibrated import read_calibrated
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.choice import load_chain
-from elastocal.manipulator.limits import joint_limits
+from elastocal.cell.work_cell import read_cell
+from elastocal.compensation import nominal_flanges, read_targets, tool_point
+from elastocal.compensation.compensate import compensate
 from elastocal.measurements import Measurements, write_measurements
-from elastocal.simulation.mujoco_arm import MujocoArm
+from elastocal.model import Chain, joint_limits, load_chain, read_calibrated
+from elastocal.simulation import MujocoArm
 
 HERE = Path(__file__).resolve().parent
 NOISE = 20e-6  # m per axis
@@ -117,8 +113,8 @@ class TrueArm:
     def measure(self, q: np.ndarray, force: np.ndarray) -> dict[str, np.ndarray]:
         """Marker positions (3,) in m in the tracker's frame, commanded to q under `force`."""
         rest = self.arm.equilibrium(q + self.offset, self.T[:3, :3].T @ force)
-        seen = self.arm.markers(rest)
-        return {m: self.T[:3, :3] @ p + self.T[:3, 3] for m, p in seen.items()}
+        observed = self.arm.markers(rest)
+        return {m: self.T[:3, :3] @ p + self.T[:3, 3] for m, p in observed.items()}
 
 
 def pose(place: np.ndarray, turned: Rotation) -> np.ndarray:
@@ -199,8 +195,8 @@ def measured(
 ) -> Measurements:
     rows = [(i, f, m) for i in range(len(q)) for f in range(2) for m in range(len(truth.markers))]
     names = tuple(truth.markers)
-    seen = [[truth.measure(pose, f * load) for f in range(2)] for pose in q]
-    position = np.array([seen[i][f][names[m]] for i, f, m in rows])
+    observed = [[truth.measure(pose, f * load) for f in range(2)] for pose in q]
+    position = np.array([observed[i][f][names[m]] for i, f, m in rows])
     index, state, marker = (np.array(v) for v in zip(*rows, strict=True))
     return Measurements(
         source="data.csv",

@@ -13,12 +13,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "kr270_reproduct
 
 from campaign import DEMO, campaign
 
-from elastocal.cell import read_cell
+from elastocal.cell.work_cell import read_cell
 from elastocal.demo import LOAD_N, published_compliances
-from elastocal.identification.variance.readings import Readings
-from elastocal.manipulator.model import Model
+from elastocal.identification import Readings
 from elastocal.measurements import read_plan
-from elastocal.simulation.simulate import expand_plan, values_from
+from elastocal.model import Model
+from elastocal.simulation import expand_plan, values_from
 from elastocal.tracker_noise import polar_axes
 
 EFFECT = 80e-6  # m, configuration effect in each direction

@@ -17,12 +17,15 @@ import pandas as pd
 from scenarios import SCENARIOS, Setting, setting
 from tables import report, totals
 
-from elastocal.identification.covariance.cluster import cluster_robust
-from elastocal.identification.published import eq14, ols
-from elastocal.identification.robust.asymptotic import asymptotic_covariance
-from elastocal.identification.robust.mm_estimate import mm_estimate
-from elastocal.identification.variance.screen import screen
-from elastocal.identification.variance.search import settle
+from elastocal.identification import (
+    asymptotic_covariance,
+    cluster_robust,
+    eq14,
+    mm_estimate,
+    ols,
+    screen,
+)
+from elastocal.identification.noise_choice import settle
 
 CHUNK = 50
 PUBLISHED_EVERY = 10  # thirty iterations of a weighted fit each: a tenth of the replicates do

@@ -22,13 +22,12 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Cell, EffectChoice, ModelSpec, Robot, Tool
+from elastocal.cell.arm_description import EffectChoice, ModelSpec, Robot, Tool
+from elastocal.cell.work_cell import Cell
+from elastocal.identification import reduce
 from elastocal.identification.identify import identify
-from elastocal.identification.reduction import reduce
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.urdf import read_urdf
 from elastocal.measurements import Measurements
+from elastocal.model import Chain, Model, read_urdf
 
 ARMS = ("UR10", "KR 270-2")
 EFFECTS = ("base_frame", "joint_offset", "link_geometry", "marker_position")

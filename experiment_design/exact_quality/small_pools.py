@@ -6,8 +6,8 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from elastocal.design.problem import Array, DesignProblem, IntArray
-from elastocal.planning.criteria import make_criterion
+from elastocal.planning import DesignProblem, make_criterion
+from elastocal.units import Array, IntArray
 
 CRITERIA = ("test_pose", "D", "E")
 ROWS = 3

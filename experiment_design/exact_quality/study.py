@@ -15,10 +15,9 @@ import numpy as np
 import pandas as pd
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.design.problem import DesignProblem
+from elastocal.planning import DesignProblem, random_plan, regular_plan, relax
 from elastocal.planning.exact_plan import exact_plan
-from elastocal.planning.exchange import exchange, random_plan, regular_plan
-from elastocal.planning.relaxation import relax
+from elastocal.planning.exchange import exchange
 
 EQUAL = 1e-9
 

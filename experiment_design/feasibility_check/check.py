@@ -18,11 +18,10 @@ from joblib import Parallel, delayed
 from mujoco_cell import MujocoCell
 from scipy.stats import qmc
 
-from elastocal.cell import read_cell
-from elastocal.design.feasibility.feasibility import Feasibility
-from elastocal.design.feasibility.rule_book import joint_limits
-from elastocal.design.feasibility.sight import END
-from elastocal.manipulator.choice import load_chain
+from elastocal.cell.work_cell import read_cell
+from elastocal.model import joint_limits, load_chain
+from elastocal.planning import Feasibility
+from elastocal.planning.collision import END
 
 HERE = Path(__file__).resolve().parent
 FORCE = np.array([0.0, 0.0, -2600.0])

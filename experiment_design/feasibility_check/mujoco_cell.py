@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Cell, Solid
-from elastocal.design.feasibility.bodies import Body, data_base
-from elastocal.design.feasibility.carriers import HANGING, WORLD
-from elastocal.design.feasibility.pairs import Pair
-from elastocal.manipulator.chain import Chain
+from elastocal.cell.work_cell import Cell
+from elastocal.cell.workspace_rules import Solid
+from elastocal.model import Chain
+from elastocal.planning import Body, Pair, data_base
+from elastocal.planning.bodies import HANGING, WORLD
 
 AWAY = (0.0, 0.0, 1e4)
 SEEN, UNSEEN = 0, 1  # geom groups: what hides a marker, and what does not

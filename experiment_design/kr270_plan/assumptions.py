@@ -13,16 +13,21 @@ from dataclasses import replace
 import numpy as np
 from compared import HERE, table_2
 
-from elastocal.cell import Cell, Tool, read_cell
-from elastocal.design.candidates import draw
-from elastocal.design.feasibility.feasibility import Feasibility
-from elastocal.design.joint_space import joint_space
-from elastocal.design.readings import ALL_LOADS, load_states
-from elastocal.design.setup import Known, set_up
-from elastocal.design.shares import shares_of
-from elastocal.design.target_poses import TargetPoses
-from elastocal.manipulator.model import Model
-from elastocal.planning.relaxation import relax
+from elastocal.cell.arm_description import Tool
+from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.model import Model
+from elastocal.planning import (
+    Feasibility,
+    Known,
+    TargetPoses,
+    draw,
+    joint_space,
+    load_states,
+    relax,
+    set_up,
+    shares_of,
+)
+from elastocal.planning.information import ALL_LOADS
 
 CANDIDATES = 20_000
 SETS = 5  # sets of twenty test poses, drawn over the joint limits

@@ -10,12 +10,14 @@ from compared import DEMO, Study
 from joblib import Parallel, delayed
 
 from elastocal.demo import published_compliances
-from elastocal.design.readings import ALL_LOADS, rows_of
+from elastocal.identification import Options
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
-from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
-from elastocal.simulation.simulate import simulate, values_from
+from elastocal.model import Model
+from elastocal.planning import rows_of
+from elastocal.planning.information import ALL_LOADS
+from elastocal.simulation import values_from
+from elastocal.simulation.simulate import simulate
 
 STEP = 1e-6  # rad, differences of the tool's position
 ROUNDS = 6

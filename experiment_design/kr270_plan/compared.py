@@ -8,19 +8,27 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell import Cell, read_cell
-from elastocal.design.candidates import draw
-from elastocal.design.checkpoint import Checkpoint
-from elastocal.design.design import design
-from elastocal.design.feasibility.feasibility import Feasibility
-from elastocal.design.options import DesignOptions
-from elastocal.design.plan import Plan
-from elastocal.design.readings import ALL_LOADS, LoadStates, load_states
-from elastocal.design.setup import Known, Pool, Setup, set_up
-from elastocal.design.shares import shares_of
-from elastocal.design.target_poses import TargetPoses, test_poses
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.measurements import read_plan
+from elastocal.model import Model
+from elastocal.planning import (
+    Checkpoint,
+    DesignOptions,
+    Feasibility,
+    FeasiblePool,
+    Known,
+    LoadStates,
+    Plan,
+    Setup,
+    TargetPoses,
+    draw,
+    load_states,
+    set_up,
+    shares_of,
+)
+from elastocal.planning.design import design
+from elastocal.planning.information import ALL_LOADS
+from elastocal.planning.test_poses import test_poses
 
 HERE = Path(__file__).parent
 DEMO = Path(str(files("elastocal.demo")))
@@ -39,7 +47,7 @@ class Study:
     feasibility: Feasibility
     targets: TargetPoses
     setup: Setup
-    pool: Pool
+    pool: FeasiblePool
 
     @classmethod
     def of(cls, name: str, candidates: int) -> Study:

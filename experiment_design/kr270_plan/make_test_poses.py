@@ -10,11 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell import read_cell
-from elastocal.design.candidates import sobol
-from elastocal.design.feasibility.feasibility import Feasibility
-from elastocal.design.joint_space import joint_space
-from elastocal.manipulator.choice import load_chain
+from elastocal.cell.work_cell import read_cell
+from elastocal.model import load_chain
+from elastocal.planning import Feasibility, joint_space, sobol
 
 HERE = Path(__file__).parent
 PER_LEVEL = 4

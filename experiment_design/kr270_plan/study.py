@@ -15,8 +15,7 @@ import numpy as np
 from campaigns import realised
 from compared import Study, table_2
 
-from elastocal.design.plan import Plan
-from elastocal.design.plan_file import plan_rows, write_plan
+from elastocal.planning import Plan, plan_rows, write_plan
 from elastocal.report.plan_picture import write_plan_picture
 
 HERE = Path(__file__).parent

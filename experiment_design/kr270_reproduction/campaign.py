@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell import read_cell
+from elastocal.cell.work_cell import read_cell
 from elastocal.demo import LOAD_N, REPEATS, published_compliances, reading_sigma
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
 from elastocal.measurements import read_plan
-from elastocal.simulation.simulate import expand_plan, simulate, values_from
+from elastocal.model import Model, observe
+from elastocal.simulation import expand_plan, values_from
+from elastocal.simulation.simulate import simulate
 
 DEMO = Path(str(files("elastocal.demo")))
 
@@ -56,9 +56,9 @@ def campaign() -> Campaign:
     table = simulate(model, rows, x, 0, noise=False)
     at = model.regressor(table, x)
     visible = np.flatnonzero(np.linalg.norm(at.B, axis=0) > 1e-6 * np.linalg.norm(at.B))
-    seen = observe(table, "deflection")
-    configuration = np.repeat(seen.configuration, 3)
-    direction = np.tile(np.arange(3), len(seen.lead))
+    observed = observe(table, "deflection")
+    configuration = np.repeat(observed.configuration, 3)
+    direction = np.tile(np.arange(3), len(observed.lead))
     deflection_sigma = reading_sigma(DEMO) * np.sqrt(2)
     return Campaign(
         names=tuple(model.names[i] for i in visible),

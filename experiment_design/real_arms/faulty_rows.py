@@ -8,13 +8,11 @@ from __future__ import annotations
 import numpy as np
 from prepare import HERE, prepare
 
-from elastocal.cell import read_cell
-from elastocal.identification.identify import Options, identify
-from elastocal.identification.outliers import blocks
-from elastocal.identification.result import Calibration
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.cell.work_cell import read_cell
+from elastocal.identification import Calibration, Options, blocks
+from elastocal.identification.identify import identify
 from elastocal.measurements import Measurements, read_measurements
+from elastocal.model import Model, observe
 
 SPLITS, TEST_SHARE = 5, 0.2
 

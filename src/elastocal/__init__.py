@@ -13,28 +13,25 @@ Every name is loaded when it is first used, so that `import elastocal` costs not
 """
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from elastocal.cell import Cell, Robot, Tool, Tracker, Workspace, read_cell
+    from elastocal.cell.arm_description import Robot, Tool, Tracker
+    from elastocal.cell.work_cell import Cell, read_cell
+    from elastocal.cell.workspace_rules import Workspace
     from elastocal.compensation.compensate import Compensation
-    from elastocal.design.plan import Plan
-    from elastocal.diagnosis.result import Diagnosis
-    from elastocal.errors import (
-        ElastocalError,
-        InputError,
-        InsufficientDataError,
-        UnknownNameError,
-    )
-    from elastocal.identification.knowledge import Knowledge
+    from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
+    from elastocal.identification.knowledge_file import Knowledge
     from elastocal.identification.result import Calibration
-    from elastocal.manipulator.calibrated import CalibratedArm, read_calibrated
-    from elastocal.manipulator.effects.base import Effect
-    from elastocal.manipulator.model import Model
-    from elastocal.manipulator.parameter import Parameter
     from elastocal.measurements import Measurements
+    from elastocal.model.arm import Parameter
+    from elastocal.model.calibrated import CalibratedArm, read_calibrated
+    from elastocal.model.effects.base import Effect
+    from elastocal.model.manipulator import Model
+    from elastocal.planning.plan import Plan
     from elastocal.plugins import register_criterion, register_effect, register_noise_model
     from elastocal.verbs import compensate, design, diagnose, identify, simulate
 
@@ -42,18 +39,18 @@ __version__ = "0.1.0"
 
 
 def loaded_on_demand(
-    package: str, homes: Mapping[str, Sequence[str]]
+    package: str, rooms: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Returns `__getattr__` and `__dir__` of a package whose names are loaded when they are used.
 
-    `homes` gives the names that each module has (PEP 562).
+    `rooms` gives the names that each module of the package has, with spaces between (PEP 562).
     """
-    home_of = {name: home for home, names in homes.items() for name in names}
+    home_of = {name: room for room, names in rooms.items() for name in names.split()}
 
     def load(name: str) -> Any:
         if name not in home_of:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        value = getattr(import_module(home_of[name]), name)
+        value = getattr(import_module(f"{package}.{home_of[name]}"), name)
         setattr(sys.modules[package], name, value)
         return value
 
@@ -61,26 +58,21 @@ def loaded_on_demand(
 
 
 # Where each name lives; a test holds this against the imports above.
-_HOMES = {
-    "elastocal.cell": ("Cell", "Robot", "Tool", "Tracker", "Workspace", "read_cell"),
-    "elastocal.compensation.compensate": ("Compensation",),
-    "elastocal.design.plan": ("Plan",),
-    "elastocal.diagnosis.result": ("Diagnosis",),
-    "elastocal.errors": (
-        "ElastocalError",
-        "InputError",
-        "InsufficientDataError",
-        "UnknownNameError",
-    ),
-    "elastocal.identification.knowledge": ("Knowledge",),
-    "elastocal.identification.result": ("Calibration",),
-    "elastocal.manipulator.calibrated": ("CalibratedArm", "read_calibrated"),
-    "elastocal.manipulator.effects.base": ("Effect",),
-    "elastocal.manipulator.model": ("Model",),
-    "elastocal.manipulator.parameter": ("Parameter",),
-    "elastocal.measurements": ("Measurements",),
-    "elastocal.plugins": ("register_criterion", "register_effect", "register_noise_model"),
-    "elastocal.verbs": ("compensate", "design", "diagnose", "identify", "simulate"),
+ROOMS = {
+    "cell": "Cell Robot Tool Tracker Workspace read_cell",
+    "compensation.compensate": "Compensation",
+    "planning.plan": "Plan",
+    "diagnosis.diagnosis": "Diagnosis",
+    "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
+    "identification.knowledge_file": "Knowledge",
+    "identification.result": "Calibration",
+    "model.calibrated": "CalibratedArm read_calibrated",
+    "model.effects.base": "Effect",
+    "model.manipulator": "Model",
+    "model.arm": "Parameter",
+    "measurements": "Measurements",
+    "plugins": "register_criterion register_effect register_noise_model",
+    "verbs": "compensate design diagnose identify simulate",
 }
 
 __all__ = [
@@ -116,4 +108,4 @@ __all__ = [
 ]
 
 
-__getattr__, __dir__ = loaded_on_demand(__name__, _HOMES)
+__getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 VIEWS = "elastocal.report.notebook"
-PAGES = "elastocal.report.result_pages"
+PAGES = "elastocal.report.page"
 WRITERS = "elastocal.saving"
 
 

@@ -17,13 +17,13 @@ from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
 from elastocal.errors import InputError
 from elastocal.files import read_text
 from elastocal.text import did_you_mean, listed, nearest, quoted
+from elastocal.units import Array
 
 MAX_BYTES = 5_000_000
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -32,7 +32,6 @@ UNIT_SUFFIX = re.compile(
     r"|deg_per_s|rad_per_s|m_per_s|mm_per_s)$"
 )
 
-Array = NDArray[np.float64]
 Keys = Sequence[str | int]
 
 

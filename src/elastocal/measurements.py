@@ -15,9 +15,7 @@ from elastocal.errors import InputError
 from elastocal.files import atomic_writer
 from elastocal.tables import (
     NO_UNIT,
-    Array,
     Family,
-    IntArray,
     Labels,
     Layout,
     RawTable,
@@ -28,7 +26,7 @@ from elastocal.tables import (
     write_csv,
 )
 from elastocal.text import did_you_mean, is_label, listed, quoted
-from elastocal.units import ANGLE, LENGTH, TIME
+from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 
 if TYPE_CHECKING:
     import pandas as pd

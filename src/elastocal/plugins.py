@@ -22,14 +22,13 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from elastocal import plugin_loader
-from elastocal.cell import Cell
+from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.identification.variance.readings import Readings
-from elastocal.identification.variance.structure import NoiseModel
-from elastocal.manipulator import effects, rigid
-from elastocal.manipulator.arm import Arm, Spring
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects.base import (
+from elastocal.identification.noise_structure import NoiseModel, Readings
+from elastocal.model import effects, rigid
+from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
+from elastocal.model.chain import Chain
+from elastocal.model.effects.base import (
     Effect,
     Symbols,
     index,
@@ -38,8 +37,8 @@ from elastocal.manipulator.effects.base import (
     motion_unit,
     turning_joints,
 )
-from elastocal.manipulator.effects.compliances import LoadedEffect, TorqueEffect, add_deflection
-from elastocal.manipulator.effects.driven import (
+from elastocal.model.effects.compliances import LoadedEffect, TorqueEffect, add_deflection
+from elastocal.model.effects.driven import (
     BaseMotion,
     DrivenEffect,
     JointMotion,
@@ -47,7 +46,6 @@ from elastocal.manipulator.effects.driven import (
     LinkLength,
     MarkerMotion,
 )
-from elastocal.manipulator.parameter import ParameterSpec, Setting
 
 __all__ = [
     "Arm",
@@ -105,7 +103,7 @@ def register_noise_model(model: N) -> N:
     Raises InputError, with file and line of the call, where `model` is none, or has the name of
     another one.
     """
-    from elastocal.identification.variance.structure import register
+    from elastocal.identification.noise_structure import register
 
     return _registered(register, model)
 

@@ -17,19 +17,19 @@ import numpy as np
 
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text
-from elastocal.manipulator.inputs import given_force
+from elastocal.model.arm import given_force
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from elastocal.compensation.compensate import Compensation
-    from elastocal.design.plan import Plan
-    from elastocal.diagnosis.result import Diagnosis
+    from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
-    from elastocal.manipulator.calibrated import CalibratedArm
     from elastocal.measurements import Measurements
+    from elastocal.model.calibrated import CalibratedArm
+    from elastocal.planning.plan import Plan
 
 # One verb's result should not load another verb: each function imports what it needs.
 
@@ -62,7 +62,7 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
     `command` is the command line that repeats the design.  Raises InputError for a path that ends
     in .json, since that of the summary is made of it.
     """
-    from elastocal.design.plan_file import plan_rows, write_plan, write_plan_json
+    from elastocal.planning.plan import plan_rows, write_plan, write_plan_json
 
     require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
     rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
@@ -73,7 +73,7 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
 
 def save_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
     """The diagnosis as JSON (schema elastocal/diagnosis/1)."""
-    from elastocal.diagnosis.published import publish
+    from elastocal.diagnosis.diagnosis import publish
 
     assert diagnosis.model is not None  # `diagnose` states it
     content = publish(diagnosis, diagnosis.model, diagnosis.data)
@@ -86,7 +86,7 @@ def save_compensation(found: Compensation, path: Path, partial: bool = False) ->
     Raises InsufficientDataError where targets are not reached, unless `partial`: their rows are
     then left empty.
     """
-    from elastocal.compensation.commands_file import check_reached, commands_csv
+    from elastocal.compensation.compensate import check_reached, commands_csv
 
     if not partial:
         check_reached(found)
@@ -132,10 +132,9 @@ def wish_of(
     Raises:
         InputError: An option is wrong; the message names it.
     """
-    from elastocal.export.export import Wish
-    from elastocal.export.formats import format_of
-    from elastocal.export.kept import Conditions
-    from elastocal.export.urdf import Frames
+    from elastocal.export.export import Wish, format_of
+    from elastocal.export.exportable import Conditions
+    from elastocal.export.urdf_file import Frames
 
     chosen = format_of(path, format)
     for name, value in (("temperature_c", temperature_c), ("time_s", time_s)):
@@ -158,7 +157,7 @@ def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str])
     pose that is visited again under the same force is a configuration of its own: 4, 4/2, ….
     Raises InputError where the place cannot be written.
     """
-    from elastocal.design.plan_file import PlanRows, write_plan
+    from elastocal.planning.plan import PlanRows, write_plan
 
     names = []
     visits: Counter[tuple[int, bytes]] = Counter()

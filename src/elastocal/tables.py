@@ -26,13 +26,11 @@ from elastocal.csv_lines import Chunk, CsvLines, first_bad_cell
 from elastocal.errors import InputError
 from elastocal.files import open_input
 from elastocal.text import did_you_mean, is_label, listed, quoted
-from elastocal.units import to_si
+from elastocal.units import Array, IntArray, to_si
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 NO_UNIT = ("",)
 IGNORED = ("#", "_", "note")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from elastocal.cell import CartesianNoise, PolarNoise, Tracker
+from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
-
-Array = NDArray[np.float64]
+from elastocal.units import Array
 
 
 def available_noise(table: Measurements, tracker: Tracker) -> str:

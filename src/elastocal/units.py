@@ -1,9 +1,10 @@
-"""Units of file columns and keys: their way to SI, and those that other people's tables use."""
+"""Types of arrays, and units of file columns and keys on their way to SI."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
@@ -16,6 +17,12 @@ Value = TypeVar("Value", float, NDArray[np.float64])
 _MULTIPLY = {"deg": math.pi / 180.0, "deg_per_s": math.pi / 180.0, "min": 60.0}
 _DIVIDE = {"mm": 1e3, "um": 1e6, "urad": 1e6, "ppm": 1e6}
 _SI = {"", "si", "m", "rad", "N", "Nm", "s", "C", "kg"}
+
+# The types that every room passes on: arrays of numbers, and who is told of progress.
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Progress = Callable[[str], None]
 
 LENGTH = ("mm", "m", "um")
 ANGLE = ("deg", "rad")

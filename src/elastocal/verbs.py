@@ -15,29 +15,28 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.cell import Cell, Motion, TargetBox, TargetPath, TargetPose
+from elastocal.cell.plan_wishes import Motion, TargetBox, TargetPath, TargetPose
+from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
-from elastocal.manipulator.calibrated import CalibratedArm
-from elastocal.manipulator.choice import cell_of
-from elastocal.manipulator.inputs import given_force
-from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
+from elastocal.model.arm import given_force
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.choice import cell_of
+from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed, quoted
 
 if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
-    from elastocal.compensation.point import ToolPoint
-    from elastocal.compensation.targets import Targets
-    from elastocal.design.options import DesignOptions, Effort
-    from elastocal.design.plan import Plan
-    from elastocal.diagnosis.result import Diagnosis
-    from elastocal.identification.constrained.constraints import Constraints
-    from elastocal.identification.constrained.prior import GaussianPrior
+    from elastocal.compensation.tool_targets import Targets, ToolPoint
+    from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.intervals import IntervalKind
-    from elastocal.identification.knowledge import Knowledge
-    from elastocal.identification.noise import WeightKind
+    from elastocal.identification.knowledge import Constraints, GaussianPrior
+    from elastocal.identification.knowledge_file import Knowledge
     from elastocal.identification.options import FaultyReadings, Method
     from elastocal.identification.result import Calibration
+    from elastocal.identification.weighted_problem import WeightKind
+    from elastocal.planning.plan import Plan
+    from elastocal.planning.search import DesignOptions, Effort
 
 # One verb should not load another: each imports the package that it calls.
 
@@ -140,7 +139,7 @@ def design(
         <Plan kuka_kr270_2: 6 poses by D, ...>
         >>> plan.save("six.csv")
     """
-    from elastocal.design.design import design as run
+    from elastocal.planning.design import design as run
 
     cell, options = design_request(
         model, poses=poses, criterion=criterion, target=target, curve=curve, fixed=fixed,
@@ -171,7 +170,7 @@ def design_request(
 
     Raises InputError that names the keyword.
     """
-    from elastocal.design.options import DesignOptions
+    from elastocal.planning.search import DesignOptions
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
     if isinstance(prior, str):
@@ -261,7 +260,7 @@ def _prior_of(
     knowledge: Knowledge | str | Path | None, model: Model
 ) -> tuple[GaussianPrior | None, tuple[str, ...]]:
     """What a knowledge file says that counts for a plan, and a sentence on what does not."""
-    from elastocal.identification.constrained.constraints import Constraints
+    from elastocal.identification.knowledge import Constraints
 
     known = knowledge_of(knowledge)
     if known is None:
@@ -317,7 +316,7 @@ def simulate(
         >>> ec.identify("cell.toml", data)["joint3.compliance"].ci95
         (3.3...e-07, 3.4...e-07)
     """
-    from elastocal.identification.checks import check_limits
+    from elastocal.identification.start import check_limits
     from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
     from elastocal.simulation.simulate import simulate as run
 
@@ -347,7 +346,7 @@ def simulate(
 
 
 def _poses(model: Model, plan: Plan | Table | ArrayLike) -> Measurements:
-    from elastocal.design.plan import Plan
+    from elastocal.planning.plan import Plan
 
     if isinstance(plan, Plan):
         return plan.table()
@@ -500,8 +499,8 @@ def diagnose(
         >>> why.effects[0].probability > 0.9
         True
     """
+    from elastocal.diagnosis.diagnose import DiagnosisOptions
     from elastocal.diagnosis.diagnose import diagnose as run
-    from elastocal.diagnosis.options import DiagnosisOptions
 
     options = DiagnosisOptions(_whole("seed", seed, 0), _names("without", without), false_alarm)
     if extra_poses is not None:
@@ -520,7 +519,7 @@ def with_extra_poses(
     model: Model, table: Measurements, found: Diagnosis, most: int, seed: int, progress: Progress
 ) -> Diagnosis:
     """The diagnosis with the fewest of at most `most` poses that tell its rivals apart."""
-    from elastocal.diagnosis.separate.plan import plan_extra
+    from elastocal.diagnosis.extra_poses import plan_extra
 
     progress("looking for poses that tell the rivals apart")
     extra = plan_extra(model, table, found, most=most, seed=seed, progress=progress)
@@ -573,7 +572,7 @@ def compensate(
         (True, True)
     """
     from elastocal.compensation.compensate import compensate as run
-    from elastocal.compensation.targets import FRAMES
+    from elastocal.compensation.tool_targets import FRAMES
     from elastocal.identification.result import Calibration
 
     if isinstance(arm, Calibration):
@@ -597,7 +596,7 @@ def compensate(
 
 
 def _tool_point(cell: Cell, point: str | ArrayLike | None) -> ToolPoint:
-    from elastocal.compensation.point import tool_point
+    from elastocal.compensation.tool_targets import tool_point
 
     if point is None or isinstance(point, str):
         return tool_point(cell, point)
@@ -612,7 +611,7 @@ def _targets(
     frame: Literal["base", "tracker"],
     force: NDArray[np.float64] | None,
 ) -> Targets:
-    from elastocal.compensation.targets import Targets, read_targets, targets_at
+    from elastocal.compensation.tool_targets import Targets, read_targets, targets_at
 
     if isinstance(targets, Targets):
         return targets
@@ -668,7 +667,7 @@ def _table(name: str, model: Model, given: Table) -> Measurements:
 
 def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:
     """What a file and the option `physical` state together; None where neither was given."""
-    from elastocal.identification.knowledge import Knowledge, read_knowledge
+    from elastocal.identification.knowledge_file import Knowledge, read_knowledge
 
     if given is None:
         return Knowledge(physical=True, source=option("physical", True)) if physical else None
@@ -677,7 +676,7 @@ def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -
 
 
 def _gaussian(prior: Prior | None) -> GaussianPrior | None:
-    from elastocal.identification.constrained.prior import GaussianPrior
+    from elastocal.identification.knowledge import GaussianPrior
 
     if prior is None or isinstance(prior, GaussianPrior):
         return prior

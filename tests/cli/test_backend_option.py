@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from elastocal.cli import app
-from elastocal.manipulator.backend import VARIABLE, chosen_backend
+from elastocal.cli.app import app
+from elastocal.model import chosen_backend
+from elastocal.model.evaluate import VARIABLE
 
 ABSENT = ["identify", "no-cell.toml", "no-data.csv"]
 

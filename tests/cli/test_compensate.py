@@ -12,11 +12,10 @@ import pytest
 from support.calibration import with_values
 from typer.testing import CliRunner
 
-from elastocal.cell import read_cell
-from elastocal.cli import app
-from elastocal.manipulator.calibrated import nominal_flange_rows
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import read_cell
+from elastocal.cli.app import app
+from elastocal.model import Model, nominal_flange_rows
+from elastocal.model.effects import CATALOGUE
 
 URDF = Path(__file__).parents[2] / "src" / "elastocal" / "demo" / "kr270_2.urdf"
 CELL = f"""
@@ -103,8 +102,8 @@ def test_the_marker_named_is_where_simulate_sees_it(folder):
         ["simulate", str(folder / "cell.toml"), str(out), "-o", str(folder / "s.csv"),
          "--no-noise", *sets],
     )  # fmt: skip
-    seen = [row for row in csv.DictReader((folder / "s.csv").open()) if row["marker"] == "M2"]
-    x = [float(row["x_m"]) for row in seen]
+    observed = [row for row in csv.DictReader((folder / "s.csv").open()) if row["marker"] == "M2"]
+    x = [float(row["x_m"]) for row in observed]
     assert np.allclose(x, [1.8, 1.81, 1.82], atol=1e-7)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from elastocal.cli import app
+from elastocal.cli.app import app
 
 
 def demo(folder: Path):

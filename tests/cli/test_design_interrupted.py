@@ -16,8 +16,8 @@ from support.design_commands import (
     write_cell,
 )
 
-from elastocal.design import select
-from elastocal.design.checkpoint import Stage
+from elastocal.planning import Stage
+from elastocal.planning import search as select
 
 GOING_ON = "going on with the design that was interrupted"
 # A child may inherit that SIGINT is ignored; here it must not.

@@ -11,7 +11,7 @@ from support.robots import KR270
 from support.urdf_text import arm
 from typer.testing import CliRunner, Result
 
-from elastocal.cli import app
+from elastocal.cli.app import app
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from support.cells import COMPLIANCE, SLANTED, TABLE_2, table_of
 from support.robots import KR270
 from typer.testing import CliRunner
 
-from elastocal.cell import read_cell
-from elastocal.cli import app
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import read_cell
+from elastocal.cli.app import app
+from elastocal.model import Model
 
 CELL = f"""\
 [robot]

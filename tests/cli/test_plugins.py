@@ -19,13 +19,12 @@ from typer.testing import CliRunner, Result
 
 from elastocal import plugin_loader
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli import app
-from elastocal.diagnosis.extended_cell import write_extended_cell
+from elastocal.cli.app import app
+from elastocal.diagnosis import write_extended_cell
 from elastocal.errors import InputError
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements, write_measurements
+from elastocal.model import Chain, Model
+from elastocal.model.effects import CATALOGUE
 from elastocal.plugins import load_plugins
 
 CELL = f"""\

@@ -14,9 +14,9 @@ from rich.console import Console
 from support.study_folders import SCRIPT, numbers, run_study, write_study
 from typer.testing import CliRunner
 
-from elastocal.cli import app
-from elastocal.cli.study import StudyProgress
-from elastocal.studies import read_results
+from elastocal.cli.app import app
+from elastocal.cli.study_command import StudyProgress
+from elastocal.studies.study_results import read_results
 
 # A child may inherit that SIGINT is ignored; here it must not.
 PROGRAM = (
@@ -247,7 +247,7 @@ def test_a_study_on_a_cluster_is_interrupted_and_goes_on(tmp_path):
 
 def test_a_terminal_sees_a_bar_with_rate_and_time_left(monkeypatch):
     screen = Console(file=io.StringIO(), force_terminal=True, width=120)
-    monkeypatch.setattr("elastocal.cli.study.console", lambda stderr: screen)
+    monkeypatch.setattr("elastocal.cli.study_command.console", lambda stderr: screen)
     with StudyProgress(True) as progress:
         progress.show(40, 10, 1)
         progress.show(40, 11, 2)

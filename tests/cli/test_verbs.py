@@ -9,8 +9,7 @@ from support.exports import write_result
 from support.files import write_campaign
 from typer.testing import CliRunner
 
-from elastocal.cli import app
-from elastocal.cli.app import VERBS
+from elastocal.cli.app import VERBS, app
 
 SIMULATE = ("simulate", "cell.toml", "plan.csv", "-o", "out.csv")
 IDENTIFY = ("identify", "cell.toml", "data.csv", "-q")

@@ -21,12 +21,11 @@ from support.cells import (
 )
 from support.commands import calibrated, circumstances, erring, tool_errors
 
-from elastocal.cell import Nominal
-from elastocal.compensation.compensate import compensate, nominal_flanges
-from elastocal.compensation.point import tool_point
-from elastocal.compensation.targets import targets_at
+from elastocal.cell.arm_description import Nominal
+from elastocal.compensation import nominal_flanges, targets_at, tool_point
+from elastocal.compensation.compensate import compensate
 from elastocal.errors import InputError
-from elastocal.manipulator.model import Model
+from elastocal.model import Model
 
 EVERYWHERE = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 SOME = ("joint_offset", "link_geometry:link3", "joint_compliance")

@@ -9,10 +9,9 @@ import pytest
 from support.cells import COMPLIANCE, DOWN, LOAD_POINT, kr270_cell, kr270_chain
 from support.commands import calibrated
 
-from elastocal.compensation.compensate import compensate, nominal_flanges
-from elastocal.compensation.point import tool_point
-from elastocal.compensation.targets import targets_at
-from elastocal.simulation.mujoco_arm import MujocoArm
+from elastocal.compensation import nominal_flanges, targets_at, tool_point
+from elastocal.compensation.compensate import compensate
+from elastocal.simulation import MujocoArm
 
 POSTURES = np.radians(
     [[10, -80, 90, 30, 50, -20], [-60, -60, 60, -80, 60, 100], [80, -110, 100, 120, -70, -150]]

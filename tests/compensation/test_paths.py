@@ -8,11 +8,9 @@ import numpy as np
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated
 
-from elastocal.compensation.compensate import compensate, nominal_flanges
-from elastocal.compensation.nominal import nominal_path
-from elastocal.compensation.point import tool_point
-from elastocal.compensation.targets import targets_at
-from elastocal.manipulator.limits import joint_limits
+from elastocal.compensation import nominal_flanges, nominal_path, targets_at, tool_point
+from elastocal.compensation.compensate import compensate
+from elastocal.model import joint_limits
 
 HOME = np.radians([0, -90, 90, 0, 40, 0])
 PLACE = np.array([0.1, 0.0, 0.2])

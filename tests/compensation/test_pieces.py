@@ -13,11 +13,16 @@ from hypothesis import strategies as st
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated
 
-from elastocal.compensation.commands_file import commands_csv, summary
+from elastocal.compensation import (
+    commands_csv,
+    one_target,
+    read_targets,
+    share_of_levels,
+    summary,
+    targets_at,
+    tool_point,
+)
 from elastocal.compensation.compensate import compensate
-from elastocal.compensation.levels import share_of_levels
-from elastocal.compensation.point import tool_point
-from elastocal.compensation.targets import one_target, read_targets, targets_at
 from elastocal.errors import ElastocalError, InputError
 from elastocal.measurements import read_plan
 

@@ -10,10 +10,16 @@ from scipy.spatial.transform import Rotation
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated, erring, tool_errors
 
-from elastocal.compensation.compensate import compensate, nominal_flanges
-from elastocal.compensation.point import tool_point
-from elastocal.compensation.table import EXACT, Grid, box_grid, correction_table, joint_grid
-from elastocal.compensation.targets import targets_at
+from elastocal.compensation import (
+    CorrectionGrid,
+    box_grid,
+    joint_grid,
+    nominal_flanges,
+    targets_at,
+    tool_point,
+)
+from elastocal.compensation.compensate import compensate
+from elastocal.compensation.correction_table import EXACT, correction_table
 from elastocal.errors import InputError
 
 EFFECTS = ("joint_offset", "link_geometry", "joint_compliance")
@@ -28,9 +34,9 @@ def arm_and_point():
     return arm, tool_point(cell, "M1")
 
 
-def joint_box(counts) -> Grid:
+def joint_box(counts) -> CorrectionGrid:
     axes = zip(LOW, HIGH, counts, strict=True)
-    return Grid(tuple(np.linspace(a, b, n) if n > 1 else np.array([(a + b) / 2])
+    return CorrectionGrid(tuple(np.linspace(a, b, n) if n > 1 else np.array([(a + b) / 2])
                       for a, b, n in axes), True)  # fmt: skip
 
 

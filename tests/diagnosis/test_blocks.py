@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.diagnosis_data import random_blocks
 
-from elastocal.diagnosis.blocks import Blocks
+from elastocal.diagnosis import Blocks
 
 SEEDS = range(5)
 

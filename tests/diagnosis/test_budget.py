@@ -6,20 +6,22 @@ import numpy as np
 import pytest
 from support.diagnosis_data import SIGMA, campaign, diagnosed, random_blocks, random_data
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.budget import _left_out_together
-from elastocal.diagnosis.heldout import (
+from elastocal.diagnosis import (
+    Item,
+    NoiseValues,
     blocks_of_time,
+    covariance,
+    diagnosis_data_of,
+    fit_baseline,
+    fit_set,
     left_out_residual,
     noise_rms,
+    possible,
+    project,
     rms_with_interval,
     squared_lengths,
 )
-from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.model_set import Item, fit_set
-from elastocal.diagnosis.noise import NoiseValues, covariance
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.scene import scene_of
+from elastocal.diagnosis.gap import _left_out_together
 
 NOISE = NoiseValues(1.2, np.array([4e-6, 9e-6, 1e-5]), 0.4)
 SEEDS = range(4)
@@ -70,13 +72,13 @@ def test_a_drift_is_judged_on_hours_that_were_left_out() -> None:
     """Between two neighbours it needs no model; what does not go with time is left out singly."""
     model, table = campaign("thermal_expansion:link2")
     base = fit_baseline(model, table)
-    scene = scene_of(base, possible(model, table)[0])
-    (h,) = (h for h in scene.hypotheses if (h.name, h.where) == ("thermal_expansion", "link2"))
-    chosen = fit_set(scene, (Item(h, np.array([1200.0]), 0.0),))
-    drift = _left_out_together(scene, chosen)
+    dataset = diagnosis_data_of(base, possible(model, table)[0])
+    (h,) = (h for h in dataset.hypotheses if (h.name, h.where) == ("thermal_expansion", "link2"))
+    chosen = fit_set(dataset, (Item(h, np.array([1200.0]), 0.0),))
+    drift = _left_out_together(dataset, chosen)
     assert drift is not None and len(np.unique(drift)) == 10
-    (still,) = (h for h in scene.hypotheses if h.label == "encoder_scale at joint3")
-    assert _left_out_together(scene, fit_set(scene, (Item(still, np.zeros(0), 0.0),))) is None
+    (still,) = (h for h in dataset.hypotheses if h.label == "encoder_scale at joint3")
+    assert _left_out_together(dataset, fit_set(dataset, (Item(still, np.zeros(0), 0.0),))) is None
 
 
 @pytest.mark.parametrize("seed", SEEDS)

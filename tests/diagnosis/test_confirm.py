@@ -8,7 +8,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from elastocal.diagnosis.confirm import FRESH, Change, Truth, shrinkage
+from elastocal.diagnosis import Change, PosteriorDraw
+from elastocal.diagnosis.shrinkage import FRESH, shrinkage
 
 SIGMA, P, K = 1e-5, 8, 2
 N = 10_000  # measured poses: as many kinds of pose as there are
@@ -20,22 +21,25 @@ def columns(poses: int, rng: np.random.Generator) -> np.ndarray:
     return 1e-5 * rng.normal(size=(poses, 3, 3, P + K))
 
 
-def world(seed: int, poses: int, size: float) -> tuple[Truth, float]:
+def world(seed: int, poses: int, size: float) -> tuple[PosteriorDraw, float]:
     """What is known of an effect of rms `size` (m) after a fit with and one without it, and by
     how much the errors at 100 fresh poses really fall."""
     rng = np.random.default_rng((seed, poses))
     X = columns(poses, rng).reshape(-1, P + K)
-    truth = np.concatenate([rng.normal(size=P), size / 1e-5 * np.array([0.8, -0.6])])
-    y = X @ truth + SIGMA * rng.normal(size=len(X))
+    posterior_draw = np.concatenate([rng.normal(size=P), size / 1e-5 * np.array([0.8, -0.6])])
+    y = X @ posterior_draw + SIGMA * rng.normal(size=len(X))
     after = np.linalg.lstsq(X, y)[0]
     before = np.concatenate([np.linalg.lstsq(X[:, :P], y)[0], np.zeros(K)])
     spread = SIGMA * np.linalg.inv(np.linalg.cholesky(X.T @ X)).T
     real = columns(FRESH, rng)
-    rms = [np.sqrt(((real @ (fit - truth)) ** 2).sum(axis=2).mean()) for fit in (before, after)]
+    rms = [
+        np.sqrt(((real @ (fit - posterior_draw)) ** 2).sum(axis=2).mean())
+        for fit in (before, after)
+    ]
     fresh = columns(300, rng)
     rows = fresh.reshape(-1, 3, P + K)
     pose = np.repeat(np.arange(300), 3)
-    found = Truth(rows @ (before - after), rows @ (after - after), rows @ spread, pose, 1.0)
+    found = PosteriorDraw(rows @ (before - after), rows @ (after - after), rows @ spread, pose, 1.0)
     return found, float(1 - rms[1] / rms[0])
 
 

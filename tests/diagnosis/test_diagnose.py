@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from support.diagnosis_data import FAULTS, SIGMA, campaign, diagnosed
 
-from elastocal.cell import CartesianNoise
+from elastocal.cell.arm_description import CartesianNoise
+from elastocal.diagnosis import Diagnosis, DiagnosisOptions
 from elastocal.diagnosis.diagnose import diagnose
-from elastocal.diagnosis.options import DiagnosisOptions
-from elastocal.diagnosis.result import Diagnosis
-from elastocal.manipulator.model import Model
+from elastocal.model import Model
 
 # Effects that others imitate in any poses, and those others.
 IMITATED = {
@@ -128,15 +127,15 @@ WITHHELD = {
 
 @pytest.mark.parametrize("name", sometimes(list(WITHHELD), SHORT[:1]))
 def test_an_effect_that_the_catalogue_lacks_is_unknown_but_located(name: str) -> None:
-    fault, (stage, driver) = FAULTS[name], WITHHELD[name]
+    fault, (stage, covariate) = FAULTS[name], WITHHELD[name]
     d = diagnosed(name, without=(fault.effect,))
     assert d.verdict == "unknown_effect" and d.effects == ()
     assert d.probability_unknown > 0.9
     assert (d.location.stage, d.location.where) == (stage, fault.where)
     assert max(c.probability for c in d.candidates) < 0.1
     assert fault.effect not in {c.effect for c in d.candidates}
-    shown = {t.driver: t.p_family for t in d.structure}
-    assert shown[driver] <= 0.05
+    shown = {t.covariate: t.p_family for t in d.structure}
+    assert shown[covariate] <= 0.05
 
 
 def test_the_shape_of_an_unknown_dependence_is_drawn() -> None:
@@ -144,7 +143,7 @@ def test_the_shape_of_an_unknown_dependence_is_drawn() -> None:
     fault = FAULTS["gear_eccentricity:joint4"]
     d = diagnosed("gear_eccentricity:joint4", without=("gear_eccentricity",))
     (curve,) = d.curves
-    assert (curve.driver, curve.x_unit, curve.y_unit) == ("joint4 angle", "rad", "rad")
+    assert (curve.covariate, curve.x_unit, curve.y_unit) == ("joint4 angle", "rad", "rad")
     x, y, sd = (np.array(v) for v in (curve.x, curve.y, curve.sd))
     a, b = fault.values.values()
     true = a * np.sin(x) + b * np.cos(x)

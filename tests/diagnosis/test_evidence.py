@@ -10,10 +10,8 @@ from scipy import stats
 from scipy.special import logsumexp
 from support.diagnosis_data import dense_noise, random_data, used_rows
 
-from elastocal.diagnosis.evidence import SCALES, evidence_of
-from elastocal.diagnosis.noise import NoiseValues, NoisyData
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.sums import direct
+from elastocal.diagnosis import NoiseValues, NoisyData, direct, evidence_of, project
+from elastocal.diagnosis.evidence import SCALES
 
 NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), 0.5)
 SEEDS = range(4)

@@ -17,11 +17,14 @@ from pydantic import BaseModel
 from support.diagnoses import ECCENTRICITY, JUMP
 from support.robots import KR270
 
-from elastocal.cell import Cell, EffectChoice, read_cell, table_of
-from elastocal.diagnosis.extended_cell import PATHS, write_extended_cell
+from elastocal.cell.arm_description import EffectChoice
+from elastocal.cell.file_keys import table_of
+from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.diagnosis import write_extended_cell
+from elastocal.diagnosis.extended_cell import PATHS
 from elastocal.errors import InputError
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
+from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
 
 ROOT = Path(__file__).parents[2]
 SLIP = replace(JUMP, effect="marker_slip", where="marker:M1", settings={"slip_time_s": 61.5})

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis.fresh import _box, _raked, fresh_table
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.diagnosis import new_pose_table
+from elastocal.diagnosis.shrinkage import _box, _raked
 from elastocal.measurements import Measurements
+from elastocal.model import Model, observe
 
 N = 50
 
@@ -21,7 +21,7 @@ N = 50
 def drawn(observe: str = "position") -> tuple[Model, Measurements, Measurements]:
     model, table = campaign(observe=observe)
     table = replace(table, temperature=20 + 1e-3 * table.time)
-    return model, table, fresh_table(model, table, N, np.random.default_rng(5))
+    return model, table, new_pose_table(model, table, N, np.random.default_rng(5))
 
 
 def test_there_are_as_many_as_asked_each_like_a_measured_one() -> None:
@@ -64,7 +64,7 @@ def test_as_much_of_the_room_is_beyond_the_ends_as_draws_leave_on_average() -> N
 def test_no_joint_is_drawn_to_its_middle_by_the_ends_of_the_room() -> None:
     """Poses with an outstretched arm leave the box most often, and would be missing."""
     model, table, _ = drawn()
-    fresh = fresh_table(model, table, 400, np.random.default_rng(6))
+    fresh = new_pose_table(model, table, 400, np.random.default_rng(6))
     was, now = (t.q[np.unique(t.configuration, return_index=True)[1]] for t in (table, fresh))
     np.testing.assert_allclose(now.std(axis=0), was.std(axis=0), rtol=0.08)
 
@@ -90,15 +90,15 @@ def test_times_are_the_campaigns_and_one_per_visit() -> None:
 
 def test_loaded_and_unloaded_readings_still_pair() -> None:
     model, _, fresh = drawn("deflection")
-    seen = observe(fresh, "deflection")
-    assert len(seen.lead) == len(fresh) // 2
-    assert np.isfinite(model.predict(fresh, None, seen)).all()
+    observed = observe(fresh, "deflection")
+    assert len(observed.lead) == len(fresh) // 2
+    assert np.isfinite(model.predict(fresh, None, observed)).all()
 
 
 def test_the_same_seed_draws_the_same_poses() -> None:
     model, table, fresh = drawn()
-    again = fresh_table(model, table, N, np.random.default_rng(5))
-    other = fresh_table(model, table, N, np.random.default_rng(6))
+    again = new_pose_table(model, table, N, np.random.default_rng(5))
+    other = new_pose_table(model, table, N, np.random.default_rng(6))
     np.testing.assert_array_equal(again.q, fresh.q)
     assert not np.array_equal(other.q, fresh.q)
 
@@ -106,7 +106,7 @@ def test_the_same_seed_draws_the_same_poses() -> None:
 def test_where_nothing_recorded_is_there_nothing_is_invented() -> None:
     model, table, _ = drawn()
     bare = replace(table, time=None, approach=None, temperature=None)
-    fresh = fresh_table(model, bare, N, np.random.default_rng(5))
+    fresh = new_pose_table(model, bare, N, np.random.default_rng(5))
     assert fresh.time is None and fresh.approach is None and fresh.temperature is None
 
 
@@ -120,6 +120,6 @@ def test_repeats_keep_their_own_side_of_approach(n: int) -> None:
     repeat = (np.arange(len(both)) >= len(few)).astype(np.int64)
     sides = np.where(repeat[:, None] == 1, -1.0, 1.0) * np.ones_like(repeated.q)
     repeated = replace(repeated, repeat=repeat, approach=sides)
-    fresh = fresh_table(model, repeated, N, np.random.default_rng(1))
+    fresh = new_pose_table(model, repeated, N, np.random.default_rng(1))
     np.testing.assert_array_equal(fresh.approach[fresh.repeat == 0], 1.0)
     np.testing.assert_array_equal(fresh.approach[fresh.repeat == 1], -1.0)

@@ -9,15 +9,22 @@ import numpy as np
 import pytest
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.drivers import Drivers, monomials, waves
-from elastocal.diagnosis.generic import Generic, generic_blocks
-from elastocal.diagnosis.gram import Grams
-from elastocal.diagnosis.model_set import Item, packed_columns
-from elastocal.diagnosis.noise import NoiseValues
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.sums import direct
+from elastocal.diagnosis import (
+    Covariates,
+    DiagnosisData,
+    Generic,
+    Grams,
+    Item,
+    NoiseValues,
+    diagnosis_data_of,
+    direct,
+    fit_baseline,
+    generic_blocks,
+    monomials,
+    packed_columns,
+    project,
+    waves,
+)
 from elastocal.measurements import Measurements
 
 N = 24
@@ -25,10 +32,10 @@ NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
 
 
 @lru_cache
-def scene_without(*columns: str) -> Scene:
+def scene_without(*columns: str) -> DiagnosisData:
     model, table = campaign(n=N)
     table = replace(table, **dict.fromkeys(columns))
-    return scene_of(fit_baseline(model, table), [])
+    return diagnosis_data_of(fit_baseline(model, table), [])
 
 
 @lru_cache
@@ -37,18 +44,18 @@ def blocks() -> tuple[Generic, ...]:
 
 
 def test_every_joint_angle_may_move_every_joint_and_link() -> None:
-    pairs = {(g.driver, g.where) for g in blocks() if g.kind == "angle"}
+    pairs = {(g.covariate, g.where) for g in blocks() if g.kind == "angle"}
     parts = [f"{what}{k}" for what in ("joint", "link") for k in range(1, 7)]
     assert pairs >= {(f"joint{i} angle", p) for i in range(1, 7) for p in parts}
 
 
 def test_drivers_that_were_not_recorded_are_not_asked() -> None:
-    drivers = {g.driver for g in blocks()}
-    assert "time" in drivers and "load" in drivers and "approach of joint2" in drivers
-    rest = {g.driver for g in generic_blocks(scene_without("time"))}
-    assert rest == {d for d in drivers if "time" not in d}
-    rest = {g.driver for g in generic_blocks(scene_without("approach"))}
-    assert rest == {d for d in drivers if "approach" not in d}
+    covariates = {g.covariate for g in blocks()}
+    assert "time" in covariates and "load" in covariates and "approach of joint2" in covariates
+    rest = {g.covariate for g in generic_blocks(scene_without("time"))}
+    assert rest == {d for d in covariates if "time" not in d}
+    rest = {g.covariate for g in generic_blocks(scene_without("approach"))}
+    assert rest == {d for d in covariates if "approach" not in d}
 
 
 def test_a_block_says_where_and_at_which_stage_it_acts() -> None:
@@ -67,10 +74,10 @@ def test_a_block_says_where_and_at_which_stage_it_acts() -> None:
 
 
 def test_a_block_scores_as_the_columns_it_stands_for() -> None:
-    scene = scene_without()
-    grams = Grams(scene, scene.data, project(scene.data, NOISE))
+    dataset = scene_without()
+    grams = Grams(dataset, dataset.data, project(dataset.data, NOISE))
     for g in blocks()[::17]:
-        C = packed_columns(scene, Item(g, np.zeros(0), 0.0))
+        C = packed_columns(dataset, Item(g, np.zeros(0), 0.0))
         expected = direct(C, grams.at).evidence()
         np.testing.assert_allclose(grams.of_block(g).evidence(), expected, atol=1e-6)
 
@@ -79,24 +86,24 @@ def test_a_block_scores_as_the_columns_it_stands_for() -> None:
     ("driver", "where"),
     [("joint2 angle", "joint5"), ("time", "link3"), ("load × joint3 angle", "joint4")],
 )
-def test_a_planted_dependence_is_told_from_every_other(driver: str, where: str) -> None:
+def test_a_planted_dependence_is_told_from_every_other(covariate: str, where: str) -> None:
     """A smooth motion that no block holds as such: the right block scores highest."""
-    scene = scene_without()
-    table = scene.base.seen.table
+    dataset = scene_without()
+    table = dataset.base.observed.table
     along = {
         "joint2 angle": np.sin(3 * table.q[:, 1]),
         "time": np.tanh((table.time - 500) / 200),
         "load × joint3 angle": (table.force[:, 2] != 0) * np.sin(1.2 * table.q[:, 2]),
-    }[driver]
+    }[covariate]
     entry = "joint_motion" if where.startswith("joint") else "link_frame"
-    E = scene.columns.entry((entry, (where,)))
+    E = dataset.columns.entry((entry, (where,)))
     amount = 1.5e-4 * np.array([1.0, 0.5, -0.7, 0.3, 1.0, -0.4])[: E.shape[2]]
     moved = E @ amount * along[:, None]
-    data = replace(scene.data, r=scene.data.r + scene.pack(moved[:, :, None])[:, :, 0])
-    grams = Grams(scene, data, project(data, NOISE))
+    data = replace(dataset.data, r=dataset.data.r + dataset.pack(moved[:, :, None])[:, :, 0])
+    grams = Grams(dataset, data, project(data, NOISE))
     scores = [float(grams.of_block(g).evidence()[0]) for g in blocks()]
     best = blocks()[int(np.argmax(scores))]
-    assert (best.driver, best.where) == (driver, where)
+    assert (best.covariate, best.where) == (covariate, where)
 
 
 def test_waves_follow_any_smooth_function_and_vanish_where_no_visit_is() -> None:
@@ -122,14 +129,14 @@ def test_monomials_are_every_product_up_to_the_second_degree() -> None:
 
 def test_the_wrench_at_a_link_is_the_load_in_that_links_axes() -> None:
     """R_flangeᵀ F at the last link, largest component one; the load turns the flange a little."""
-    scene = scene_without()
-    model, table = scene.base.model, scene.base.seen.table
-    force, _ = list(Drivers.of(scene).wrenches())[-1]
-    R = model.flange_poses(table, scene.base.x)[:, :3, :3]
+    dataset = scene_without()
+    model, table = dataset.base.model, dataset.base.observed.table
+    force, _ = list(Covariates.of(dataset).wrenches())[-1]
+    R = model.flange_poses(table, dataset.base.x)[:, :3, :3]
     expected = np.einsum("nji,nj->ni", R, table.force)
     expected /= np.abs(expected).max()
-    rows = scene.base.seen.lead[np.maximum(scene.places.example, 0)]
-    np.testing.assert_allclose(force[scene.present], expected[rows][scene.present], atol=5e-3)
+    rows = dataset.base.observed.lead[np.maximum(dataset.places.example, 0)]
+    np.testing.assert_allclose(force[dataset.present], expected[rows][dataset.present], atol=5e-3)
 
 
 def without_load(table: Measurements) -> Measurements:
@@ -138,6 +145,6 @@ def without_load(table: Measurements) -> Measurements:
 
 def test_an_unloaded_campaign_asks_nothing_of_loads() -> None:
     model, table = campaign(n=N)
-    scene = scene_of(fit_baseline(model, without_load(table)), [])
-    kinds = {g.kind for g in generic_blocks(scene)}
+    dataset = diagnosis_data_of(fit_baseline(model, without_load(table)), [])
+    kinds = {g.kind for g in generic_blocks(dataset)}
     assert not any("load" in kind or kind == "force" for kind in kinds)

@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis import gram, scene
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.gram import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.noise import NoiseValues
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.sums import direct
+from elastocal.diagnosis import (
+    DiagnosisData,
+    Grams,
+    Hypothesis,
+    NoiseValues,
+    diagnosis_data_of,
+    direct,
+    fit_baseline,
+    possible,
+    project,
+)
+from elastocal.diagnosis import diagnosis_data as dataset
+from elastocal.diagnosis import evidence as gram
 
 NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
 TRIED = (
@@ -25,16 +30,16 @@ TRIED = (
 
 
 @lru_cache
-def made() -> Scene:
+def made() -> DiagnosisData:
     model, table = campaign(n=24)
     hypotheses = [h for h in possible(model, table)[0] if (h.name, h.where) in TRIED]
-    return scene_of(fit_baseline(model, table), hypotheses)
+    return diagnosis_data_of(fit_baseline(model, table), hypotheses)
 
 
-def fresh() -> Scene:
+def fresh() -> DiagnosisData:
     """The scene without what it has kept."""
     known = made()
-    return Scene(
+    return DiagnosisData(
         known.base, known.columns, known.hypotheses, known.blocks, known.places, known.data,
         known.fitted, known.load_point,
     )  # fmt: skip
@@ -76,7 +81,7 @@ def test_nothing_hangs_on_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = made().grids[h.name, h.where].values
     kept = made().drive(h, settings)
     assert made().drive(h, settings) is kept
-    monkeypatch.setattr(scene, "KEPT", 0)
+    monkeypatch.setattr(dataset, "KEPT", 0)
     forgetful = fresh()
     first = forgetful.drive(h, settings)
     assert forgetful.drive(h, settings) is not first

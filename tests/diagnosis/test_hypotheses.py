@@ -9,11 +9,10 @@ import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import campaign, cell
 
-from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.options import DiagnosisOptions
+from elastocal.diagnosis import DiagnosisOptions, possible
 from elastocal.errors import InputError
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
+from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
 
 MODEL, TABLE = campaign()
 ISSUE = {

@@ -8,11 +8,9 @@ import weakref
 import numpy as np
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis.extend import extended
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.model_cache import MOST, made_once
-from elastocal.diagnosis.model_set import Item
-from elastocal.manipulator.model import Model
+from elastocal.diagnosis import Hypothesis, Item, extended, made_once, possible
+from elastocal.diagnosis.baseline import MOST
+from elastocal.model import Model
 
 
 def small() -> Model:
@@ -45,11 +43,11 @@ def test_those_asked_for_last_are_kept() -> None:
 def test_what_is_kept_goes_with_the_model_it_was_made_of() -> None:
     original = small()
     model = copy(original)
-    seen = weakref.ref(made_once(model, "a", lambda: copy(original)))
-    assert seen() is not None
+    observed = weakref.ref(made_once(model, "a", lambda: copy(original)))
+    assert observed() is not None
     del model
     gc.collect()
-    assert seen() is None
+    assert observed() is None
 
 
 def test_a_model_with_other_settings_is_another_model() -> None:

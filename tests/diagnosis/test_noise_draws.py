@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from support.diagnosis_data import random_blocks, random_data
 
-from elastocal.diagnosis.noise import NoiseValues, NoisyData
-from elastocal.diagnosis.noise_draws import noise_draws
-from elastocal.diagnosis.noise_fit import fit_noise
-from elastocal.diagnosis.projection import likelihood
+from elastocal.diagnosis import NoiseValues, NoisyData, fit_noise, likelihood, noise_draws
 
 N = 300
 

@@ -10,24 +10,32 @@ import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import FITTED, Fault, cell, measured, plan
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.found import Found
-from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.listing import warnings
-from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
-from elastocal.diagnosis.play_law import doubt, under_other_law, with_likelier_play
-from elastocal.diagnosis.recorded_drivers import with_recorded_drivers
-from elastocal.diagnosis.scan import Scan
-from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.screen import Screened
-from elastocal.diagnosis.truths import NOISES, Confirmation
-from elastocal.manipulator.model import Model
+from elastocal.diagnosis import (
+    Confirmation,
+    DiagnosisData,
+    Item,
+    ModelSet,
+    OutlierScreening,
+    Scan,
+    SelectedEffects,
+    diagnosis_data_of,
+    doubt,
+    fit_baseline,
+    fit_set,
+    possible,
+    under_other_law,
+    warnings,
+    with_likelier_backlash_model,
+    with_recorded_drivers,
+)
+from elastocal.diagnosis.shrinkage import NOISES
+from elastocal.model import Model
 
 PLAY = Fault("backlash", "joint3", {"backlash": 3e-4})
 
 
 @lru_cache
-def scene(law: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> Scene:
+def dataset(law: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> DiagnosisData:
     """Readings of an arm with play under `law`, looked at as the diagnosis would at first."""
     chain = kr270_chain()
     table = plan(chain, 40, 3)
@@ -35,59 +43,59 @@ def scene(law: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> Sce
     if not sides:
         table = replace(table, approach=None)
     model = with_recorded_drivers(Model.assembled(chain, cell(fitted)), table)
-    return scene_of(fit_baseline(model, table), possible(model, table)[0])
+    return diagnosis_data_of(fit_baseline(model, table), possible(model, table)[0])
 
 
 @pytest.mark.parametrize("law", ["load", "load_and_approach"])
 def test_the_readings_tell_the_law(law: str) -> None:
-    first = scene(law)
+    first = dataset(law)
     assert first.base.model.cell.model.play_side == "load_and_approach"
-    told = with_likelier_play(first)
+    told = with_likelier_backlash_model(first)
     assert told.base.model.cell.model.play_side == law
     assert [h.label for h in told.hypotheses] == [h.label for h in first.hypotheses]
 
 
 def test_readings_left_out_stay_so() -> None:
-    first = scene("load")
+    first = dataset("load")
     faulty = first.data.faulty
     faulty[:3] = True
-    told = with_likelier_play(first.without(faulty))
+    told = with_likelier_backlash_model(first.without(faulty))
     assert told.base.model.cell.model.play_side == "load"
     assert (told.data.faulty == faulty).all()
 
 
 def test_nothing_is_asked_where_no_side_is_recorded() -> None:
-    first = scene("load", sides=False)
-    assert with_likelier_play(first) is first
+    first = dataset("load", sides=False)
+    assert with_likelier_backlash_model(first) is first
 
 
 def test_play_in_the_cell_keeps_its_law() -> None:
-    first = scene("load", (*FITTED, "backlash:joint2"))
-    assert with_likelier_play(first) is first
+    first = dataset("load", (*FITTED, "backlash:joint2"))
+    assert with_likelier_backlash_model(first) is first
 
 
-def set_of(law: str, told: Scene) -> ModelSet:
+def set_of(law: str, told: DiagnosisData) -> ModelSet:
     model = told.base.model
     if model.cell.model.play_side != law:
         model = under_other_law(model)
-    under = scene_of(replace(told.base, model=model), list(told.hypotheses))
+    under = diagnosis_data_of(replace(told.base, model=model), list(told.hypotheses))
     (play,) = [h for h in under.hypotheses if (h.name, h.where) == PLAY.key]
     return fit_set(under, (Item(play, np.zeros(0), 0.0),), told.noise)
 
 
 def test_a_few_readings_in_the_dead_zone_leave_less_doubt_of_the_law() -> None:
-    assert with_likelier_play(scene("load_and_approach")).other_play < 0.25
+    assert with_likelier_backlash_model(dataset("load_and_approach")).other_play < 0.25
 
 
 def test_laws_that_say_the_same_are_as_likely() -> None:
-    told = with_likelier_play(scene("load"))
+    told = with_likelier_backlash_model(dataset("load"))
     same = set_of("load", told)
     assert doubt(same, same) == pytest.approx(0.5)
 
 
 def test_one_configuration_alone_does_not_settle_the_law() -> None:
     """However far off the other law is there: it may be off for a reason of its own."""
-    told = with_likelier_play(scene("load"))
+    told = with_likelier_backlash_model(dataset("load"))
     right = set_of("load", told)
     r = right.data.r.copy()
     r[4] += 1e-3
@@ -96,28 +104,32 @@ def test_one_configuration_alone_does_not_settle_the_law() -> None:
 
 @pytest.mark.parametrize(("doubt_of_it", "told"), [(0.05, False), (0.5, True)])
 def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool) -> None:
-    one = replace(with_likelier_play(scene("load")), other_play=doubt_of_it)
+    one = replace(with_likelier_backlash_model(dataset("load")), other_play=doubt_of_it)
     (play,) = [h for h in one.hypotheses if (h.name, h.where) == PLAY.key]
     plain = fit_set(one, ())
     nothing: Scan = None  # type: ignore[assignment]
-    screened = Screened(one.data.faulty, one.data.faulty)
+    screened = OutlierScreening(one.data.faulty, one.data.faulty)
     for items, expected in (((Item(play, np.zeros(0), 0.0),), told), ((), False)):
-        found = Found(one, fit_set(one, items), (), (), plain, nothing, nothing)
+        found = SelectedEffects(one, fit_set(one, items), (), (), plain, nothing, nothing)
         texts = [t for t in warnings(one, found, screened) if "play of joint3" in t]
         assert bool(texts) == expected
 
 
 def test_play_by_either_law_may_be_true_at_fresh_poses() -> None:
     """As probable as each law is; nothing else is drawn under another law."""
-    told = replace(with_likelier_play(scene("load")), other_play=0.3)
+    told = replace(with_likelier_backlash_model(dataset("load")), other_play=0.3)
     (play,) = [h for h in told.hypotheses if (h.name, h.where) == PLAY.key]
     item = Item(play, np.zeros(0), 0.0)
     plain, chosen = fit_set(told, ()), fit_set(told, (item,))
     nothing: Scan = None  # type: ignore[assignment]
-    found = Found(told, chosen, (), (), plain, nothing, nothing)
-    truths = Confirmation.of(found, told.base, np.random.default_rng(1)).truths(0, ((item, 1.0),))
-    assert [t.probability for t in truths] == pytest.approx(
+    found = SelectedEffects(told, chosen, (), (), plain, nothing, nothing)
+    posterior_draws = Confirmation.of(found, told.base, np.random.default_rng(1)).posterior_draws(
+        0, ((item, 1.0),)
+    )
+    assert [t.probability for t in posterior_draws] == pytest.approx(
         [0.7 / NOISES] * NOISES + [0.3 / NOISES] * NOISES
     )
-    own, other = (float(np.sqrt((t.after**2).mean())) for t in (truths[0], truths[-1]))
+    own, other = (
+        float(np.sqrt((t.after**2).mean())) for t in (posterior_draws[0], posterior_draws[-1])
+    )
     assert other > 3 * own

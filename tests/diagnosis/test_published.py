@@ -10,10 +10,9 @@ import pytest
 from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, EXTRA, UNKNOWN, VERDICTS
 
-from elastocal.diagnosis.published import publish
-from elastocal.diagnosis.result import Diagnosis, Gap
-from elastocal.identification.error_budget import BudgetStep
-from elastocal.manipulator.model import Model
+from elastocal.diagnosis import Diagnosis, Gap, publish
+from elastocal.identification import BudgetStep
+from elastocal.model import Model
 
 
 @pytest.fixture(scope="module")

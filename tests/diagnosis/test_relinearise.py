@@ -7,31 +7,44 @@ from functools import lru_cache
 import numpy as np
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis.baseline import Baseline, fit_baseline
-from elastocal.diagnosis.estimate import fit_extended
-from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
-from elastocal.diagnosis.relinearise import is_far, relinearised
-from elastocal.diagnosis.scene import Scene, away, scene_of
+from elastocal.diagnosis import (
+    Baseline,
+    DiagnosisData,
+    Item,
+    ModelSet,
+    away,
+    diagnosis_data_of,
+    fit_baseline,
+    fit_extended,
+    fit_set,
+    is_far,
+    possible,
+    relinearised,
+)
 
 SPRING = ("gravity_compensator", "joint2")
 
 
 @lru_cache
-def about_the_spring() -> tuple[Scene, Scene, ModelSet, Baseline]:
+def about_the_spring() -> tuple[DiagnosisData, DiagnosisData, ModelSet, Baseline]:
     """The scene before and after, the set with the spring, and the exact fit with it."""
     model, table = campaign(":".join(SPRING))
     base = fit_baseline(model, table)
-    scene = scene_of(base, possible(model, table)[0])
-    (h,) = (h for h in scene.hypotheses if (h.name, h.where) == SPRING)
-    chosen = fit_set(scene, (Item(h, np.zeros(0), 0.0),))
-    return scene, relinearised(scene, chosen), chosen, fit_extended(scene, chosen, chosen.items)
+    dataset = diagnosis_data_of(base, possible(model, table)[0])
+    (h,) = (h for h in dataset.hypotheses if (h.name, h.where) == SPRING)
+    chosen = fit_set(dataset, (Item(h, np.zeros(0), 0.0),))
+    return (
+        dataset,
+        relinearised(dataset, chosen),
+        chosen,
+        fit_extended(dataset, chosen, chosen.items),
+    )
 
 
 def test_the_residual_at_the_exact_fit_is_that_of_the_exact_fit() -> None:
     """A spring makes a signal of hundreds of deviations: a thousandth of it would not do."""
-    scene, fresh, chosen, exact = about_the_spring()
-    assert is_far(scene, chosen)
+    dataset, fresh, chosen, exact = about_the_spring()
+    assert is_far(dataset, chosen)
     h = chosen.items[0].what
     x = dict(zip(exact.model.names, exact.x, strict=True))
     moved = np.array([x[f"{h.where}.{p.key}"] - p.nominal for p in h.parameters])
@@ -40,7 +53,7 @@ def test_the_residual_at_the_exact_fit_is_that_of_the_exact_fit() -> None:
     width = fresh.fitted.width
     beta = np.zeros(len(width))
     n = len(away(fresh.base))
-    shown = np.abs(exact.model.regressor(exact.seen.table, exact.x).B[:, :n]).max(axis=0) > 0
+    shown = np.abs(exact.model.regressor(exact.observed.table, exact.x).B[:, :n]).max(axis=0) > 0
     assert shown.sum() <= len(beta)
     beta[: shown.sum()] = (away(fresh.base)[shown]) / width[: shown.sum()]
     left = fresh.data.r - fresh.data.X @ beta - explained

@@ -9,30 +9,35 @@ import numpy as np
 import pytest
 from support.diagnosis_data import SIGMA, campaign, diagnosed
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.noise import NoiseValues
-from elastocal.diagnosis.noise_fit import fit_noise
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.screen import describe_faulty, reading_errors, screen
+from elastocal.diagnosis import (
+    DiagnosisData,
+    NoiseValues,
+    describe_faulty,
+    diagnosis_data_of,
+    fit_baseline,
+    fit_noise,
+    project,
+    reading_errors,
+    screen_outliers,
+)
 from elastocal.measurements import Measurements
 
 POSES = 60  # × 2 loads × 3 markers
 
 
-def scene_with(table: Measurements) -> Scene:
-    return scene_of(fit_baseline(campaign(n=POSES)[0], table), [])
+def scene_with(table: Measurements) -> DiagnosisData:
+    return diagnosis_data_of(fit_baseline(campaign(n=POSES)[0], table), [])
 
 
 @lru_cache
-def clean() -> Scene:
+def clean() -> DiagnosisData:
     return scene_with(campaign(n=POSES)[1])
 
 
-def screened(scene: Scene) -> tuple[np.ndarray, Scene, NoiseValues]:
+def screened(dataset: DiagnosisData) -> tuple[np.ndarray, DiagnosisData, NoiseValues]:
     """Rows of the faulty readings, the scene without them, and the noise of the others."""
-    faulty = screen(scene, scene.data).faulty
-    kept = scene.without(faulty)
+    faulty = screen_outliers(dataset, dataset.data).faulty
+    kept = dataset.without(faulty)
     return np.flatnonzero(faulty), kept, fit_noise(kept.data)
 
 
@@ -46,7 +51,7 @@ def spoiled(rows: np.ndarray, size: float, seed: int) -> Measurements:
 
 def test_good_readings_are_kept() -> None:
     faulty, _, noise = screened(clean())
-    assert len(faulty) == 0 and not screen(clean(), clean().data).suspects.any()
+    assert len(faulty) == 0 and not screen_outliers(clean(), clean().data).suspects.any()
     assert noise.factor == pytest.approx(1.0, abs=0.15)
 
 
@@ -56,10 +61,10 @@ def test_one_reading_in_a_hundred_that_is_a_millimetre_off_is_found_and_no_other
 ) -> None:
     rows = np.sort(np.random.default_rng(seed).choice(6 * POSES, 4, replace=False))
     table = spoiled(rows, 1e-3, seed)
-    faulty, scene, noise = screened(scene_with(table))
+    faulty, dataset, noise = screened(scene_with(table))
     np.testing.assert_array_equal(faulty, rows)
     assert noise.factor == pytest.approx(1.0, abs=0.15)
-    told = describe_faulty(scene, scene.data, noise)
+    told = describe_faulty(dataset, dataset.data, noise)
     assert [f.line for f in told] == list(table.row[rows])
     for f, k in zip(told, rows, strict=True):
         assert f.error == pytest.approx(1e-3, rel=0.1)
@@ -80,26 +85,26 @@ def test_a_slipped_marker_is_not_a_row_of_faults() -> None:
     table = campaign(n=POSES)[1]
     late = (table.marker == 1) & (table.time > 0.9 * table.time.max())
     position = table.position + 1e-3 * late[:, None]
-    scene = scene_with(replace(table, position=position))
-    found = screen(scene, scene.data)
+    dataset = scene_with(replace(table, position=position))
+    found = screen_outliers(dataset, dataset.data)
     assert late.sum() > 8
     assert not (found.faulty & late).any()
 
 
 def test_the_error_of_a_reading_is_against_the_fit_to_all_others() -> None:
     """uᵢᵀP_ii⁻¹u_i falls by as much as the residuals' squares do when reading i is left out."""
-    scene = clean()
-    _, _, noise = screened(scene)
-    at = project(scene.data, noise)
-    found = reading_errors(scene, at)
+    dataset = clean()
+    _, _, noise = screened(dataset)
+    at = project(dataset.data, noise)
+    found = reading_errors(dataset, at)
 
     def squares(at_data) -> float:
         p = project(at_data, noise)
         return float((p.u * at_data.masked(at_data.r)).sum())
 
     for i in (0, 17, 200):
-        mask = np.arange(scene.blocks.n) == i
-        fall = squares(scene.data) - squares(scene.data.without(mask))
+        mask = np.arange(dataset.blocks.n) == i
+        fall = squares(dataset.data) - squares(dataset.data.without(mask))
         assert found[i] == pytest.approx(fall, rel=1e-4, abs=1e-4)
 
 

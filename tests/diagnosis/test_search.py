@@ -9,29 +9,39 @@ import numpy as np
 import pytest
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.found import Found, Slot
-from elastocal.diagnosis.generic import generic_blocks
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.model_set import Item, fit_set, packed_columns
-from elastocal.diagnosis.noise import NoiseValues, covariance
-from elastocal.diagnosis.prior import Prior
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.scan import scan
-from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.search import FLIPS, Search, base_score
-from elastocal.diagnosis.sums import direct
+from elastocal.diagnosis import (
+    DiagnosisData,
+    ForwardSelection,
+    Hypothesis,
+    Item,
+    NoiseValues,
+    Prior,
+    SelectedEffects,
+    Slot,
+    base_score,
+    covariance,
+    diagnosis_data_of,
+    direct,
+    fit_baseline,
+    fit_set,
+    generic_blocks,
+    packed_columns,
+    possible,
+    project,
+    scan,
+)
+from elastocal.diagnosis.effect_search import FLIPS
 
 TRIED = ("gear_eccentricity", "encoder_scale", "encoder_jump", "marker_slip", "hysteresis")
 NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
 
 
 @lru_cache
-def empty() -> Scene:
+def empty() -> DiagnosisData:
     """A scene with five effects to try; residuals are put in by `noisy`."""
     model, table = campaign(n=24)
     hypotheses = [h for h in possible(model, table)[0] if h.name in TRIED]
-    return scene_of(fit_baseline(model, table), hypotheses)
+    return diagnosis_data_of(fit_baseline(model, table), hypotheses)
 
 
 def item(name: str, where: str, settings: tuple[float, ...] = ()) -> Item:
@@ -39,23 +49,23 @@ def item(name: str, where: str, settings: tuple[float, ...] = ()) -> Item:
     return Item(h, np.array(settings), 0.0)
 
 
-def noisy(seed: int, *planted: tuple[Item, tuple[float, ...]]) -> Scene:
+def noisy(seed: int, *planted: tuple[Item, tuple[float, ...]]) -> DiagnosisData:
     """Noise of exactly the modelled kind, and items at sizes in units of their typical ones."""
-    scene = empty()
-    V = covariance(scene.data, NOISE)
+    dataset = empty()
+    V = covariance(dataset.data, NOISE)
     z = np.random.default_rng(seed).normal(size=(*V.shape[:2], 1))
     r = (np.linalg.cholesky(V) @ z)[..., 0]
     for what, size in planted:
-        r = r + packed_columns(scene, what) @ np.array(size)
-    return replace(scene, data=replace(scene.data, r=scene.data.masked(r)))
+        r = r + packed_columns(dataset, what) @ np.array(size)
+    return replace(dataset, data=replace(dataset.data, r=dataset.data.masked(r)))
 
 
-def run(scene: Scene, level: float = 0.05, blocks: bool = False) -> Found:
-    generic = generic_blocks(scene) if blocks else []
-    return Search(scene, generic, NOISE, level, 0).run()
+def run(dataset: DiagnosisData, level: float = 0.05, blocks: bool = False) -> SelectedEffects:
+    generic = generic_blocks(dataset) if blocks else []
+    return ForwardSelection(dataset, generic, NOISE, level, 0).run()
 
 
-def keys(found: Found) -> set[tuple[str, str]]:
+def keys(found: SelectedEffects) -> set[tuple[str, str]]:
     return {
         (i.what.name, i.what.where) for i in found.chosen.items if isinstance(i.what, Hypothesis)
     }
@@ -93,66 +103,66 @@ def test_false_alarms_keep_to_the_level() -> None:
 
 
 def test_a_level_below_what_the_flips_resolve_claims_nothing() -> None:
-    scene = noisy(1, (item(*SLIP), (1.0, -0.7, 0.4)))
-    assert run(scene, level=0.004).chosen.items == ()
+    dataset = noisy(1, (item(*SLIP), (1.0, -0.7, 0.4)))
+    assert run(dataset, level=0.004).chosen.items == ()
 
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])
 def test_a_fitted_set_and_a_scored_group_have_the_same_evidence(scale: float) -> None:
     """Columns inside the model at precision 1/s², or outside it under a prior of size s."""
-    scene = noisy(4, (item(*BEND), (0.3, 0.2)))
-    C = packed_columns(scene, item(*BEND))
-    at = project(scene.data, NOISE)
-    inside = project(scene.data.with_columns(C, np.full(2, scale**-2)), NOISE).marginal
+    dataset = noisy(4, (item(*BEND), (0.3, 0.2)))
+    C = packed_columns(dataset, item(*BEND))
+    at = project(dataset.data, NOISE)
+    inside = project(dataset.data.with_columns(C, np.full(2, scale**-2)), NOISE).marginal
     outside = direct(C, at).evidence(np.array([scale]))[0]
     assert inside - at.marginal == pytest.approx(outside, abs=1e-4)
 
 
 def test_scores_of_a_scan_count_from_the_set_under_its_noise() -> None:
-    scene = noisy(5)
-    nothing = fit_set(scene, ())
-    prior = Prior.of(scene.hypotheses, [])
-    seen = scan(scene, [], prior, nothing.data, nothing.noise, np.zeros((0, 24)))
-    assert base_score(scene, nothing, seen) == pytest.approx(nothing.score, abs=1e-6)
-    worse = scan(scene, [], prior, nothing.data, NOISE, np.zeros((0, 24)))
-    assert base_score(scene, nothing, worse) < nothing.score + 0.5
+    dataset = noisy(5)
+    nothing = fit_set(dataset, ())
+    prior = Prior.of(dataset.hypotheses, [])
+    observed = scan(dataset, [], prior, nothing.data, nothing.noise, np.zeros((0, 24)))
+    assert base_score(dataset, nothing, observed) == pytest.approx(nothing.score, abs=1e-6)
+    worse = scan(dataset, [], prior, nothing.data, NOISE, np.zeros((0, 24)))
+    assert base_score(dataset, nothing, worse) < nothing.score + 0.5
 
 
 def test_a_set_is_scanned_once_under_one_noise() -> None:
     """With flips holds what is asked for without them, and not the other way round."""
-    scene = noisy(5)
-    search, nothing = Search(scene, [], NOISE, 0.05, 0), fit_set(scene, ())
+    dataset = noisy(5)
+    search, nothing = ForwardSelection(dataset, [], NOISE, 0.05, 0), fit_set(dataset, ())
     plain = search._scan(nothing, NOISE)
     assert search._scan(nothing, NOISE) is plain and len(plain.flipped) == 0
     flipped = search._scan(nothing, NOISE, flips=True)
     assert len(flipped.flipped) == FLIPS and search._scan(nothing, NOISE) is flipped
     assert [s.evidence for s in plain.scored] == [s.evidence for s in flipped.scored]
     assert search._scan(nothing) is not flipped
-    other = fit_set(scene, (item(*BEND),), NOISE)
+    other = fit_set(dataset, (item(*BEND),), NOISE)
     assert search._scan(other, NOISE).odds != flipped.odds
 
 
 def test_the_odds_of_all_are_the_prior_mean_of_each() -> None:
-    scene = noisy(6)
-    blocks = generic_blocks(scene)
-    prior = Prior.of(scene.hypotheses, blocks)
+    dataset = noisy(6)
+    blocks = generic_blocks(dataset)
+    prior = Prior.of(dataset.hypotheses, blocks)
     signs = np.ones((1, 24))
-    seen = scan(scene, blocks, prior, scene.data, NOISE, signs)
+    observed = scan(dataset, blocks, prior, dataset.data, NOISE, signs)
     weights = np.exp(np.concatenate([prior.hypotheses, prior.blocks]))
-    each = np.exp([s.evidence for s in (*seen.scored, *seen.blocks)])
-    assert seen.odds == pytest.approx(np.log(weights @ each / weights.sum()))
+    each = np.exp([s.evidence for s in (*observed.scored, *observed.blocks)])
+    assert observed.odds == pytest.approx(np.log(weights @ each / weights.sum()))
     # Residuals are flipped at the noise's own size, a little above what a fit leaves.
-    assert seen.flipped[0] == pytest.approx(seen.odds, abs=0.5)
+    assert observed.flipped[0] == pytest.approx(observed.odds, abs=0.5)
 
 
 def test_priors_share_out_what_is_not_nothing() -> None:
     """Even odds; a twentieth for the unknown; effects alike, whatever their number of places."""
-    scene = empty()
-    prior = Prior.of(scene.hypotheses, generic_blocks(scene))
+    dataset = empty()
+    prior = Prior.of(dataset.hypotheses, generic_blocks(dataset))
     assert prior.total == pytest.approx(0.0)
     assert np.exp(prior.blocks).sum() == pytest.approx(0.05)
     each = dict.fromkeys(TRIED, 0.0)
-    for h, w in zip(scene.hypotheses, prior.hypotheses, strict=True):
+    for h, w in zip(dataset.hypotheses, prior.hypotheses, strict=True):
         each[h.name] += np.exp(w)
     assert list(each.values()) == pytest.approx([0.95 / len(TRIED)] * len(TRIED))
 

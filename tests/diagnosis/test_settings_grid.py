@@ -9,14 +9,21 @@ import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import JUMP_TIME, VISIT_TIME, campaign
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.model_set import Item, fit_set, refine
-from elastocal.diagnosis.scene import scene_of
-from elastocal.diagnosis.settings_grid import Grid, change_times, grid_of
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
+from elastocal.diagnosis import (
+    Hypothesis,
+    Item,
+    SettingsGrid,
+    change_times,
+    diagnosis_data_of,
+    fit_baseline,
+    fit_set,
+    grid_of,
+    possible,
+    refine,
+)
 from elastocal.measurements import Measurements
+from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +36,7 @@ def hypothesis(name: str, where: str, model: Model | None = None) -> Hypothesis:
     return next(h for h in possible(model, table)[0] if (h.name, h.where) == (name, where))
 
 
-def ripple(orders: tuple[float, ...], q: np.ndarray, visits: Measurements) -> Grid:
+def ripple(orders: tuple[float, ...], q: np.ndarray, visits: Measurements) -> SettingsGrid:
     plain = campaign()[0]
     spec = replace(plain.cell.model, gear_ripple_orders=orders)
     model = Model.assembled(kr270_chain(), replace(plain.cell, model=spec))
@@ -126,11 +133,11 @@ def test_what_has_no_constant_to_search_has_one_point(visits) -> None:
 def test_a_change_is_found_to_the_visit_however_many_there_are() -> None:
     """200 visits, of which 120 moments are tried: the right one is sought about the best."""
     model, table = campaign("encoder_jump:joint4", n=100)
-    scene = scene_of(fit_baseline(model, table), [hypothesis("encoder_jump", "joint4")])
-    (h,) = scene.hypotheses
-    grid = scene.grids[h.name, h.where].values[:, 0]
-    assert len(grid) < len(scene.moments)
+    dataset = diagnosis_data_of(fit_baseline(model, table), [hypothesis("encoder_jump", "joint4")])
+    (h,) = dataset.hypotheses
+    grid = dataset.grids[h.name, h.where].values[:, 0]
+    assert len(grid) < len(dataset.moments)
     far = grid[np.abs(grid - JUMP_TIME).argsort()[1]]
-    chosen = fit_set(scene, (Item(h, np.array([far]), 0.0),))
-    found = float(refine(scene, chosen, 0).items[0].settings[0])
+    chosen = fit_set(dataset, (Item(h, np.array([far]), 0.0),))
+    found = float(refine(dataset, chosen, 0).items[0].settings[0])
     assert abs(found - JUMP_TIME) <= VISIT_TIME

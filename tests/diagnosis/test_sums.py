@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from support.diagnosis_data import random_blocks, random_data
 
-from elastocal.diagnosis.blocks import VisitPlaces
-from elastocal.diagnosis.noise import NoiseValues
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.sums import EntrySums, direct
+from elastocal.diagnosis import EntrySums, NoiseValues, VisitPlaces, direct, project
 
 NOISE = NoiseValues(1.1, np.array([4e-6, 9e-6, 1e-5]), 0.5)
 SEEDS = range(4)

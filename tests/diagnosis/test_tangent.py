@@ -9,16 +9,19 @@ import pytest
 from support.cells import random_poses
 from support.diagnosis_data import FAULTS, campaign, diagnosed
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.columns import compute_columns
-from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.model_set import Item
-from elastocal.diagnosis.result import NoiseFloor
-from elastocal.diagnosis.scene import scene_of
-from elastocal.diagnosis.separate.contest import Contest
-from elastocal.diagnosis.separate.pool import pool_of
-from elastocal.diagnosis.separate.rivals import RivalSet
-from elastocal.diagnosis.separate.rows import campaign_of, rows_of
+from elastocal.diagnosis import (
+    Discrimination,
+    Item,
+    NoiseFloor,
+    RivalSet,
+    campaign_of,
+    compute_columns,
+    diagnosis_data_of,
+    fit_baseline,
+    possible,
+    rows_of,
+    visit_pool_of,
+)
 
 COMPENSATOR = "gravity_compensator:joint2"
 
@@ -61,20 +64,20 @@ def test_poses_not_measured_yet_do_not_change_what_the_data_say() -> None:
     force = np.unique(table.force, axis=0)
     late = np.linspace(1e5, 2e5, 100)
     q = random_poses(model.chain, 100, 5)
-    pool = pool_of(model, base.x, table, q, np.ones((100, 6)), late, force)
+    pool = visit_pool_of(model, base.x, table, q, np.ones((100, 6)), late, force)
     noise = NoiseFloor(True, 1.0, 2e-5, (5e-6,) * 6, 0.0, None)
     diagnosis = type("Found", (), {"noise": noise})
-    whole = campaign_of(base, pool, spring, diagnosis).scene  # type: ignore
-    alone = scene_of(base, spring)
+    whole = campaign_of(base, pool, spring, diagnosis).dataset  # type: ignore
+    alone = diagnosis_data_of(base, spring)
     np.testing.assert_allclose(whole.sizes[key], alone.sizes[key], rtol=1e-9)
-    here, there = (scene.packed(spring[0], np.zeros(0)) for scene in (alone, whole))
+    here, there = (dataset.packed(spring[0], np.zeros(0)) for dataset in (alone, whole))
     same = there[: len(here), : here.shape[1]]
     size = np.abs(here).max(axis=(0, 1))
     assert (np.abs(same - here).max(axis=(0, 1)) < 1e-6 * size).all()
 
 
 @pytest.fixture(scope="module")
-def against_a_spring() -> Contest:
+def against_a_spring() -> Discrimination:
     """An eccentric gear of joint 2 against a spring there, with thirty candidates."""
     model, table = campaign(COMPENSATOR)
     base = fit_baseline(model, table)
@@ -82,30 +85,30 @@ def against_a_spring() -> Contest:
     known = {(h.name, h.where): h for h in possible(model, table)[0]}
     force = np.unique(table.force, axis=0)
     late, q = np.linspace(1e5, 2e5, 30), random_poses(model.chain, 30, 5)
-    pool = pool_of(model, base.x, table, q, np.ones((30, 6)), late, force)
+    pool = visit_pool_of(model, base.x, table, q, np.ones((30, 6)), late, force)
     noise = NoiseFloor(True, 1.0, 2e-5, (5e-6,) * 6, 0.0, None)
     diagnosis = type("Found", (), {"noise": noise})
     whole = campaign_of(base, pool, [known[k] for k in keys], diagnosis)  # type: ignore
     rivals = RivalSet.of([Item(known[k], np.zeros(0), 0.0) for k in keys], [0.5, 0.5], [])
-    return Contest.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
+    return Discrimination.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
 
 
 def test_a_plan_lets_a_spring_be_anchored_anew(against_a_spring) -> None:
     """The distance from a spring is the one to whichever start imitates best in all visits, and
     the best start so far is one of them."""
-    contest, chosen = against_a_spring, (3, 11, 20)
-    plain, about = contest.rows.imitations
-    assert len(about) == 12 and plain == (contest.rows.groups[0],)
+    discrimination, chosen = against_a_spring, (3, 11, 20)
+    plain, about = discrimination.rows.imitations
+    assert len(about) == 12 and plain == (discrimination.rows.groups[0],)
 
     def by(span: slice) -> np.ndarray:
-        rows = replace(contest.rows, imitations=(plain, (span,)))
-        one = replace(contest, rows=rows)
+        rows = replace(discrimination.rows, imitations=(plain, (span,)))
+        one = replace(discrimination, rows=rows)
         return one.squared(one.gram(chosen))[0, 1]
 
     each = np.array([by(span) for span in about])
-    both = contest.squared(contest.gram(chosen))
+    both = discrimination.squared(discrimination.gram(chosen))
     np.testing.assert_allclose(both[0, 1], each.min(axis=0), rtol=1e-9)
-    kept = by(contest.rows.groups[1])
+    kept = by(discrimination.rows.groups[1])
     assert np.isclose(each, kept, rtol=1e-6).all(axis=1).any()
     assert (both[0, 1] < 0.9 * kept).any()
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis.thin import MOST_IN_ONE, MOST_ROWS, thinned
-from elastocal.manipulator.observation import observe
+from elastocal.diagnosis import thinned
+from elastocal.diagnosis.baseline import MOST_IN_ONE, MOST_ROWS
 from elastocal.measurements import Measurements
+from elastocal.model import observe
 
 
 def repeated(times: int, poses: int = 40) -> Measurements:

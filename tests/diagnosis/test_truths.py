@@ -11,20 +11,26 @@ from support import diagnosis_data
 from support.cells import kr270_chain
 from support.diagnosis_data import FAULTS, Fault, campaign, cell, measured, plan
 
-from elastocal.diagnosis.alike import signal_of
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.confirm import Truth
-from elastocal.diagnosis.found import Found
-from elastocal.diagnosis.generic import generic_blocks
-from elastocal.diagnosis.heldout import left_out_residual, squared_lengths
-from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.model_set import Item, fit_set
-from elastocal.diagnosis.noise import NoiseValues
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.scan import Scan
-from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.truths import DRAWN, NOISES, Confirmation
-from elastocal.manipulator.model import Model
+from elastocal.diagnosis import (
+    Confirmation,
+    DiagnosisData,
+    Item,
+    NoiseValues,
+    PosteriorDraw,
+    Scan,
+    SelectedEffects,
+    diagnosis_data_of,
+    fit_baseline,
+    fit_set,
+    generic_blocks,
+    left_out_residual,
+    possible,
+    project,
+    signal_of,
+    squared_lengths,
+)
+from elastocal.diagnosis.shrinkage import DRAWN, NOISES
+from elastocal.model import Model
 
 SILENT = 1e-9
 
@@ -34,28 +40,28 @@ def confirmation(name: str, wrong_setting: float | None = None) -> tuple[Confirm
     """After the fault of that name has been found, at its own constants or at another."""
     model, table = campaign(name)
     base = fit_baseline(model, table)
-    scene = scene_of(base, possible(model, table)[0])
+    dataset = diagnosis_data_of(base, possible(model, table)[0])
     fault = FAULTS[name]
-    (h,) = (h for h in scene.hypotheses if (h.name, h.where) == fault.key)
+    (h,) = (h for h in dataset.hypotheses if (h.name, h.where) == fault.key)
     values = [fault.settings[s.key] for s in h.settings]
     item = Item(h, np.array(values if wrong_setting is None else [wrong_setting]), 0.0)
-    found = _found(scene, (item,))
+    found = _found(dataset, (item,))
     return Confirmation.of(found, base, np.random.default_rng(3)), item
 
 
-def _found(scene: Scene, items: tuple[Item, ...]) -> Found:
+def _found(dataset: DiagnosisData, items: tuple[Item, ...]) -> SelectedEffects:
     """Only what the confirmation reads of it."""
     nothing: Scan = None  # type: ignore[assignment]
-    plain, chosen = fit_set(scene, ()), fit_set(scene, items)
-    return Found(scene, chosen, (), (), plain, nothing, nothing)
+    plain, chosen = fit_set(dataset, ()), fit_set(dataset, items)
+    return SelectedEffects(dataset, chosen, (), (), plain, nothing, nothing)
 
 
 def rms(rows: np.ndarray) -> float:
     return float(np.sqrt((rows**2).sum(axis=1).mean()))
 
 
-def of_one(found: Confirmation, item: Item) -> Truth:
-    return found.truths(0, ((item, 1.0),))[0]
+def of_one(found: Confirmation, item: Item) -> PosteriorDraw:
+    return found.posterior_draws(0, ((item, 1.0),))[0]
 
 
 @pytest.mark.parametrize("name", ["encoder_scale:joint3", "payload_error:load"])
@@ -65,26 +71,26 @@ def test_the_errors_expected_are_those_of_fresh_readings(
     """Before: the effect that the plain fit could not absorb.  After: what noise left."""
     found, item = confirmation(name)
     monkeypatch.setattr(diagnosis_data, "REPEATABILITY", 0.0)  # of the fresh readings
-    truth = of_one(found, item)
-    fresh = found.seen.table
+    posterior_draw = of_one(found, item)
+    fresh = found.observed.table
     plain = cell(sigma=SILENT)
     readings = measured(kr270_chain(), plain, [FAULTS[name]], fresh, 1).position.ravel()
     before, after = (
         rms((fit.model.predict(fresh, fit.x) - readings).reshape(-1, 3))
         for fit in (found.plain, found.fitted)
     )
-    spread = float(np.sqrt((truth.spread**2).sum(axis=(1, 2)).mean()))
-    assert np.hypot(rms(truth.before), spread) == pytest.approx(before, rel=0.1)
+    spread = float(np.sqrt((posterior_draw.spread**2).sum(axis=(1, 2)).mean()))
+    assert np.hypot(rms(posterior_draw.before), spread) == pytest.approx(before, rel=0.1)
     # One campaign's few dozen fitted numbers make its error, which scatters by a third.
-    assert 0.6 < after / np.hypot(rms(truth.after), spread) < 1.6
+    assert 0.6 < after / np.hypot(rms(posterior_draw.after), spread) < 1.6
     assert after < 0.5 * before
 
 
 def test_a_constant_that_is_not_known_well_widens_what_is_possible() -> None:
     found, item = confirmation("gear_ripple:joint5")
-    truth = of_one(found, item)
+    posterior_draw = of_one(found, item)
     known = len(found.fitted.x)
-    assert truth.spread.shape[2] == known + 1
+    assert posterior_draw.spread.shape[2] == known + 1
     column = found._by_constant(found.fitted, [item], item)[1]
     assert rms(column.reshape(-1, 3)) > 0
 
@@ -116,46 +122,54 @@ def test_a_large_effect_is_not_held_to_be_smaller_than_it_was_found() -> None:
     chain, plain = kr270_chain(), cell(sigma=5e-5)
     table = measured(chain, plain, [stiff], plan(chain, 40, 1), 1)
     base = fit_baseline(Model.assembled(chain, plain), table)
-    scene = scene_of(base, [h for h in possible(base.model, table)[0] if h.name == stiff.effect])
-    item = Item(scene.hypotheses[0], np.zeros(0), 0.0)
-    found = Confirmation.of(_found(scene, (item,)), base, np.random.default_rng(3))
-    truth = of_one(found, item)
+    dataset = diagnosis_data_of(
+        base, [h for h in possible(base.model, table)[0] if h.name == stiff.effect]
+    )
+    item = Item(dataset.hypotheses[0], np.zeros(0), 0.0)
+    found = Confirmation.of(_found(dataset, (item,)), base, np.random.default_rng(3))
+    posterior_draw = of_one(found, item)
     assert found.chosen.scales[0] > 1
-    moved = np.linalg.norm(truth.spread, axis=2)
-    assert rms(truth.after) < 0.3 * float(np.sqrt((moved**2).sum(axis=1).mean()))
+    moved = np.linalg.norm(posterior_draw.spread, axis=2)
+    assert rms(posterior_draw.after) < 0.3 * float(np.sqrt((moved**2).sum(axis=1).mean()))
 
 
 def test_readings_are_numbered_by_fresh_pose() -> None:
     found, item = confirmation("encoder_scale:joint3")
-    truth = of_one(found, item)
-    assert len(np.unique(truth.pose)) == DRAWN
-    assert truth.before.shape == truth.after.shape == truth.spread.shape[:2]
+    posterior_draw = of_one(found, item)
+    assert len(np.unique(posterior_draw.pose)) == DRAWN
+    assert (
+        posterior_draw.before.shape == posterior_draw.after.shape == posterior_draw.spread.shape[:2]
+    )
 
 
 def test_a_rival_is_held_for_true_as_often_as_it_is_probable() -> None:
     """Unlikely ones and blocks without a name are no truth; the settings share the item's."""
     found, item = confirmation("encoder_scale:joint3")
-    others = {(h.name, h.where): h for h in found.scene.hypotheses}
+    others = {(h.name, h.where): h for h in found.dataset.hypotheses}
     rival = Item(others["gear_eccentricity", "joint4"], np.zeros(0), 0.0)
-    block = Item(generic_blocks(found.scene)[0], np.zeros(0), 0.0)
-    truths = found.truths(0, ((item, 0.7), (rival, 0.2), (block, 0.1), (rival, 1e-4)))
-    shares = [t.probability for t in truths]
+    block = Item(generic_blocks(found.dataset)[0], np.zeros(0), 0.0)
+    posterior_draws = found.posterior_draws(
+        0, ((item, 0.7), (rival, 0.2), (block, 0.1), (rival, 1e-4))
+    )
+    shares = [t.probability for t in posterior_draws]
     assert shares == pytest.approx([0.07] * NOISES + [0.02] * NOISES)
     # If the rival were true the model with the item in it would be wrong.
-    assert rms(truths[-1].after) > 3 * rms(truths[0].after)
+    assert rms(posterior_draws[-1].after) > 3 * rms(posterior_draws[0].after)
 
 
 def test_what_has_no_name_is_as_large_as_what_it_stands_for() -> None:
     found, item = confirmation("encoder_scale:joint3")
     assert found.unnamed == 0.0
     (block,) = (
-        b for b in generic_blocks(found.scene) if (b.driver, b.where) == ("joint3 angle", "joint3")
+        b
+        for b in generic_blocks(found.dataset)
+        if (b.covariate, b.where) == ("joint3 angle", "joint3")
     )
     noise = NoiseValues.usual(6)
-    only = fit_set(found.scene, (Item(block, np.zeros(0), 0.0),), noise)
+    only = fit_set(found.dataset, (Item(block, np.zeros(0), 0.0),), noise)
     unnamed = replace(found, chosen=only).unnamed
-    named = fit_set(found.scene, (item,), noise)
-    data = replace(found.scene.data, r=signal_of(found.scene, named, 0))
+    named = fit_set(found.dataset, (item,), noise)
+    data = replace(found.dataset.data, r=signal_of(found.dataset, named, 0))
     error = left_out_residual(project(data, noise.of_instrument()))
     squares, count = squared_lengths(data, data.masked(error))
     assert unnamed == pytest.approx(float(squares.sum() / count.sum()), rel=0.5)

@@ -11,15 +11,20 @@ from support.cells import kr270_chain
 from support.diagnosis_data import VISIT_TIME, Fault, cell, measured, plan
 from support.registered import forgotten, write_example
 
-from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis import (
+    Hypothesis,
+    Item,
+    diagnosis_data_of,
+    fit_baseline,
+    fit_set,
+    grid_of,
+    possible,
+    refine,
+)
 from elastocal.diagnosis.diagnose import diagnose
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.model_set import Item, fit_set, refine
-from elastocal.diagnosis.scene import scene_of
-from elastocal.diagnosis.settings_grid import MOST_POINTS, grid_of
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.parameter import Setting
+from elastocal.diagnosis.hypotheses import MOST_POINTS
 from elastocal.measurements import Measurements
+from elastocal.model import Model, Setting
 from elastocal.plugin_loader import load_plugins
 
 FROM, TIME = 900.0, 400.0
@@ -71,11 +76,11 @@ def test_settings_that_depend_on_each_other_are_refined_together(readings) -> No
     """From a point of the grid to a better one than the grid has."""
     model, table = readings
     h = hypothesis(model, table)
-    scene = scene_of(fit_baseline(model, table), [h])
-    grid = scene.grids[h.name, h.where]
+    dataset = diagnosis_data_of(fit_baseline(model, table), [h])
+    grid = dataset.grids[h.name, h.where]
     near = grid.values[grid.nearest(np.array([FROM, TIME]))]
-    chosen = fit_set(scene, (Item(h, near, 0.0),))
-    refined = refine(scene, chosen, 0)
+    chosen = fit_set(dataset, (Item(h, near, 0.0),))
+    refined = refine(dataset, chosen, 0)
     assert refined.score > chosen.score
     at = refined.items[0].settings
     assert at.shape == (2,) and (at != near).any()

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from support.design_cells import plan_cell
 
-from elastocal.design.design import design
-from elastocal.design.options import DesignOptions
 from elastocal.errors import InputError
-from elastocal.planning.criteria import CRITERIA, make_criterion, register
+from elastocal.planning import DesignOptions, make_criterion, register
+from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.design import design
 from elastocal.report.plan_view import plan_lines
 
 PAGE = Path(__file__).parents[2] / "docs" / "adding-a-criterion.md"

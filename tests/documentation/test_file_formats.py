@@ -9,21 +9,16 @@ import cell_keys_page
 import pytest
 from typer.testing import CliRunner
 
-from elastocal.cell import read_cell
-from elastocal.cli import app
+from elastocal.cell.work_cell import read_cell
+from elastocal.cli.app import app
 from elastocal.config import tables_in
+from elastocal.diagnosis import Curve, DiagnosisOptions, RivalPair, Untested, publish
 from elastocal.diagnosis.diagnose import diagnose
-from elastocal.diagnosis.options import DiagnosisOptions
-from elastocal.diagnosis.published import publish
-from elastocal.diagnosis.result import Curve, Untested
-from elastocal.diagnosis.separate.result import RivalPair
-from elastocal.identification.knowledge import KnowledgeTable
-from elastocal.identification.outlier import Outlier
-from elastocal.identification.robust.report import FaultyGroup
-from elastocal.manipulator.dh import DH_FAMILIES
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
+from elastocal.identification import FaultyGroup, KnowledgeTable, Outlier
 from elastocal.measurements import families, read_measurements
+from elastocal.model import Model
+from elastocal.model.dh import DH_FAMILIES
+from elastocal.model.effects import CATALOGUE
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "file-formats.md").read_text(encoding="utf-8")

@@ -10,9 +10,9 @@ import effects_page
 import pytest
 import typer
 
-from elastocal.cli import app
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.effects.base import Effect
+from elastocal.cli.app import app
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.base import Effect
 from elastocal.planning.criteria import CRITERIA
 
 DOCS = Path(__file__).parents[2] / "docs"

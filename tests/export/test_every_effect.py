@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 from support.cells import COMPENSATOR, SLANTED, kr270_cell
 
-from elastocal.cell import Nominal
-from elastocal.export.cost import cost_of
-from elastocal.export.kept import Conditions, keep
-from elastocal.export.pieces import evaluate_pieces
-from elastocal.manipulator.calibrated import CalibratedArm
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
+from elastocal.cell.arm_description import Nominal
+from elastocal.export import Conditions, cost_of, evaluate_pieces, keep
+from elastocal.model import CalibratedArm, Model
+from elastocal.model.effects import CATALOGUE
 
 CONDITIONS = Conditions(SLANTED, time=1800.0, temperature=30.0)
 # Without parameters of their own they act through the others.

@@ -10,7 +10,7 @@ import pytest
 from support.exports import exported, flanges_in_base, write_result
 from support.robots import KR270
 
-from elastocal.export.formats import ENDINGS, FORMATS
+from elastocal.export.export import ENDINGS, FORMATS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "exporting.md").read_text(encoding="utf-8")
 
@@ -39,7 +39,7 @@ def test_every_format_and_ending_is_told() -> None:
 def test_every_option_is_told() -> None:
     from typer.main import get_command
 
-    from elastocal.cli import app
+    from elastocal.cli.app import app
 
     command = get_command(app).commands["export"]  # type: ignore[attr-defined]
     options = [o for p in command.params for o in p.opts if o.startswith("--")]

@@ -10,9 +10,8 @@ import pytest
 from support.exports import DH, LOAD, SPRINGS, exported, flanges_in_base, poses_of, write_result
 from support.robots import KR270, packaged_urdf, random_chain_urdf
 
-from elastocal.export.mujoco_rest import MujocoRest
-from elastocal.export.urdf import Frames
-from elastocal.manipulator.parameter import Parameter
+from elastocal.export import Frames, MujocoRest
+from elastocal.model import Parameter
 
 mujoco = pytest.importorskip("mujoco")
 

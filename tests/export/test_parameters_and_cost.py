@@ -12,11 +12,9 @@ from hypothesis import strategies as st
 from support.exports import GEOMETRY, LOAD, SPRINGS, exported, write_result
 from support.robots import KR270
 
-from elastocal.export.export import Wish, export
-from elastocal.export.kept import Conditions
-from elastocal.export.yaml_text import to_yaml
-from elastocal.manipulator.calibrated import read_calibrated
-from elastocal.manipulator.urdf import read_urdf
+from elastocal.export import Conditions, Wish, to_yaml
+from elastocal.export.export import export
+from elastocal.model import read_calibrated, read_urdf
 
 ROBOT = f'urdf = "{KR270}"'
 
@@ -77,8 +75,7 @@ def test_a_gear_error_costs_what_it_moves(tmp_path: Path) -> None:
     calibrated, done = exported(*written, "urdf", poses=400)
     (entry,) = done.cost.effects
     assert entry.effect == "gear_eccentricity" and entry.difference == done.cost.total
-    from elastocal.export.check import flanges
-    from elastocal.export.cost import random_table
+    from elastocal.export import flanges, random_table
 
     q = random_table(calibrated.model, Conditions(), 400, 0).q
     place = flanges(calibrated.model.chain, q)[:, :2, 3]

@@ -11,10 +11,8 @@ from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, w
 from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from support.urdf_text import arm
 
-from elastocal.export.urdf import Frames
-from elastocal.manipulator.calibrated import CalibratedArm
-from elastocal.manipulator.urdf import read_urdf
-from elastocal.manipulator.urdf_check import check_urdf
+from elastocal.export import Frames
+from elastocal.model import CalibratedArm, check_urdf, read_urdf
 
 NANOMETRE = 1e-9
 

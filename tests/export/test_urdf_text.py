@@ -15,9 +15,7 @@ from support.exports import GEOMETRY, exported, write_result
 from support.robots import KR270, packaged_urdf
 
 from elastocal.errors import InputError
-from elastocal.export.rigid_text import rpy
-from elastocal.export.urdf import Frames
-from elastocal.export.urdf_edit import read_urdf_text
+from elastocal.export import Frames, read_urdf_text, rpy
 
 ODD = """<?xml version='1.0'?>
 <!-- <joint name="q1"> in a comment is no joint -->\r

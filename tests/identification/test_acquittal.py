@@ -7,12 +7,9 @@ import pytest
 from support.calibration import GEOMETRY, measured
 from support.parts import SIGMA, arm, faulty_of, solved
 
-from elastocal.identification import outliers
-from elastocal.identification.judgement import verdict
-from elastocal.identification.noise import weights_for
-from elastocal.identification.outliers import find_faulty
+from elastocal.identification import find_faulty, outliers, verdict, weights_for
 from elastocal.identification.solve import solve
-from elastocal.manipulator.observation import subset
+from elastocal.model import subset
 
 
 def solved_with(faults, size, seed, poses=60):
@@ -29,9 +26,9 @@ def refitting(solution, log):
 
     def refit(good):
         log.append(int(good.sum()))
-        seen = subset(problem.observations, good)
-        weights = weights_for(seen, problem.model.cell.tracker)
-        return solve(replace(problem, observations=seen, weights=weights), try_wider=False)
+        observed = subset(problem.observations, good)
+        weights = weights_for(observed, problem.model.cell.tracker)
+        return solve(replace(problem, observations=observed, weights=weights), try_wider=False)
 
     return refit
 

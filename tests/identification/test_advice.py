@@ -16,10 +16,11 @@ from support.calibration import (
 )
 from support.cells import random_poses
 
-from elastocal.cell import CartesianNoise, Nominal, Tracker
-from elastocal.identification import fit as fit_module
-from elastocal.identification.identify import Options, identify
-from elastocal.manipulator.model import Model
+from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.identification import Options
+from elastocal.identification import least_squares as fit_module
+from elastocal.identification.identify import identify
+from elastocal.model import Model
 
 SIGMA = 5e-5
 SENTENCES = {

@@ -16,11 +16,9 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.checks import check_limits, check_table, fixed_and_free
-from elastocal.identification.identify import Options, identify
-from elastocal.manipulator.chain import Chain, Joint
-from elastocal.manipulator.limits import joint_limits
-from elastocal.manipulator.model import Model
+from elastocal.identification import Options, check_limits, check_table, fixed_and_free
+from elastocal.identification.identify import identify
+from elastocal.model import Chain, Joint, Model, joint_limits
 
 
 @pytest.fixture

@@ -9,16 +9,21 @@ from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table
 from support.cells import random_poses
 from support.parts import CASES, SIGMA, arm, faulty_of, positions, solved
 
-from elastocal.cell import Nominal
+from elastocal.cell.arm_description import Nominal
 from elastocal.errors import ElastocalError
-from elastocal.identification import chunked, outliers, partition, solve
-from elastocal.identification.heldout import held_out_by_parts, held_out_residual
-from elastocal.identification.linear import solve_weighted
-from elastocal.identification.noise import Weights
-from elastocal.identification.outliers import describe
-from elastocal.identification.selection import residual_sigma
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.identification import (
+    Weights,
+    describe,
+    held_out_by_parts,
+    held_out_residual,
+    outliers,
+    residual_sigma,
+    solve,
+    solve_weighted,
+)
+from elastocal.identification import weighted_problem as chunked
+from elastocal.identification import weighted_problem as partition
+from elastocal.model import Model, observe
 
 UNIT = Weights("none", None, False, "")
 
@@ -80,9 +85,9 @@ def test_the_last_evaluation_leaves_the_triangle_of_all_columns_to_choose_from(i
     solution = solved(model, table)
     problem, fitted = solution.problem, solution.fit
     assert len(fitted.columns) < len(problem.free)
-    again = chunked.evaluate(model, problem.parts, fitted.x, problem.free).triangle
-    own = chunked.evaluate(model, problem.parts, fitted.x, fitted.columns).triangle
-    for one, other in ((fitted.wide, again), (fitted.triangle, own)):
+    again = chunked.evaluate(model, problem.parts, fitted.x, problem.free).r_factor
+    own = chunked.evaluate(model, problem.parts, fitted.x, fitted.columns).r_factor
+    for one, other in ((fitted.wide, again), (fitted.r_factor, own)):
         scale = np.linalg.norm(other.augmented, axis=0)
         scale[scale == 0] = 1.0
         np.testing.assert_allclose(one.augmented.T @ one.augmented / np.outer(scale, scale),
@@ -147,16 +152,16 @@ def test_held_out_where_a_configuration_is_larger_than_a_part(configurations, in
     """60 readings in a few configurations, parts of five; one alone has no held-out residual."""
     model, table = positions()
     code = np.random.default_rng(0).integers(0, configurations, len(table))
-    seen = observe(replace(table, configuration=code), "position")
+    observed = observe(replace(table, configuration=code), "position")
     x, columns = model.nominal, np.array([0, 1, 2, 6, 7])
-    at = model.regressor(seen.table, x, columns, seen)
+    at = model.regressor(observed.table, x, columns, observed)
     step = solve_weighted(at.B, at.residual).x
     whole = held_out_residual(at.B, at.residual - at.B @ step, UNIT, code, 3)
     in_parts(15 * len(model.parameters))
-    parts = partition.partition(seen, UNIT, len(model.parameters))
+    parts = partition.partition(observed, UNIT, len(model.parameters))
     assert max(len(group) for group in parts.groups) > 1
-    triangle = chunked.evaluate(model, parts, x, columns).triangle
-    held = held_out_by_parts(model, parts, x, columns, triangle, step)
+    r_factor = chunked.evaluate(model, parts, x, columns).r_factor
+    held = held_out_by_parts(model, parts, x, columns, r_factor, step)
     assert np.isinf(whole).all() == (configurations == 1)
     np.testing.assert_allclose(held, whole, rtol=1e-9, atol=1e-12)
 
@@ -185,17 +190,17 @@ def test_the_number_of_workers_changes_no_bit(workers, in_parts, monkeypatch):
     reference = chunked.evaluate(model, parts, model.nominal, columns)
     monkeypatch.setattr(chunked, "AT_ONCE", workers)
     found = chunked.evaluate(model, parts, model.nominal, columns)
-    assert np.array_equal(found.triangle.augmented, reference.triangle.augmented)
+    assert np.array_equal(found.r_factor.augmented, reference.r_factor.augmented)
     assert np.array_equal(found.residual, reference.residual)
 
 
-def peak_of_a_pass(model, truth, seen):
+def peak_of_a_pass(model, truth, observed):
     """Largest memory traced in a pass that evaluates and in one that leaves out, in bytes."""
-    parts = partition.partition(seen, UNIT, len(model.parameters))
+    parts = partition.partition(observed, UNIT, len(model.parameters))
     columns, kept = np.arange(len(model.parameters)), np.arange(6)
     tracemalloc.start()
-    triangle = chunked.evaluate(model, parts, truth, columns).triangle.of_columns(kept)
-    held_out_by_parts(model, parts, truth, kept, triangle, np.zeros(len(kept)))
+    r_factor = chunked.evaluate(model, parts, truth, columns).r_factor.of_columns(kept)
+    held_out_by_parts(model, parts, truth, kept, r_factor, np.zeros(len(kept)))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return peak
@@ -209,9 +214,9 @@ def test_a_longer_table_takes_no_more_than_its_residual(monkeypatch):
     peaks, rows = [], []
     for n in (100_000, 300_000):
         many = plan.take(np.arange(n) % 500)
-        seen = observe(replace(many, configuration=np.arange(n)), "position")
-        assert partition.is_large(seen, len(model.parameters))
-        peaks.append(peak_of_a_pass(model, truth, seen))
-        rows.append(len(seen.value))
+        observed = observe(replace(many, configuration=np.arange(n)), "position")
+        assert partition.is_large(observed, len(model.parameters))
+        peaks.append(peak_of_a_pass(model, truth, observed))
+        rows.append(len(observed.value))
     assert peaks[1] < 8 * rows[1] * len(model.parameters) / 2
     assert peaks[1] - peaks[0] < 1.5 * 8 * (rows[1] - rows[0]) + 8 * 2**19

@@ -4,13 +4,16 @@ import numpy as np
 from support.calibration import PLACED, cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.identification.cluster_by_parts import cluster_by_parts, worth_clustering
-from elastocal.identification.covariance.cluster import cluster_robust
-from elastocal.identification.fit import FitProblem, fit
-from elastocal.identification.noise import Weights
-from elastocal.identification.partition import Partition
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.identification import (
+    FitProblem,
+    Partition,
+    Weights,
+    cluster_by_parts,
+    cluster_robust,
+    fit,
+    worth_clustering,
+)
+from elastocal.model import Model, observe
 
 MARKERS = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}
 
@@ -21,30 +24,30 @@ def fitted():
     truth = true_values(model, rng)
     plan = table_at(random_poses(model.chain, 40, 0), markers=("M1", "M2"))
     table = measured(model, plan, truth, 5e-5, rng)
-    seen = observe(table, "position")
+    observed = observe(table, "position")
     columns = np.arange(len(model.parameters))
     weights = Weights("none", None, False, "")
     sizes = np.ones(len(columns))
-    return fit(FitProblem(model, seen, weights, truth, columns, sizes)), seen, weights
+    return fit(FitProblem(model, observed, weights, truth, columns, sizes)), observed, weights
 
 
 def test_equals_the_whole_table_however_it_is_cut():
-    found, seen, weights = fitted()
-    cluster = np.repeat(seen.configuration, 3)
+    found, observed, weights = fitted()
+    cluster = np.repeat(observed.configuration, 3)
     whole = cluster_robust(found.B, found.whitened, cluster, "CR1").matrix
-    order = np.argsort(seen.configuration, kind="stable")
+    order = np.argsort(observed.configuration, kind="stable")
     for groups in (
         (((0, 80),),),
         (((0, 30),), ((30, 80),)),
         # a configuration cut in two: its halves make one group
         (((0, 20),), ((20, 41), (41, 60)), ((60, 80),)),
     ):
-        parts = Partition(seen, weights, order, groups)
+        parts = Partition(observed, weights, order, groups)
         np.testing.assert_allclose(cluster_by_parts(found, parts).matrix, whole, rtol=1e-7,
                                    atol=1e-9 * np.abs(whole).max())  # fmt: skip
 
 
 def test_needs_several_readings_and_many_configurations():
-    _, seen, weights = fitted()
-    parts = Partition(seen, weights, None, (((0, 80),),))
+    _, observed, weights = fitted()
+    parts = Partition(observed, weights, None, (((0, 80),),))
     assert worth_clustering(parts, 4) and not worth_clustering(parts, 5)

@@ -8,9 +8,9 @@ import pytest
 from support.calibration import cell_of, measured, table_at
 from support.cells import kr270_chain, random_poses
 
-from elastocal.cell import Nominal
+from elastocal.cell.arm_description import Nominal
 from elastocal.identification.identify import identify
-from elastocal.manipulator.model import Model
+from elastocal.model import Model
 from elastocal.text import json_text
 
 HELD = 2e-6  # rad/(N m), what the cell states for every joint

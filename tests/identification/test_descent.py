@@ -7,9 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.chunked import Evaluation
-from elastocal.identification.descent import Objective, descend
-from elastocal.identification.triangle import Triangle
+from elastocal.identification import Evaluation, RFactor, SumOfSquares, descend
 
 
 def objective_of(residual, jacobian, p, lower=-np.inf, upper=np.inf, tie=np.inf):
@@ -17,10 +15,10 @@ def objective_of(residual, jacobian, p, lower=-np.inf, upper=np.inf, tie=np.inf)
         e = residual(u)
         if not np.isfinite(e).all():
             raise ElastocalError("no equilibrium")
-        return Evaluation(e, Triangle.of(-jacobian(u), e))
+        return Evaluation(e, RFactor.of(-jacobian(u), e))
 
     limits = (np.full(p, float(lower)), np.full(p, float(upper)))
-    return Objective(evaluate, np.full(p, float(tie)), np.zeros(p), *limits)
+    return SumOfSquares(evaluate, np.full(p, float(tie)), np.zeros(p), *limits)
 
 
 def rosenbrock(u):
@@ -43,7 +41,7 @@ def test_where_the_descent_means_to_end_the_last_evaluation_takes_the_place_of_t
         lambda u: (np.arange(4.0) * np.exp(u[0] * np.arange(4.0)))[:, None],
         1,
     )
-    wide = Triangle.of(np.eye(4), np.ones(4))
+    wide = RFactor.of(np.eye(4), np.ones(4))
     asked = []
 
     def last(u):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from identification.test_methods import campaign
 
-from elastocal.identification.identify import Options, identify
+from elastocal.identification import Options
+from elastocal.identification.identify import identify
 
 
 def shifted(table, rows, by):

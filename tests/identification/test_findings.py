@@ -12,15 +12,20 @@ import pytest
 from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell import CartesianNoise, Tracker
-from elastocal.diagnosis import result as diagnosis_result
+from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.diagnosis import diagnosis as diagnosis_result
 from elastocal.errors import options_as_flags
+from elastocal.identification import (
+    Finding,
+    LackOfFit,
+    TestErrors,
+    judged,
+    next_steps,
+    warning_sentences,
+)
 from elastocal.identification import findings as module
-from elastocal.identification.findings import judged, next_steps, warning_sentences
 from elastocal.identification.identify import identify
-from elastocal.identification.lack_of_fit import LackOfFit
-from elastocal.identification.result import Finding, TestErrors
-from elastocal.manipulator.model import Model
+from elastocal.model import Model
 
 SIGMA = 5e-5
 PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"

@@ -6,8 +6,7 @@ from itertools import pairwise
 import numpy as np
 from support.parts import positions, solved
 
-from elastocal.identification.fit import fit
-from elastocal.identification.partition import part_of
+from elastocal.identification import fit, part_of
 
 
 def test_residual_and_B_of_a_point_come_from_one_evaluation(monkeypatch):

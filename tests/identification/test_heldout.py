@@ -17,13 +17,18 @@ from support.calibration import (
 )
 from support.cells import random_poses
 
-from elastocal.cell import CartesianNoise, Nominal, Tracker
-from elastocal.identification.fit import FitProblem, fit
-from elastocal.identification.heldout import held_out_residual, rms_3d
-from elastocal.identification.identify import Options, identify
-from elastocal.identification.noise import Weights, weights_for
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import subset
+from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.identification import (
+    FitProblem,
+    Options,
+    Weights,
+    fit,
+    held_out_residual,
+    rms_3d,
+    weights_for,
+)
+from elastocal.identification.identify import identify
+from elastocal.model import Model, subset
 
 UNIT = Weights("none", None, False, "")
 
@@ -73,14 +78,14 @@ def test_equals_refits_of_an_arm(effects, stated):
     table = measured(model, table_at(random_poses(chain, 20, 3), forces), truth, sigma, rng)
     result = identify(model, table, Options(method="wls" if stated else "ols"))
     kept = np.array([model.names.index(name) for name in result.determined])
-    seen = result.observations
+    observed = result.observations
     sizes = model.sizes(model.regressor(table, result.x).B)
     for c in range(0, 20, 4):
-        others = subset(seen, seen.configuration != c)
+        others = subset(observed, observed.configuration != c)
         weights = weights_for(others, model.cell.tracker)
         refit = fit(FitProblem(model, others, weights, result.x, kept, sizes))
-        mine = np.repeat(seen.configuration == c, 3)
-        left_out = (seen.value - model.predict(table, refit.x, seen))[mine]
+        mine = np.repeat(observed.configuration == c, 3)
+        left_out = (observed.value - model.predict(table, refit.x, observed))[mine]
         np.testing.assert_allclose(result.held_out[mine], left_out, atol=0.01 * sigma)
 
 

@@ -27,11 +27,10 @@ from support.calibration import (
 from support.cells import COMPLIANCE, kr270_chain, random_poses
 from support.robots import packaged_urdf
 
-from elastocal.cell import CartesianNoise, Nominal, Tracker
-from elastocal.identification.identify import Options, identify
-from elastocal.identification.reduction import reduce
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.urdf import read_urdf
+from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.identification import Options, reduce
+from elastocal.identification.identify import identify
+from elastocal.model import Model, read_urdf
 from elastocal.simulation.simulate import simulate
 
 SIGMA = 5e-5

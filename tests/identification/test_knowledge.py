@@ -15,24 +15,25 @@ from support.calibration import binomial_band, measured, with_values
 from support.cells import DOWN, SLANTED, TABLE_2, kr270_cell, table_of
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification import partition
-from elastocal.identification.constrained.constraints import (
+from elastocal.identification import (
     Bounds,
     Constraints,
+    GaussianPrior,
+    Knowledge,
     LinearEquality,
+    Options,
     SemidefiniteMatrix,
+    degrees_of_freedom,
     equal,
     non_negative,
+    on_columns,
+    physical_constraints,
+    read_knowledge,
 )
-from elastocal.identification.constrained.physical import physical_constraints
-from elastocal.identification.constrained.prior import GaussianPrior
+from elastocal.identification import weighted_problem as partition
 from elastocal.identification.identify import identify
-from elastocal.identification.knowledge import Knowledge, read_knowledge
-from elastocal.identification.knowledge_columns import on_columns
-from elastocal.identification.knowledge_intervals import degrees_of_freedom
-from elastocal.identification.options import Options
-from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
+from elastocal.model import Model
 
 SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise
 BEARING_X, BEARING_Y = "joint2.off_axis_compliance_x", "joint2.off_axis_compliance_y"

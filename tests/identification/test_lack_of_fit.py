@@ -8,10 +8,9 @@ from scipy import stats
 from support.calibration import cell_of, planar_chain, table_at
 from support.cells import random_poses
 
-from elastocal.identification.identify import Options, identify
-from elastocal.identification.lack_of_fit import lack_of_fit
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.identification import Options, lack_of_fit
+from elastocal.identification.identify import identify
+from elastocal.model import Model, observe
 
 PLACED = ("base_frame", "marker_position")
 SIGMA, POSES, REPEATS = 5e-5, 14, 4
@@ -36,10 +35,10 @@ def test_it_is_the_textbook_decomposition():
     """Against the sums written out for one mean fitted to groups of unequal size."""
     _, table = campaign(0)
     table = table.take(np.arange(len(table)) % 7 != 3)
-    seen = observe(table, "position")
+    observed = observe(table, "position")
     e = np.random.default_rng(1).normal(size=(len(table), 3))
     e -= e.mean(axis=0)
-    found = lack_of_fit(seen, e.ravel(), 3)
+    found = lack_of_fit(observed, e.ravel(), 3)
     key = table.configuration * 100 + table.marker
     groups = [e[key == k] for k in np.unique(key)]
     pure = sum(((g - g.mean(axis=0)) ** 2).sum() for g in groups)

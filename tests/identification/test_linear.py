@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.identification.linear import solve_weighted
+from elastocal.identification import solve_weighted
 
 
 def rational_solution(B, y, w):

@@ -16,15 +16,14 @@ from support.calibration import (
 )
 from support.cells import random_poses
 
-from elastocal.cell import CartesianNoise, Tracker
+from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.errors import InputError
-from elastocal.identification import published
-from elastocal.identification.identify import Options, identify
+from elastocal.identification import Options, published
+from elastocal.identification.identify import identify
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.intervals import KINDS as NOISES
 from elastocal.identification.options import METHODS, ROBUST
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.model import Model, observe
 from elastocal.simulation.simulate import simulate
 
 SIGMA = 5e-5
@@ -86,12 +85,12 @@ def test_every_method_finds_the_truth_and_says_its_name(method):
 def test_the_published_methods_are_those_of_the_paper():
     """On the linearised model at the result, a step of the published estimator moves nothing."""
     model, table, _ = campaign()
-    seen = observe(table, "position")
-    group = (seen.configuration[:, None] * 3 + np.arange(3)).ravel()
+    observed = observe(table, "position")
+    group = (observed.configuration[:, None] * 3 + np.arange(3)).ravel()
     for method in ("ols", "eq14"):
         result = identify(model, table, Options(method=method))
         columns = np.array([model.names.index(n) for n in result.determined])
-        B = model.regressor(table, result.x, columns, seen).B
+        B = model.regressor(table, result.x, columns, observed).B
         history = published.eq14(B, result.residual, group)
         found = history[0 if method == "ols" else -1]
         std = np.sqrt(np.diag(result.covariance))

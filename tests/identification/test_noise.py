@@ -5,21 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import linalg, stats
-from support.calibration import (
-    cell_of,
-    measured,
-    planar_chain,
-    table_at,
-    true_values,
-)
+from support.calibration import cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell import CartesianNoise, PolarNoise, Tracker
+from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError
-from elastocal.identification.identify import Options, identify
-from elastocal.identification.noise import scaled_by_component, weights_for
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe, subset
+from elastocal.identification import Options, scaled_by_component, weights_for
+from elastocal.identification.identify import identify
+from elastocal.model import Model, observe, subset
 from elastocal.simulation.simulate import simulate
 
 POLAR = Tracker(np.array([0.3, -0.2, 0.1]), PolarNoise(2e-6, 3e-6, 5e-6, 2e-5))
@@ -75,18 +68,18 @@ def test_whitens_positions_and_deflections(case, kind):
     table = some_table(states=1 if kind == "position" else 2)
     if case.startswith("rows"):
         table = with_sigma(table, case.split()[1])
-    seen = observe(table, kind)
-    weights = weights_for(seen, tracker)
+    observed = observe(table, kind)
+    weights = weights_for(observed, tracker)
     assert weights.kind == case.split()[0] and weights.absolute
-    mix = np.kron(seen.combine.toarray(), np.eye(3))
+    mix = np.kron(observed.combine.toarray(), np.eye(3))
     assert_whitens(weights, mix @ reading_covariance(table, tracker) @ mix.T)
 
 
 def test_deflections_that_share_an_unloaded_reading_are_correlated():
     """Three loads against one unloaded reading: Σ = σ² (I + 1 1ᵀ), whitened together."""
     table = some_table(n=4, states=4)
-    seen = observe(table, "deflection")
-    weights = weights_for(seen, AXIS)
+    observed = observe(table, "deflection")
+    weights = weights_for(observed, AXIS)
     covariance = np.kron(np.kron(np.eye(4), np.eye(3) + np.ones((3, 3))),
                          np.diag(AXIS.noise.sigma**2))  # fmt: skip
     assert_whitens(weights, covariance)
@@ -102,8 +95,10 @@ def test_deflections_against_the_mean_of_unloaded_repeats():
     force = table.force.copy()
     force[:, 2] = np.tile([0.0, 0.0, -100.0], 3)
     table = replace(table, force=force, repeat=np.tile([0, 1, 5], 3))
-    seen = observe(table, "deflection")
-    assert_whitens(weights_for(seen, AXIS), np.kron(np.eye(3), 1.5 * np.diag(AXIS.noise.sigma**2)))
+    observed = observe(table, "deflection")
+    assert_whitens(
+        weights_for(observed, AXIS), np.kron(np.eye(3), 1.5 * np.diag(AXIS.noise.sigma**2))
+    )
 
 
 def test_whitens_poses_and_distances():
@@ -117,11 +112,11 @@ def test_whitens_poses_and_distances():
 
 
 def test_a_given_covariance_is_whitened_and_wins():
-    seen = observe(some_table(n=4), "position")
+    observed = observe(some_table(n=4), "position")
     A = np.random.default_rng(3).normal(size=(12, 12))
     covariance = A @ A.T + 0.1 * np.eye(12)
     covariance[:3, 3:] = covariance[3:, :3] = 0.0  # a group of its own
-    weights = weights_for(seen, AXIS, "auto", covariance)
+    weights = weights_for(observed, AXIS, "auto", covariance)
     assert weights.kind == "covariance" and weights.absolute
     assert_whitens(weights, covariance)
 
@@ -233,8 +228,8 @@ def test_wls_has_the_variance_it_states_and_beats_ols():
     model = Model.assembled(chain, cell_of(effects))
     plan, rng = heterogeneous(chain), np.random.default_rng(5)
     truth = true_values(model, rng)
-    seen = observe(replace(plan, position=np.zeros((25, 3))), "position")
-    W = weights_for(seen, model.cell.tracker)
+    observed = observe(replace(plan, position=np.zeros((25, 3))), "position")
+    W = weights_for(observed, model.cell.tracker)
     kept = [model.names.index(n) for n in (
         "base.x", "base.y", "base.z", "joint2.offset", "joint3.offset", "link2.dx", "link2.rx"
     )]  # fmt: skip
@@ -246,7 +241,7 @@ def test_wls_has_the_variance_it_states_and_beats_ols():
     weighted, ordinary = np.zeros((DRAWS, len(kept))), np.zeros((DRAWS, len(kept)))
     for i in range(DRAWS):
         table = simulate(model, plan, truth, rng)
-        y = table.position.ravel() - model.predict(plan, truth, seen)
+        y = table.position.ravel() - model.predict(plan, truth, observed)
         weighted[i] = np.linalg.lstsq(Bw, W.apply(y), rcond=None)[0]
         ordinary[i] = np.linalg.lstsq(B * size, y, rcond=None)[0]
     z = linalg.solve_triangular(factor, weighted.T, lower=True)
@@ -291,8 +286,8 @@ def test_unit_weights_are_ols_and_worse():
 
 def test_weights_follow_a_subset_of_the_observations():
     table = with_sigma(some_table(n=10, states=2), "cartesian")
-    seen = observe(table, "deflection")
-    part = subset(seen, np.arange(10) % 3 > 0)
+    observed = observe(table, "deflection")
+    part = subset(observed, np.arange(10) % 3 > 0)
     mix = np.kron(part.combine.toarray(), np.eye(3))
     assert_whitens(weights_for(part, AXIS), mix @ reading_covariance(part.table, AXIS) @ mix.T)
 

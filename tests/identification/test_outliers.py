@@ -18,10 +18,10 @@ from support.calibration import (
 )
 from support.cells import random_poses
 
-from elastocal.identification.identify import Options, identify
-from elastocal.identification.outliers import FALSE_ALARM, blocks
-from elastocal.identification.trimmed import least_trimmed_squares, majority, median_scale
-from elastocal.manipulator.model import Model
+from elastocal.identification import Options, blocks, least_trimmed_squares, majority
+from elastocal.identification.identify import identify
+from elastocal.identification.outliers import FALSE_ALARM, median_scale
+from elastocal.model import Model
 
 SIGMA = 5e-5
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy import sparse
 from support.parts import deflections, positions
 
-from elastocal.identification import partition
-from elastocal.identification.noise import Weights, weights_for
-from elastocal.manipulator.observation import observe
+from elastocal.identification import Weights, weights_for
+from elastocal.identification import weighted_problem as partition
+from elastocal.model import observe
 
 UNIT = Weights("none", None, False, "")
 UNIT_TABLE = positions()
@@ -30,14 +30,14 @@ def test_partition(n, configurations, run, limit, seed):
     table = replace(
         table.take(rng.integers(0, len(table), n)), configuration=rng.integers(0, configurations, n)
     )
-    seen = observe(table, "position")
+    observed = observe(table, "position")
     block = np.sort(np.arange(n) // run)[rng.permutation(n)]
     linked = np.kron((block[:, None] == block) & np.tri(n, dtype=bool), np.tri(3))
     weights = Weights("covariance", sparse.csr_array(linked), True, "")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(partition, "LARGE", 0)
         patch.setattr(partition, "PART", limit * 3 * len(model.parameters))
-        parts = partition.partition(seen, weights, len(model.parameters))
+        parts = partition.partition(observed, weights, len(model.parameters))
     of_group = [[parts.part(span) for span in group] for group in parts.groups]
     every = [part for group in of_group for part in group]
     index = np.concatenate([part.index for part in every])
@@ -48,7 +48,7 @@ def test_partition(n, configurations, run, limit, seed):
             group_of[part.index] = g
     for k, part in enumerate(every):
         span_of[part.index] = k
-        assert np.array_equal(part.observations.value, seen.value[part.rows])
+        assert np.array_equal(part.observations.value, observed.value[part.rows])
         assert len(part.index) <= limit or len(np.unique(block[part.index])) == 1
         dense = weights.whiten.toarray()[np.ix_(part.rows, part.rows)]
         assert np.array_equal(part.weights.whiten.toarray(), dense)
@@ -59,20 +59,20 @@ def test_partition(n, configurations, run, limit, seed):
 
 def test_a_table_of_ordinary_size_stays_whole():
     model, table = positions()
-    seen = observe(table, "position")
-    parts = partition.partition(seen, UNIT, len(model.parameters))
-    assert parts.spans == [(0, 60)] and parts.part((0, 60)).observations is seen
+    observed = observe(table, "position")
+    parts = partition.partition(observed, UNIT, len(model.parameters))
+    assert parts.spans == [(0, 60)] and parts.part((0, 60)).observations is observed
 
 
 def test_a_sample_takes_correlated_observations_together(monkeypatch):
     """12 of 80 observations in 20 blocks of four, and two of the only marker."""
     monkeypatch.setattr(partition, "OF_A_MARKER", 2)
     model, table = deflections()
-    seen = observe(table, "deflection")
-    weights = weights_for(seen, model.cell.tracker)
-    parts = partition.partition(seen, weights, 4)
+    observed = observe(table, "deflection")
+    weights = weights_for(observed, model.cell.tracker)
+    parts = partition.partition(observed, weights, 4)
     assert parts.blocks is not None and len(np.unique(parts.blocks)) == 20
     part = partition.sample(parts, 12)
     assert 12 <= len(part.index) <= 20
-    outside = np.setdiff1d(np.arange(len(seen.lead)), part.index)
+    outside = np.setdiff1d(np.arange(len(observed.lead)), part.index)
     assert not set(parts.blocks[part.index]) & set(parts.blocks[outside])

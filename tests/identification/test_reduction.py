@@ -21,12 +21,11 @@ from support.calibration import (
 )
 from support.cells import choices, kr270_chain, random_poses
 
-from elastocal.cell import Nominal
+from elastocal.cell.arm_description import Nominal
+from elastocal.identification import reduce
+from elastocal.identification.identifiability import STRUCTURAL
 from elastocal.identification.identify import identify
-from elastocal.identification.reduction import STRUCTURAL, reduce
-from elastocal.manipulator.chain import Chain, Joint
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.parameter import Parameter
+from elastocal.model import Chain, Joint, Model, Parameter
 
 DOWN = ((0.0, 0.0, -300.0),)
 SIDEWAYS = ((300.0, 0.0, 0.0),)

@@ -13,14 +13,14 @@ from scipy import sparse, stats
 from support.calibration import binomial_band, table_at
 
 from elastocal.errors import InputError
-from elastocal.identification.normal_scores import normal_scores, simultaneous_level
-from elastocal.identification.residual_summary import (
-    MOST_BINS,
-    MOST_LISTED,
+from elastocal.identification import (
     ResidualSummary,
+    normal_scores,
+    simultaneous_level,
     summarise_residuals,
 )
-from elastocal.manipulator.observation import Observations
+from elastocal.identification.residuals import MOST_BINS, MOST_LISTED
+from elastocal.model import Observations
 
 LOADS = ((0, 0, 0), (0, 0, -2600.0))
 
@@ -32,8 +32,8 @@ def readings(poses: int, markers: int = 2, forces: Any = LOADS) -> Observations:
     return Observations("position", np.zeros(3 * n), whole, np.arange(n), table)
 
 
-def noise(seen: Observations, seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=len(seen.value))
+def noise(observed: Observations, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=len(observed.value))
 
 
 def summary(*arguments: Any, **options: Any) -> ResidualSummary:
@@ -43,11 +43,11 @@ def summary(*arguments: Any, **options: Any) -> ResidualSummary:
 
 
 def test_every_value_is_counted_once_in_every_grouping() -> None:
-    seen = readings(10)
-    found = summary(seen, noise(seen, 0))
+    observed = readings(10)
+    found = summary(observed, noise(observed, 0))
     assert [g.by for g in found.groupings] == ["component", "marker", "configuration", "load state"]
     for g in found.groupings:
-        assert sum(group.n for group in g.groups) == len(seen.value)
+        assert sum(group.n for group in g.groups) == len(observed.value)
         for group in g.groups:
             assert group.counts.sum() + group.beyond == group.n
             assert group.expected.sum() == pytest.approx(group.n, rel=0.05)
@@ -57,9 +57,9 @@ def test_every_value_is_counted_once_in_every_grouping() -> None:
 
 
 def test_statistics_are_those_of_scipy() -> None:
-    seen = readings(40)
-    e = noise(seen, 1)
-    found = summary(seen, e).groupings[0].groups[1]
+    observed = readings(40)
+    e = noise(observed, 1)
+    found = summary(observed, e).groupings[0].groups[1]
     y = e.reshape(-1, 3)[:, 1]
     assert found.mean_square == pytest.approx(np.mean(y**2))
     assert found.skewness == pytest.approx(stats.skew(y))
@@ -69,11 +69,13 @@ def test_statistics_are_those_of_scipy() -> None:
 
 
 def test_the_order_of_the_readings_does_not_matter() -> None:
-    seen = readings(10)
-    e = noise(seen, 2)
-    order = np.random.default_rng(3).permutation(len(seen.lead))
-    shuffled = Observations("position", seen.value, seen.combine, seen.lead[order], seen.table)
-    one = summary(seen, e)
+    observed = readings(10)
+    e = noise(observed, 2)
+    order = np.random.default_rng(3).permutation(len(observed.lead))
+    shuffled = Observations(
+        "position", observed.value, observed.combine, observed.lead[order], observed.table
+    )
+    one = summary(observed, e)
     two = summary(shuffled, e.reshape(-1, 3)[order].ravel())
     np.testing.assert_allclose(one.whole.scores.observed, two.whole.scores.observed)
     for a, b in zip(one.groupings, two.groupings, strict=True):
@@ -82,10 +84,10 @@ def test_the_order_of_the_readings_does_not_matter() -> None:
 
 
 def test_unknown_size_of_the_noise_drops_out() -> None:
-    seen = readings(10)
-    e, h = noise(seen, 4), np.full(len(seen.value), 0.2)
-    one = summary(seen, e, h, absolute=False)
-    two = summary(seen, 3.7e-5 * e, h, absolute=False)
+    observed = readings(10)
+    e, h = noise(observed, 4), np.full(len(observed.value), 0.2)
+    one = summary(observed, e, h, absolute=False)
+    two = summary(observed, 3.7e-5 * e, h, absolute=False)
     np.testing.assert_allclose(one.whole.scores.observed, two.whole.scores.observed)
     assert one.whole.mean_square == pytest.approx(1.0)
     assert one.whole.counts.tolist() == two.whole.counts.tolist()
@@ -93,7 +95,7 @@ def test_unknown_size_of_the_noise_drops_out() -> None:
 
 def test_leverage_makes_residuals_of_a_fit_standard_normal() -> None:
     """With p = 40 of 96 rows fitted, raw residuals have mean square 0.58; z of variance 1."""
-    seen = readings(8)
+    observed = readings(8)
     rng = np.random.default_rng(5)
     Q = np.linalg.qr(rng.normal(size=(96, 40)))[0]
     h = (Q**2).sum(axis=1)
@@ -101,7 +103,7 @@ def test_leverage_makes_residuals_of_a_fit_standard_normal() -> None:
     for _ in range(250):
         e = rng.normal(size=96)
         e -= Q @ (Q.T @ e)
-        whole = summary(seen, e, h).whole
+        whole = summary(observed, e, h).whole
         p.append(whole.p)
         below += whole.p < 0.05
     low, high = binomial_band(250, 0.05)
@@ -111,7 +113,7 @@ def test_leverage_makes_residuals_of_a_fit_standard_normal() -> None:
 
 def test_expected_counts_of_internally_studentised_residuals() -> None:
     """With 6 degrees of freedom |z| cannot exceed √6; the expected counts are the mean counts."""
-    seen = readings(1)
+    observed = readings(1)
     rng = np.random.default_rng(6)
     Q = np.linalg.qr(rng.normal(size=(12, 6)))[0]
     h = (Q**2).sum(axis=1)
@@ -120,7 +122,7 @@ def test_expected_counts_of_internally_studentised_residuals() -> None:
     for _ in range(runs):
         e = rng.normal(size=12)
         e -= Q @ (Q.T @ e)
-        whole = summary(seen, e, h, absolute=False)
+        whole = summary(observed, e, h, absolute=False)
         assert np.abs(whole.whole.scores.observed).max() <= np.sqrt(6)
         middle = len(whole.whole.counts) // 2
         total += whole.whole.counts[middle], whole.whole.expected[middle]
@@ -129,67 +131,69 @@ def test_expected_counts_of_internally_studentised_residuals() -> None:
 
 
 def test_a_group_that_scatters_more_is_named_and_clean_tables_name_none() -> None:
-    seen = readings(12)
+    observed = readings(12)
     wrong = 0
     for seed in range(200):
-        wrong += bool(summary(seen, noise(seen, seed)).deviating)
+        wrong += bool(summary(observed, noise(observed, seed)).deviating)
     assert wrong <= binomial_band(200, 0.05)[1]  # Holm: at most 5 % of clean tables
-    e = noise(seen, 7)
-    e[np.repeat(seen.configuration, 3) == 4] *= 3
-    assert [(by, g.name) for by, g in summary(seen, e).deviating][:1] == [("configuration", "5")]
-    quiet = noise(seen, 7)
+    e = noise(observed, 7)
+    e[np.repeat(observed.configuration, 3) == 4] *= 3
+    assert [(by, g.name) for by, g in summary(observed, e).deviating][:1] == [
+        ("configuration", "5")
+    ]
+    quiet = noise(observed, 7)
     quiet.reshape(-1, 3)[:, 2] *= 0.3
-    found = dict((g.name, g) for _, g in summary(seen, quiet).deviating)
+    found = dict((g.name, g) for _, g in summary(observed, quiet).deviating)
     assert found["z"].mean_square < 1
 
 
 def test_only_the_most_conspicuous_of_many_groups_are_listed() -> None:
-    seen = readings(100)
-    e = noise(seen, 8)
-    loud = np.isin(np.repeat(seen.configuration, 3), [17, 71])
+    observed = readings(100)
+    e = noise(observed, 8)
+    loud = np.isin(np.repeat(observed.configuration, 3), [17, 71])
     e[loud] *= 4
-    g = next(g for g in summary(seen, e).groupings if g.by == "configuration")
+    g = next(g for g in summary(observed, e).groupings if g.by == "configuration")
     assert (g.n_groups, g.n_small, len(g.groups)) == (100, 0, MOST_LISTED)
     assert [group.name for group in g.groups if group.deviates] == ["18", "72"]
     assert g.n_deviating == 2
 
 
 def test_small_groups_are_left_out_and_counted() -> None:
-    seen = readings(5, markers=1)  # 6 values in a configuration
-    g = next(g for g in summary(seen, noise(seen, 9)).groupings if g.by == "configuration")
+    observed = readings(5, markers=1)  # 6 values in a configuration
+    g = next(g for g in summary(observed, noise(observed, 9)).groupings if g.by == "configuration")
     assert (g.n_groups, g.n_small, g.groups) == (5, 5, ())
 
 
 def test_rows_without_a_residual_are_left_out() -> None:
-    seen = readings(10)
-    e, h = noise(seen, 10), np.zeros(len(seen.value))
+    observed = readings(10)
+    e, h = noise(observed, 10), np.zeros(len(observed.value))
     e[:6], h[:6] = 0.0, 1.0
-    found = summary(seen, e, h)
+    found = summary(observed, e, h)
     assert (found.n_alone, found.whole.n) == (6, len(e) - 6)
     assert found.whole.mean_square == pytest.approx(np.mean(e[6:] ** 2))
 
 
 def test_held_out_mean_square_passes_over_what_cannot_be_held_out() -> None:
-    seen = readings(10)
-    e = noise(seen, 11)
+    observed = readings(10)
+    e = noise(observed, 11)
     held = 2 * e
     held[:12] = np.inf
-    assert summary(seen, e).whole.held_out_mean_square is None
-    found = summary(seen, e, held_out=held).whole
+    assert summary(observed, e).whole.held_out_mean_square is None
+    found = summary(observed, e, held_out=held).whole
     assert found.held_out_mean_square == pytest.approx(4 * np.mean(e[12:] ** 2))
 
 
 def test_nothing_to_summarise() -> None:
-    seen = readings(10)
-    assert summarise_residuals(seen, np.zeros(len(seen.value))) is None
-    assert summarise_residuals(seen, noise(seen, 0), np.ones(len(seen.value))) is None
+    observed = readings(10)
+    assert summarise_residuals(observed, np.zeros(len(observed.value))) is None
+    assert summarise_residuals(observed, noise(observed, 0), np.ones(len(observed.value))) is None
 
 
 def test_wild_values_do_not_blow_up_the_histogram() -> None:
-    seen = readings(10)
-    e = noise(seen, 12)
+    observed = readings(10)
+    e = noise(observed, 12)
     e[0] = 1e9
-    whole = summary(seen, e).whole
+    whole = summary(observed, e).whole
     assert len(whole.counts) <= MOST_BINS
     assert whole.beyond == 1
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.identification.triangle import BLOCK, Triangle, merge
+from elastocal.identification import RFactor, merge
+from elastocal.identification.weighted_problem import BLOCK
 
 NIST = Path(__file__).parent / "nist"
 CERTIFIED = json.loads((NIST / "certified.json").read_text(encoding="utf-8"))
@@ -30,13 +31,13 @@ def test_an_ill_conditioned_problem_keeps_its_digits(name, digits):
     columns = [np.ones((len(y), 1))] if 0 in certified["powers"] else []
     B = np.hstack(columns + [predictors**k for k in certified["powers"] if k > 0])
     pieces = [slice(a, a + 5) for a in range(0, len(y), 5)]
-    triangle = merge(Triangle.of(B[piece], y[piece]) for piece in pieces)
+    r_factor = merge(RFactor.of(B[piece], y[piece]) for piece in pieces)
     scale = 1 / np.linalg.norm(B, axis=0)
     x, std = np.array(certified["x"]), np.array(certified["std"])
-    error = np.abs(triangle.step(scale) - x) / np.maximum(np.abs(x), std)
+    error = np.abs(r_factor.step(scale) - x) / np.maximum(np.abs(x), std)
     assert (error < 10.0**-digits).all()
-    sigma = triangle.rest / np.sqrt(len(y) - len(x))
-    found = sigma * np.sqrt(np.diag(triangle.cofactor(scale)))
+    sigma = r_factor.rest / np.sqrt(len(y) - len(x))
+    found = sigma * np.sqrt(np.diag(r_factor.cofactor(scale)))
     assert (np.abs(found / std - 1) < 10.0**-digits).all()
     if name == "Filip":
         scaled = B * scale
@@ -53,36 +54,36 @@ def test_a_triangle_stands_for_its_rows(rows, p, cuts, seed):
     rng = np.random.default_rng(seed)
     B, e = rng.normal(size=(rows, p)) * 10.0 ** rng.uniform(-3, 3, p), rng.normal(size=rows)
     edges = np.linspace(0, rows, cuts + 1).astype(int)
-    triangle = merge(Triangle.of(B[a:b], e[a:b]) for a, b in pairwise(edges) if b > a)
+    r_factor = merge(RFactor.of(B[a:b], e[a:b]) for a, b in pairwise(edges) if b > a)
     norm = np.linalg.norm(B, axis=0)
-    assert triangle.rows == rows and triangle.rss == pytest.approx(e @ e, rel=1e-12)
-    np.testing.assert_allclose(triangle.R.T @ triangle.R, B.T @ B, rtol=0,
+    assert r_factor.rows == rows and r_factor.rss == pytest.approx(e @ e, rel=1e-12)
+    np.testing.assert_allclose(r_factor.R.T @ r_factor.R, B.T @ B, rtol=0,
                                atol=1e-12 * np.outer(norm, norm).max())  # fmt: skip
-    np.testing.assert_allclose(triangle.R.T @ triangle.projected, B.T @ e,
+    np.testing.assert_allclose(r_factor.R.T @ r_factor.projected, B.T @ e,
                                atol=1e-11 * norm.max() * np.linalg.norm(e))  # fmt: skip
     chosen = np.flatnonzero(rng.random(p) < 0.6)
-    some = triangle.of_columns(chosen)
+    some = r_factor.of_columns(chosen)
     assert some.rss == pytest.approx(e @ e, rel=1e-12)
     np.testing.assert_allclose(some.R.T @ some.R, B[:, chosen].T @ B[:, chosen], rtol=0,
                                atol=1e-12 * np.outer(norm, norm).max())  # fmt: skip
     if rows > 2 * p:
         x = np.linalg.lstsq(B / norm, e, rcond=None)[0] / norm
-        np.testing.assert_allclose(triangle.step(1 / norm) * norm, x * norm, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(r_factor.step(1 / norm) * norm, x * norm, rtol=1e-8, atol=1e-10)
         left = np.linalg.norm(e - B @ x)
-        assert triangle.rest == pytest.approx(left, rel=1e-8, abs=1e-12 * np.linalg.norm(e))
+        assert r_factor.rest == pytest.approx(left, rel=1e-8, abs=1e-12 * np.linalg.norm(e))
 
 
 def test_a_tall_matrix_whose_solution_is_known():
     B = np.random.default_rng(0).normal(size=(5003, 7))
-    triangle = Triangle.of(B, B[:, 0])
-    np.testing.assert_allclose(triangle.R.T @ triangle.R, B.T @ B, rtol=1e-12, atol=1e-9)
-    np.testing.assert_allclose(triangle.step(np.ones(7)), np.eye(7)[0], atol=1e-13)
+    r_factor = RFactor.of(B, B[:, 0])
+    np.testing.assert_allclose(r_factor.R.T @ r_factor.R, B.T @ B, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(r_factor.step(np.ones(7)), np.eye(7)[0], atol=1e-13)
 
 
 def test_a_direction_without_data_is_left_where_it_is():
     """Two equal columns share the step by their sizes; a zero column stays at zero."""
     B = np.ones((9, 3)) * [1.0, 1.0, 0.0]
-    step = Triangle.of(B, np.full(9, 5.0)).step(np.array([2.0, 1.0, 1.0]))
+    step = RFactor.of(B, np.full(9, 5.0)).step(np.array([2.0, 1.0, 1.0]))
     np.testing.assert_allclose(step, [4.0, 1.0, 0.0], atol=1e-14)
 
 
@@ -95,12 +96,12 @@ def test_a_long_ill_conditioned_part_keeps_its_digits(p):
     B[:, -1] = B[:, 0] + 1e-10 * B[:, -1]
     x = rng.normal(size=p)
     e = B @ x
-    triangle = Triangle.of(B, e)
-    assert B.size + len(e) > BLOCK and triangle.rows == len(e)
+    r_factor = RFactor.of(B, e)
+    assert B.size + len(e) > BLOCK and r_factor.rows == len(e)
     R = np.linalg.qr(B, mode="r")
-    own, other = (r * np.sign(np.diag(r))[:, None] for r in (triangle.R, R))
+    own, other = (r * np.sign(np.diag(r))[:, None] for r in (r_factor.R, R))
     assert np.abs(own - other).max() < 1e-14 * np.linalg.norm(B, axis=0).max()
-    assert np.abs(triangle.step(np.ones(p)) - x).max() < 1e-5
-    assert triangle.rest < 1e-13 * np.linalg.norm(e)
+    assert np.abs(r_factor.step(np.ones(p)) - x).max() < 1e-5
+    assert r_factor.rest < 1e-13 * np.linalg.norm(e)
     normal = np.linalg.lstsq(B.T @ B, B.T @ e, rcond=None)[0]
     assert np.abs(normal - x).max() > 0.1

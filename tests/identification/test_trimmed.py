@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from elastocal.identification.trimmed import STEPS, TOGETHER, _searched, least_trimmed_squares
+from elastocal.identification import least_trimmed_squares
+from elastocal.identification.outliers import STEPS, TOGETHER, _searched
 
 
 def one_by_one(B, e, subset):

@@ -7,10 +7,10 @@ import pytest
 from support.tracker_exports import kr270_readings, krl, spatialanalyzer
 from typer.testing import CliRunner
 
-from elastocal.cli import app
-from elastocal.cli.import_ import PRESET_NAMES
-from elastocal.importing.export_columns import wanted
-from elastocal.importing.mapping import PRESETS, read_mapping
+from elastocal.cli.app import app
+from elastocal.cli.import_command import PRESET_NAMES
+from elastocal.importing import read_mapping, wanted
+from elastocal.importing.mapping_file import PRESETS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
 

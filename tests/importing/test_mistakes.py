@@ -151,7 +151,7 @@ def test_a_fit_within_millimetres_is_no_warning(tmp_path, readings):
 def test_what_would_make_the_readings_fit_is_named(tmp_path, readings, change, words):
     from dataclasses import replace
 
-    from elastocal.cell import read_cell
+    from elastocal.cell.work_cell import read_cell
 
     cell = replace(read_cell(readings[0].path), limits={})
     found = with_cell(tmp_path, (cell, *readings[1:]), f"[joints]\n{change}\n")

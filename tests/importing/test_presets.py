@@ -13,7 +13,8 @@ from support.tracker_exports import (
 )
 
 from elastocal.errors import InputError
-from elastocal.importing.mapping import PRESETS, preset_text, read_mapping
+from elastocal.importing import preset_text, read_mapping
+from elastocal.importing.mapping_file import PRESETS
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +80,7 @@ by = "order"
 
 
 def test_the_robot_names_the_joints_where_the_mapping_does_not(tmp_path, readings):
-    from elastocal.manipulator.choice import load_chain
+    from elastocal.model import load_chain
 
     cell, degrees, points = readings
     own = [joint.name for joint in load_chain(cell).joints][::-1]

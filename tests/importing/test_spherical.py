@@ -86,14 +86,14 @@ def test_readings_in_the_second_face_come_out_right(tmp_path, readings):
     st.sampled_from(["deg", "gon", "rad"]),
 )  # fmt: skip
 def test_the_length_is_the_range_whatever_the_angles(d, az, zen, clockwise, unit):
-    from elastocal.importing.records import Records, Understood, with_positions
+    from elastocal.importing import Records, Understood, with_positions
 
     scale = TURN[unit] / 400
-    seen = Understood("p", None, "points", "utf-8", "", ".", (), (), 1, ())
+    observed = Understood("p", None, "points", "utf-8", "", ".", (), (), 1, ())
     numbers = {"range": np.array([d]), "azimuth": np.array([az * scale]),
                "zenith": np.array([zen * scale * (1 - 1e-15)])}  # fmt: skip
     units = {"range": "mm", "azimuth": unit, "zenith": unit}
-    records = Records("p", np.array([2]), numbers, units, {}, None, seen)
+    records = Records("p", np.array([2]), numbers, units, {}, None, observed)
     found = with_positions(records, clockwise)
     assert set(found.numbers) == set(found.units) == set("xyz")
     assert set(found.units.values()) == {"mm"}

@@ -18,13 +18,13 @@ import pytest
 from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, HOSTILE
 
-from elastocal.cell import DesignSpec, Tracker
-from elastocal.design.design import design
-from elastocal.design.options import DesignOptions
-from elastocal.diagnosis.baseline import Baseline
-from elastocal.manipulator.model import Model
+from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.diagnosis import Baseline
+from elastocal.model import Model
+from elastocal.planning import DesignOptions
+from elastocal.planning.design import design
 from elastocal.report.page import diagnosis_page, identification_page, plan_page
-from elastocal.tracker_noise import CartesianNoise
 
 playwright = pytest.importorskip("playwright.sync_api")
 
@@ -61,9 +61,9 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def texts(hostile: Any) -> dict[str, str]:
-    seen = hostile.result.observations
+    observed = hostile.result.observations
     model = hostile.result.model
-    base = Baseline(model, seen, hostile.result.x, np.ones(len(model.names)),
+    base = Baseline(model, observed, hostile.result.x, np.ones(len(model.names)),
                     hostile.result.residual, hostile.result.residual, None)  # fmt: skip
     arm = Model.assembled(kr270_chain(), kr270_cell(("base_frame",)))
     spec = DesignSpec(poses=4, loads=np.array([[0, 0, 0], [0, 0, -2600.0]]), candidates=30)

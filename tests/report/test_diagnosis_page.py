@@ -12,10 +12,10 @@ from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, EXTRA, HOSTILE, TWO, VERDICTS
 from support.pages import Page
 
-from elastocal.diagnosis.result import FaultyReading
+from elastocal.diagnosis import FaultyReading
 from elastocal.errors import InputError
-from elastocal.identification.error_budget import BudgetStep
-from elastocal.manipulator.model import Model
+from elastocal.identification import BudgetStep
+from elastocal.model import Model
 from elastocal.report.page import diagnosis_page, write_diagnosis_report
 
 

@@ -25,7 +25,7 @@ from support.diagnoses import (
     VERDICTS,
 )
 
-from elastocal.diagnosis.result import EffectAt, NoiseFloor
+from elastocal.diagnosis import EffectAt, NoiseFloor
 from elastocal.report.diagnosis_view import (
     diagnosis_headline,
     diagnosis_lines,

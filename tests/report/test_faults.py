@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.identification.outlier import Outlier
-from elastocal.identification.robust.report import FaultyGroup, OutlierReport
+from elastocal.identification import FaultyGroup, Outlier, OutlierReport
 from elastocal.report.identification_view import summary_lines
 from elastocal.report.method_and_noise import MOST_TOLD, fault_lines
 from elastocal.report.page import identification_page

@@ -10,7 +10,7 @@ import pytest
 from support.pages import Page
 
 from elastocal.identification import error_budget as module
-from elastocal.identification.error_budget import gap_budget
+from elastocal.identification import gap_budget
 from elastocal.report.figures import waterfall_of_steps
 from elastocal.report.identification_view import budget_steps, budget_table, rms_by_kind
 
@@ -45,9 +45,9 @@ def test_floor_is_the_stated_noise_where_nothing_was_repeated(case: Any) -> None
 
 def test_floor_is_the_scatter_of_repeats_where_there_are_some(case: Any) -> None:
     """Every reading twice, moved apart by ± d: the scatter of a pair is √2 d per coordinate."""
-    seen, d = case.result.observations, 7e-6
-    rows = np.repeat(np.arange(len(seen.table)), 2)
-    twice = replace(seen, table=seen.table.take(rows), lead=np.arange(len(rows)))
+    observed, d = case.result.observations, 7e-6
+    rows = np.repeat(np.arange(len(observed.table)), 2)
+    twice = replace(observed, table=observed.table.take(rows), lead=np.arange(len(rows)))
     apart = np.tile([d, -d], len(rows) // 2)[:, None]
     residual = (np.zeros((len(rows), 3)) + apart).ravel()
     result = replace(case.result, observations=twice, residual=residual)

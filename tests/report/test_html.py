@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from support.pages import Page
 
-from elastocal.manipulator.observation import observe
+from elastocal.model import observe
 from elastocal.report import residual_view
 from elastocal.report.page import identification_page, write_identification_report
 
@@ -83,12 +83,12 @@ def test_names_from_files_are_text(hostile: Any) -> None:
 
 def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:
     """40 000 readings: thinned, said so, and below 6 MB."""
-    seen = case.result.observations
-    times = 40000 // len(seen.lead) + 1
-    rows = np.tile(np.arange(len(seen.table)), times)
+    observed = case.result.observations
+    times = 40000 // len(observed.lead) + 1
+    rows = np.tile(np.arange(len(observed.table)), times)
     long = replace(
         case.result,
-        observations=observe(seen.table.take(rows), seen.kind),
+        observations=observe(observed.table.take(rows), observed.kind),
         residual=np.tile(case.result.residual, times),
         held_out=np.tile(case.result.held_out, times),
         noise=replace(case.result.noise, kind="none"),

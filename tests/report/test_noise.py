@@ -12,15 +12,18 @@ import pytest
 from rich.console import Console
 from support.pages import Page
 
-from elastocal.identification.constrained.minimise import ActiveConstraint
-from elastocal.identification.findings import judged
+from elastocal.identification import (
+    ActiveConstraint,
+    LackOfFit,
+    Noise,
+    NoiseSize,
+    Trial,
+    judged,
+    noise_models,
+    summarise_residuals,
+)
 from elastocal.identification.intervals import KINDS as INTERVALS
-from elastocal.identification.lack_of_fit import LackOfFit
-from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.options import METHODS
-from elastocal.identification.residual_summary import summarise_residuals
-from elastocal.identification.variance.choose import Trial
-from elastocal.identification.variance.structure import noise_models
 from elastocal.report.identification_view import summary_lines
 from elastocal.report.method_and_noise import (
     candidate_rows,
@@ -52,9 +55,9 @@ def changed(result: Any, noise: dict[str, Any] | None = None, **fields: Any) -> 
 @pytest.fixture(scope="module")
 def noisy(case: Any) -> Any:
     """A result with everything that the report can tell of noise."""
-    seen = case.result.observations
-    e = np.random.default_rng(0).normal(size=len(seen.value))
-    e[np.repeat(seen.configuration, 3) == 3] *= 4
+    observed = case.result.observations
+    e = np.random.default_rng(0).normal(size=len(observed.value))
+    e[np.repeat(observed.configuration, 3) == 3] *= 4
     noise = {
         "kind": "axis+configuration",
         "description": "one variance per axis, and a deviation common to each configuration",
@@ -70,7 +73,7 @@ def noisy(case: Any) -> Any:
     share = {"joint4.offset": 0.83, "joint5.offset": 0.2, "joint6.offset": float("nan")}
     return changed(
         case.result, noise, method="reml", active=active, prior_share=share,
-        residual_summary=summarise_residuals(seen, e),
+        residual_summary=summarise_residuals(observed, e),
     )  # fmt: skip
 
 
@@ -178,11 +181,11 @@ def test_estimated_noise_is_judged_against_the_stated_one(case: Any) -> None:
 
 
 def test_shape_of_the_residuals_in_words(case: Any) -> None:
-    seen, rng = case.result.observations, np.random.default_rng(1)
-    n = len(seen.value)
+    observed, rng = case.result.observations, np.random.default_rng(1)
+    n = len(observed.value)
 
     def line(e: np.ndarray) -> str:
-        found = summarise_residuals(seen, e / e.std())
+        found = summarise_residuals(observed, e / e.std())
         assert found is not None
         return shape_line(found)
 

@@ -51,9 +51,10 @@ def plan():
 
     from support.cells import kr270_cell
 
-    from elastocal.cell import CartesianNoise, DesignSpec, Tracker
-    from elastocal.design.design import design
-    from elastocal.design.options import DesignOptions
+    from elastocal.cell.arm_description import CartesianNoise, Tracker
+    from elastocal.cell.plan_wishes import DesignSpec
+    from elastocal.planning import DesignOptions
+    from elastocal.planning.design import design
 
     loads = np.array([[0, 0, 0], [0, 0, -2600.0]])
     spec = DesignSpec(poses=4, loads=loads, candidates=30, levels={"joint2": (-0.5, -1.0)})
@@ -189,10 +190,9 @@ def commands():
     from support.cells import kr270_cell
     from support.commands import calibrated, erring
 
+    from elastocal.compensation import targets_at, tool_point
     from elastocal.compensation.compensate import compensate
-    from elastocal.compensation.point import tool_point
-    from elastocal.compensation.targets import targets_at
-    from elastocal.manipulator.model import Model
+    from elastocal.model import Model
 
     cell = kr270_cell(("joint_offset", "joint_compliance"))
     x = erring(Model.assembled(kr270_chain(), cell), np.random.default_rng(1), 0.5)

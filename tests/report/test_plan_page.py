@@ -13,15 +13,14 @@ from support.design_commands import design as design_command
 from support.design_commands import everything_in, write_cell
 from support.pages import Page
 
-from elastocal.cell import DesignSpec, Tracker
-from elastocal.design.design import design
-from elastocal.design.options import DesignOptions
-from elastocal.design.plan import Certificate, SizePoint
+from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.errors import InputError
+from elastocal.planning import Certificate, DesignOptions, PlanSize
+from elastocal.planning.design import design
 from elastocal.report.arm_view import plan_space
 from elastocal.report.page import plan_page, write_plan_report
 from elastocal.report.plan_view import plan_headline, plan_steps, plan_tone
-from elastocal.tracker_noise import CartesianNoise
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -44,7 +43,7 @@ def plan() -> Any:
 @pytest.fixture(scope="module")
 def page(plan: Any) -> Page:
     told = {"command": f"elastocal design {SCRIPT}", "inputs": {SCRIPT: "0" * 64}}
-    text = plan_page(replace(plan, curve=(SizePoint(4, 6.5, 6.1), SizePoint(8, 4.5, None))), **told)
+    text = plan_page(replace(plan, curve=(PlanSize(4, 6.5, 6.1), PlanSize(8, 4.5, None))), **told)
     found = Page(text)
     found.check_harmless(text)
     assert len(text) < 6e6

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges, random_poses
 
-from elastocal.cell import HalfSpace, Nominal, Solid, Tracker, Workspace
+from elastocal.cell.arm_description import Nominal, Tracker
+from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.report.plan_picture import draw_plan, wireframe, write_plan_picture
 

@@ -9,13 +9,12 @@ from rich.cells import cell_len
 from rich.console import Console
 from support.cells import kr270_cell
 
-from elastocal.cell import DesignSpec, Tracker
-from elastocal.design.design import design
-from elastocal.design.options import DesignOptions
-from elastocal.design.plan import Certificate, SizePoint
+from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.planning import Certificate, DesignOptions, PlanSize
+from elastocal.planning.design import design
 from elastocal.report.plan_view import plan_lines, served
 from elastocal.report.terminal import PRINTED_WIDTH, plan_text, print_plan
-from elastocal.tracker_noise import CartesianNoise
 
 LOADS = np.array([[0, 0, 0], [0, 0, -2600.0]])
 
@@ -102,7 +101,7 @@ def test_loads_curve_sums_and_warnings_fit_too(plan, width):
     other = replace(
         plan,
         load=np.array([0, 1, 0, 1]),
-        curve=(SizePoint(4, 3.25, 3.0), SizePoint(8, 2.125, None)),
+        curve=(PlanSize(4, 3.25, 3.0), PlanSize(8, 2.125, None)),
         predicted=sums,
         warnings=("a warning with [brackets] and a very long word " + 90 * "x",),
     )

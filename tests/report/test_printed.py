@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.diagnoses import VERDICTS
 
-from elastocal.identification.findings import judged
+from elastocal.identification import judged
 from elastocal.report.identification_view import judgement
 from elastocal.report.terminal import PRINTED_WIDTH, diagnosis_text, identification_text
 

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges
 from support.robots import packaged_urdf
 
-from elastocal.cell import Robot, Solid, Tracker, Workspace
-from elastocal.design.feasibility.carriers import WORLD
-from elastocal.manipulator.choice import load_chain
+from elastocal.cell.arm_description import Robot, Tracker
+from elastocal.cell.workspace_rules import Solid, Workspace
+from elastocal.model import load_chain
+from elastocal.planning.bodies import WORLD
 from elastocal.report import arm_view as residual_module
 from elastocal.report.arm_view import (
     ARROW,
@@ -114,21 +115,21 @@ def test_no_name_ends_the_script_that_holds_it(content: Any) -> None:
 def test_arrows_are_mean_residuals_by_configuration_load_and_marker(case: Any) -> None:
     result = case.result
     space = residual_space(result.model, result.observations, result.x, result.residual)
-    seen = result.observations
-    table = seen.table
+    observed = result.observations
+    table = observed.table
     parts = result.residual.reshape(-1, 3)
-    loaded = (table.force[seen.lead] != 0).any(axis=1)
-    assert len(space.poses) == 2 * len(np.unique(seen.configuration))
+    loaded = (table.force[observed.lead] != 0).any(axis=1)
+    assert len(space.poses) == 2 * len(np.unique(observed.configuration))
     pose = space.poses[1]
     label, _, load = pose.name.partition(", ")
     code = table.configuration_labels.index(label)
     for name, marker, arrow in zip(pose.names, pose.markers, pose.arrows, strict=True):
-        own = (seen.configuration == code) & (loaded == (load != "unloaded"))
-        own &= table.marker[seen.lead] == table.marker_names.index(name)
+        own = (observed.configuration == code) & (loaded == (load != "unloaded"))
+        own &= table.marker[observed.lead] == table.marker_names.index(name)
         assert arrow == pytest.approx(parts[own].mean(axis=0))
-        assert marker == pytest.approx(table.position[seen.lead][own].mean(axis=0))
+        assert marker == pytest.approx(table.position[observed.lead][own].mean(axis=0))
     # The arm ends where the model puts the flange.
-    row = seen.lead[(seen.configuration == code) & (loaded == (load != "unloaded"))][:1]
+    row = observed.lead[(observed.configuration == code) & (loaded == (load != "unloaded"))][:1]
     assert pose.flange == pytest.approx(result.model.flange_poses(table.take(row), result.x)[0])
     sizes = [np.sqrt((p.arrows**2).sum(axis=1).mean()) for p in space.poses]
     assert space.first == int(np.argmax(sizes))

@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 
-from elastocal.identification.findings import judged
-from elastocal.identification.lack_of_fit import LackOfFit
-from elastocal.identification.result import TestErrors
+from elastocal.identification import LackOfFit, TestErrors, judged
 from elastocal.report import identification_view
 
 MISFIT = LackOfFit(9.0, 1e-5, 30, 200)

@@ -12,11 +12,9 @@ import pytest
 from support.robots import KR270, random_chain_urdf
 
 from elastocal.errors import ElastocalError, InputError
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.rigid import nominal_flange
-from elastocal.manipulator.urdf import read_urdf
-from elastocal.simulation import mjcf, mujoco_arm
-from elastocal.simulation.mujoco_arm import MujocoArm
+from elastocal.model import Chain, nominal_flange, read_urdf
+from elastocal.simulation import MujocoArm, mujoco_arm
+from elastocal.simulation import mujoco_arm as mjcf
 
 pytest.importorskip("mujoco")
 
@@ -172,5 +170,5 @@ def test_it_is_independent_of_our_kinematics() -> None:
         lines = Path(str(module.__file__)).read_text().splitlines()
         imported = {line.split()[1] for line in lines if line.startswith("from elastocal")}
         assert imported <= {
-            "elastocal.errors", "elastocal.manipulator.chain", "elastocal.simulation.mjcf"
+            "elastocal.errors", "elastocal.model.chain", "elastocal.simulation.mujoco_arm"
         }  # fmt: skip

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from support.calibration import GEOMETRY, cell_of, planar_chain, table_at, true_values, with_values
 from support.cells import COMPLIANCE, kr270_chain, random_poses
 
-from elastocal.cell import CartesianNoise, Nominal, PolarNoise, Tracker
+from elastocal.cell.arm_description import CartesianNoise, Nominal, PolarNoise, Tracker
 from elastocal.errors import InputError
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
-from elastocal.simulation.simulate import draw_errors, expand_plan, simulate, values_from
+from elastocal.model import Model, observe
+from elastocal.simulation import draw_errors, expand_plan, values_from
+from elastocal.simulation.simulate import simulate
 from elastocal.tracker_noise import position_covariance
 
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 5e-5])))
@@ -145,10 +145,10 @@ def test_deflections_are_loaded_minus_unloaded_readings():
     model = Model.assembled(kr270_chain(), cell)
     plan = table_at(random_poses(model.chain, 10, 3), [[0, 0, 0], [500, 0, -2600]])
     table = simulate(model, plan, model.nominal, 0)
-    seen = observe(table, "deflection")
+    observed = observe(table, "deflection")
     difference = table.position[1::2] - table.position[::2]
-    np.testing.assert_allclose(seen.value, difference.ravel(), atol=1e-15)
-    np.testing.assert_allclose(seen.value, model.predict(plan, model.nominal), atol=1e-13)
+    np.testing.assert_allclose(observed.value, difference.ravel(), atol=1e-15)
+    np.testing.assert_allclose(observed.value, model.predict(plan, model.nominal), atol=1e-13)
     assert 1e-4 < np.linalg.norm(difference, axis=1).max() < 5e-2
 
 

@@ -30,7 +30,7 @@ from support.study_scripts import study_of
 from visits import draw_poses
 from world_files import write_world
 
-from elastocal.studies import read_study
+from elastocal.studies.study_folder import read_study
 
 study = study_of(FOLDER)
 ECCENTRIC, MASS, SCALE = (
@@ -206,10 +206,10 @@ class Blindfold(worker.Worker):
 
     def __init__(self):
         super().__init__()
-        self.seen, self.tables = [], []
+        self.observed, self.tables = [], []
 
     def diagnose(self, folder, *arguments):
-        self.seen.append((folder, arguments, sorted(p.name for p in folder.iterdir())))
+        self.observed.append((folder, arguments, sorted(p.name for p in folder.iterdir())))
         self.tables.append((folder / "data.csv").read_text().splitlines())
         given = dict.fromkeys(records.KEPT) | NOTHING | {"candidates": [{}] * 99}
         (folder / one_world.ANSWER).write_text(json.dumps(given))
@@ -231,7 +231,7 @@ def test_the_tool_sees_neither_the_truth_nor_a_name_that_betrays_it(monkeypatch)
     )
     blind = Blindfold()
     record = one_world.diagnose_world(task(), blind, {"seed": 5})
-    ((visible, arguments, files),) = blind.seen
+    ((visible, arguments, files),) = blind.observed
     sealed = next(f for f in folders if f != visible)
     assert files == ["arm.urdf", "cell.toml", "data.csv"]
     assert arguments == (

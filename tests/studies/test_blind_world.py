@@ -17,24 +17,17 @@ FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diag
 sys.path.insert(0, str(FOLDER))
 
 from arm_data import ARMS
-from draw import (
-    ALIKE,
-    CATALOGUE,
-    OUTSIDE_EFFECTS,
-    World,
-    catalogue_worlds,
-    draw_world,
-    pair_worlds,
-)
+from draw import ALIKE, CATALOGUE, OUTSIDE_EFFECTS, World, catalogue_worlds, draw_world, pair_worlds
 from instrument import OUTLIER_SIZE, REPEATABILITY, VARIANTS, draw_noise
 from mechanics import ElasticArm, Placement
 from mjcf import GRAVITY, Spring
 from skeleton import Skeleton
 from world_files import write_table, write_world
 
-from elastocal.cell import EffectChoice, read_cell
-from elastocal.manipulator.model import Model
+from elastocal.cell.arm_description import EffectChoice
+from elastocal.cell.work_cell import read_cell
 from elastocal.measurements import Measurements, read_measurements
+from elastocal.model import Model
 
 WORLD_MODULES = {
     "arm_data", "chance", "draw", "inside", "instrument", "mechanics", "mjcf", "outside", "places",
@@ -80,12 +73,12 @@ def model_with(
 ) -> tuple[Model, Measurements]:
     """elastocal's model of the world's cell with effects (name, where, settings) added, and the
     world's noise-free readings."""
-    seen = folder / "seen"
-    write_world(world, seen, folder / "sealed")
-    write_table(world, world.visits, world.noise_free(world.visits), seen / "data.csv")
+    observed = folder / "seen"
+    write_world(world, observed, folder / "sealed")
+    write_table(world, world.visits, world.noise_free(world.visits), observed / "data.csv")
     kinds = ("revolute",) * world.spec.skeleton.n_joints
-    table = read_measurements(seen / "data.csv", joint_kinds=kinds)
-    cell = read_cell(seen / "cell.toml")
+    table = read_measurements(observed / "data.csv", joint_kinds=kinds)
+    cell = read_cell(observed / "cell.toml")
     added = tuple(EffectChoice(name, where) for name, where, _ in effects)
     nominal = replace(cell.model.nominal, settings={w: s for _, w, s in effects if s})
     spec = replace(cell.model, effects=cell.model.effects + added, nominal=nominal)
@@ -267,13 +260,13 @@ def test_noise_is_of_the_kind_and_size_stated(variant):
 def test_the_tool_sees_nothing_of_the_truth(tmp_path):
     """Cell and arm are those of the same world without effects; no file names an effect."""
     for world in [*pair_worlds(12, 3), draw_world((12,), "outside", ["floor_wave"])]:
-        seen, sealed = tmp_path / "seen" / world.name, tmp_path / "sealed" / world.name
-        write_world(world, seen, sealed)
+        observed, sealed = tmp_path / "seen" / world.name, tmp_path / "sealed" / world.name
+        write_world(world, observed, sealed)
         write_world(replace(world, effects=()), tmp_path / "clean", tmp_path / "none")
-        assert {p.name for p in seen.iterdir()} == {"arm.urdf", "cell.toml", "data.csv"}
+        assert {p.name for p in observed.iterdir()} == {"arm.urdf", "cell.toml", "data.csv"}
         for name in ("arm.urdf", "cell.toml"):
-            assert (seen / name).read_bytes() == (tmp_path / "clean" / name).read_bytes()
-        text = "".join(p.read_text() for p in seen.iterdir())
+            assert (observed / name).read_bytes() == (tmp_path / "clean" / name).read_bytes()
+        text = "".join(p.read_text() for p in observed.iterdir())
         truth = json.loads((sealed / "truth.json").read_text())
         assert len(truth["effects"]) == len(world.effects)
         for effect in truth["effects"]:

@@ -17,12 +17,14 @@ sys.path.insert(0, str(FOLDER))
 import scenarios
 from support.study_scripts import study_of
 
-from elastocal.cell import read_cell
+from elastocal.cell.work_cell import read_cell
 from elastocal.demo import LOAD_N, published_compliances
-from elastocal.identification.identify import Options, identify
-from elastocal.manipulator.model import Model
+from elastocal.identification import Options
+from elastocal.identification.identify import identify
 from elastocal.measurements import read_plan
-from elastocal.simulation.simulate import expand_plan, simulate, values_from
+from elastocal.model import Model
+from elastocal.simulation import expand_plan, values_from
+from elastocal.simulation.simulate import simulate
 
 study = study_of(FOLDER)
 NAMES = {s.key: s for s in scenarios.SCENARIOS}

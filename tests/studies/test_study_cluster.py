@@ -10,8 +10,8 @@ import pytest
 from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies import ClusterLostError, StudyStop, read_results, run_cluster
-from elastocal.studies.study_run import connect
+from elastocal.studies.study_results import read_results
+from elastocal.studies.study_run import ClusterLostError, StudyStop, connect, run_cluster
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")

@@ -9,10 +9,10 @@ import pytest
 from support.study_folders import SCRIPT, TOML, here, numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies import read_results, read_study, study_results
-from elastocal.studies import run_study as run_prepared
-from elastocal.studies.study_folder import execute
-from elastocal.studies.study_results import Recorder, StudyResults, opened
+from elastocal.studies import study_results
+from elastocal.studies.study_folder import execute, read_study
+from elastocal.studies.study_results import Recorder, StudyResults, opened, read_results
+from elastocal.studies.study_run import run_study as run_prepared
 
 
 @pytest.fixture

@@ -7,9 +7,8 @@ from concurrent.futures.process import BrokenProcessPool
 import pytest
 from support.study_folders import SCRIPT, TOML, numbers, on_processes, run_study, write_study
 
-from elastocal.studies import StudyStop, read_study
-from elastocal.studies.study_folder import Outcome
-from elastocal.studies.study_run import hand_out
+from elastocal.studies.study_folder import Outcome, read_study
+from elastocal.studies.study_run import StudyStop, hand_out
 
 
 class PretendedCrew:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support.study_folders import here, numbers, on_processes, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies import read_study
+from elastocal.studies.study_folder import read_study
 
 
 @pytest.fixture(scope="module")

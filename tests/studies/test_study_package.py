@@ -6,8 +6,7 @@ import pytest
 from support.study_folders import SCRIPT, TOML, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies import read_study
-from elastocal.studies.study_folder import Sources, execute
+from elastocal.studies.study_folder import Sources, execute, read_study
 
 WITH_PARTS = """\
 from pathlib import Path

@@ -11,12 +11,13 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from support.cells import choices
 
-from elastocal.cell import Array, Cell, ModelSpec, Robot, Tool, Tracker
-from elastocal.identification.result import Calibration
-from elastocal.manipulator.chain import Chain, Joint, LinkMass
-from elastocal.manipulator.model import Model
+from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker
+from elastocal.cell.work_cell import Cell
+from elastocal.identification import Calibration
 from elastocal.measurements import Measurements
+from elastocal.model import Chain, Joint, LinkMass, Model
 from elastocal.simulation.simulate import simulate
+from elastocal.units import Array
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")
 SPRINGS = (*GEOMETRY, "joint_compliance")

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from support.robots import KR270
 
-from elastocal.cell import Array, Cell, EffectChoice, ModelSpec, Nominal, Robot, Tool, Tracker
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.rigid import nominal_flange
-from elastocal.manipulator.urdf import read_urdf
+from elastocal.cell.arm_description import EffectChoice, ModelSpec, Nominal, Robot, Tool, Tracker
+from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
+from elastocal.model import Chain, nominal_flange, read_urdf
+from elastocal.units import Array
 
 # Table 3 of Klimchik et al. (2013) in rad/(N m), k2 at its first level; k1 is not in it.
 COMPLIANCE = (3.5e-7, 0.287e-6, 0.416e-6, 2.786e-6, 3.483e-6, 2.074e-6)

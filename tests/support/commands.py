@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Array, Cell
-from elastocal.compensation.compensate import Compensation
-from elastocal.manipulator.calibrated import CalibratedArm
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import Cell
+from elastocal.compensation import Compensation
 from elastocal.measurements import Measurements
+from elastocal.model import CalibratedArm, Chain, Model
+from elastocal.units import Array
 
 
 def calibrated(chain: Chain, cell: Cell, x: Array | None = None, std: float = 0.0) -> CalibratedArm:

@@ -12,14 +12,15 @@ from scipy.spatial.transform import Rotation
 from support.calibration import cell_of, placement, random_chain
 from support.cells import kr270_cell, kr270_chain
 
-from elastocal.cell import Array, CartesianNoise, Cell, DesignSpec, Tool, Tracker
-from elastocal.design import target_poses
-from elastocal.design.readings import ALL_LOADS, load_states
-from elastocal.design.setup import Known, Setup, set_up
-from elastocal.design.target_poses import TargetPoses
-from elastocal.manipulator.chain import Chain, Joint, LinkMass
-from elastocal.manipulator.model import Model
+from elastocal.cell.arm_description import CartesianNoise, Tool, Tracker
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
+from elastocal.model import Chain, Joint, LinkMass, Model
+from elastocal.planning import Known, Setup, TargetPoses, load_states, set_up
+from elastocal.planning import test_poses as target_poses
+from elastocal.planning.information import ALL_LOADS
+from elastocal.units import Array
 
 AXIS = CartesianNoise(np.array([10e-6, 15e-6, 20e-6]))
 FULL = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")

@@ -6,22 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from elastocal.diagnosis.result import (
+from elastocal.diagnosis import (
     Candidate,
     Curve,
     Diagnosis,
     EffectAt,
+    ExtraPlan,
     FaultyReading,
     FittedParameter,
     FoundEffect,
     Gap,
     Location,
     NoiseFloor,
+    RivalPair,
     StructureTest,
     Untested,
 )
-from elastocal.diagnosis.separate.result import ExtraPlan, RivalPair
-from elastocal.identification.error_budget import BudgetStep
+from elastocal.identification import BudgetStep
 from elastocal.measurements import Measurements
 
 HOSTILE = "<script>alert(1)</script>\x1b[31m"

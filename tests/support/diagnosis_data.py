@@ -21,16 +21,14 @@ from support.cells import (
 )
 from support.robots import KR270
 
-from elastocal.cell import CartesianNoise, Cell, ModelSpec, Nominal, Robot, Tool, Tracker
-from elastocal.diagnosis.blocks import Blocks
+from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
+from elastocal.cell.work_cell import Cell
+from elastocal.diagnosis import Blocks, Diagnosis, DiagnosisOptions, NoiseValues, NoisyData
 from elastocal.diagnosis.diagnose import diagnose
-from elastocal.diagnosis.noise import NoiseValues, NoisyData
-from elastocal.diagnosis.options import DiagnosisOptions
-from elastocal.diagnosis.result import Diagnosis
-from elastocal.manipulator.chain import Chain, Joint
-from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
-from elastocal.simulation.simulate import draw_errors, simulate, values_from
+from elastocal.model import Chain, Joint, Model
+from elastocal.simulation import draw_errors, values_from
+from elastocal.simulation.simulate import simulate
 
 Array = np.ndarray
 FITTED = ("base_frame", "joint_offset", "joint_compliance", "marker_position")

@@ -8,15 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell import Array, read_cell
-from elastocal.export.cost import random_table
-from elastocal.export.export import Exported, Wish, export
-from elastocal.export.kept import Conditions
-from elastocal.export.urdf import Frames
-from elastocal.manipulator.calibrated import CalibratedArm, read_calibrated
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.parameter import Parameter
+from elastocal.cell.work_cell import read_cell
+from elastocal.export import Conditions, Exported, Frames, Wish, random_table
+from elastocal.export.export import export
+from elastocal.model import CalibratedArm, Model, Parameter, read_calibrated
+from elastocal.model.effects import CATALOGUE
+from elastocal.units import Array
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")
 SPRINGS = (*GEOMETRY, "joint_compliance")

@@ -24,8 +24,8 @@ def write_campaign(folder: Path, poses: int = 12) -> tuple[Path, Path]:
     """cell.toml, arm.urdf and an exact data.csv (degrees, millimetres) in `folder`."""
     from support.cells import random_poses, table_of
 
-    from elastocal.cell import read_cell
-    from elastocal.manipulator.model import Model
+    from elastocal.cell.work_cell import read_cell
+    from elastocal.model import Model
 
     shutil.copyfile(KR270, folder / "arm.urdf")
     cell = folder / "cell.toml"

@@ -11,16 +11,20 @@ from numpy.typing import NDArray
 from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell import Array, CartesianNoise, Nominal, PolarNoise, Tracker
-from elastocal.identification.checks import fixed_and_free
-from elastocal.identification.noise import weights_for
-from elastocal.identification.outliers import find_faulty
-from elastocal.identification.solve import Problem, Solution, solve
-from elastocal.identification.start import start_values
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe, subset
+from elastocal.cell.arm_description import CartesianNoise, Nominal, PolarNoise, Tracker
+from elastocal.identification import (
+    Problem,
+    Solution,
+    find_faulty,
+    fixed_and_free,
+    start_values,
+    weights_for,
+)
+from elastocal.identification.solve import solve
 from elastocal.measurements import Measurements
+from elastocal.model import Model, observe, subset
 from elastocal.simulation.simulate import simulate
+from elastocal.units import Array
 
 SIGMA = 3e-5
 POLAR = PolarNoise(1e-5, 3e-7, 1.5e-5, 6e-6)
@@ -108,11 +112,11 @@ def solved(
     model: Model, table: Measurements, bounded: bool = False, covariance: Array | None = None
 ) -> Solution:
     """The weighted fit from nothing, before anything is made of it."""
-    seen = observe(table, model.observe)
-    weights = weights_for(seen, model.cell.tracker, "auto", covariance)
+    observed = observe(table, model.observe)
+    weights = weights_for(observed, model.cell.tracker, "auto", covariance)
     free = fixed_and_free(model, ())
     x0 = start_values(model, table, 0, free)
-    return solve(Problem(model, seen, weights, x0, free, bounded))
+    return solve(Problem(model, observed, weights, x0, free, bounded))
 
 
 def faulty_of(solution: Solution) -> tuple[NDArray[np.bool_], Solution]:
@@ -120,8 +124,8 @@ def faulty_of(solution: Solution) -> tuple[NDArray[np.bool_], Solution]:
     problem = solution.problem
 
     def refit(good: NDArray[np.bool_]) -> Solution:
-        seen = subset(problem.observations, good)
-        weights = weights_for(seen, problem.model.cell.tracker)
-        return solve(replace(problem, observations=seen, weights=weights), try_wider=False)
+        observed = subset(problem.observations, good)
+        weights = weights_for(observed, problem.model.cell.tracker)
+        return solve(replace(problem, observations=observed, weights=weights), try_wider=False)
 
     return find_faulty(solution, refit)

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from elastocal import plugin_loader
-from elastocal.identification.variance import structure
-from elastocal.manipulator.effects import CATALOGUE
+from elastocal.identification import noise_structure as structure
+from elastocal.model.effects import CATALOGUE
 
 DOCS = Path(__file__).parents[2] / "docs"
 

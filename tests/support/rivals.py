@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from support.cells import COMPLIANCE, DOWN, kr270_cell, kr270_chain, table_of
 
-from elastocal.cell import CartesianNoise, Cell, Nominal
-from elastocal.diagnosis.result import Candidate, EffectAt, NoiseFloor
-from elastocal.manipulator.limits import finite_ranges, joint_limits
-from elastocal.manipulator.model import Model
+from elastocal.cell.arm_description import CartesianNoise, Nominal
+from elastocal.cell.work_cell import Cell
+from elastocal.diagnosis import Candidate, EffectAt, NoiseFloor
 from elastocal.measurements import Measurements
-from elastocal.simulation.simulate import simulate, values_from
+from elastocal.model import Model, finite_ranges, joint_limits
+from elastocal.simulation import values_from
+from elastocal.simulation.simulate import simulate
 
 Key = tuple[str, str]
 

@@ -9,10 +9,10 @@ import numpy as np
 from support.cells import random_poses, table_of
 from support.robots import KR270
 
-from elastocal.cell import Cell, read_cell
-from elastocal.importing.import_files import Imported, import_files
-from elastocal.importing.mapping import read_mapping
-from elastocal.manipulator.model import Model
+from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.importing import Imported, read_mapping
+from elastocal.importing.import_files import import_files
+from elastocal.model import Model
 
 MARKERS = ("M1", "M2")
 CELL = """\

@@ -17,13 +17,7 @@ from elastocal.cell.arm_description import (
     Tracker,
 )
 from elastocal.cell.file_keys import rotation_from_rpy, table_of
-from elastocal.cell.plan_wishes import (
-    DesignSpec,
-    Motion,
-    TargetBox,
-    TargetPath,
-    TargetPose,
-)
+from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.cell.workspace_rules import (
     CarriedBody,
@@ -34,7 +28,7 @@ from elastocal.cell.workspace_rules import (
     Visibility,
     Workspace,
 )
-from elastocal.config import Array
+from elastocal.units import Array
 
 __all__ = [
     "Array", "CarriedBody", "CartesianNoise", "Cell", "CompensatorTable", 

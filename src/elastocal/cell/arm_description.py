@@ -21,7 +21,6 @@ from elastocal.cell.file_keys import (
     record,
 )
 from elastocal.config import (
-    Array,
     NonNegative,
     Numbers,
     Positive,
@@ -35,7 +34,7 @@ from elastocal.config import (
 )
 from elastocal.errors import InputError, require
 from elastocal.text import is_label, quoted
-from elastocal.units import to_si
+from elastocal.units import Array, to_si
 
 Observe = Literal["position", "deflection", "pose", "distance"]
 Convention = Literal["standard", "modified"]

@@ -43,7 +43,6 @@ from pydantic_core import PydanticCustomError
 
 from elastocal.config import (
     STRICT,
-    Array,
     Table,
     Text,
     Vector3,
@@ -56,7 +55,7 @@ from elastocal.config import (
 from elastocal.errors import InputError, require
 from elastocal.files import check_exists
 from elastocal.text import did_you_mean, listed
-from elastocal.units import to_si
+from elastocal.units import Array, to_si
 
 Record = TypeVar("Record")
 Member = TypeVar("Member")

@@ -21,7 +21,6 @@ from elastocal.cell.file_keys import (
     stated,
 )
 from elastocal.config import (
-    Array,
     Count,
     NonNegative,
     Numbers,
@@ -34,6 +33,7 @@ from elastocal.config import (
     numbers,
 )
 from elastocal.errors import require
+from elastocal.units import Array
 
 Positives = Annotated[Array, numbers(above=0)]
 

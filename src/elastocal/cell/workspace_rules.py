@@ -30,18 +30,10 @@ from elastocal.cell.file_keys import (
     rotation_from_rpy,
     stated,
 )
-from elastocal.config import (
-    Array,
-    NonNegative,
-    Numbers,
-    Positive,
-    Text,
-    Vector2,
-    Vector3,
-    numbers,
-)
+from elastocal.config import NonNegative, Numbers, Positive, Text, Vector2, Vector3, numbers
 from elastocal.errors import require
 from elastocal.text import is_label, quoted
+from elastocal.units import Array
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 Part = Annotated[str, Field(pattern=r"^(base|flange|link[1-9][0-9]{0,2})$")]

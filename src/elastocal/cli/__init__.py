@@ -9,15 +9,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Importing a command registers it.
 from elastocal.cli import (  # noqa: F401
-    compensate,
-    demo,
-    design,
-    diagnose,
-    export,
-    identify,
-    import_,
-    simulate,
-    study,
+    compensate_command,
+    design_command,
+    diagnose_command,
+    export_command,
+    identify_command,
+    import_command,
+    simulate_command,
+    study_command,
 )
 from elastocal.cli.app import app
 

@@ -1,14 +1,17 @@
-"""What all commands share: the app, errors and exit codes, progress, output checks."""
+"""What all commands share: the app, errors and exit codes, progress, output checks, Ctrl-C."""
 
 from __future__ import annotations
 
 import functools
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 from typer.core import TyperGroup
@@ -18,6 +21,8 @@ from elastocal.errors import ElastocalError, InputError, options_as_flags
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+# What all commands share: the app, errors and exit codes, progress, output checks.
 
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 
@@ -134,7 +139,7 @@ def options(
     ] = None,
 ) -> None:
     """Calibrate industrial robot arms and explain what is left over."""
-    from elastocal.manipulator.backend import VARIABLE, chosen_backend
+    from elastocal.model.evaluate import VARIABLE, chosen_backend
 
     # By the environment, so that processes which a command starts choose the same.
     if backend is not None:
@@ -155,3 +160,42 @@ def check_outputs(*paths: Path | None) -> None:
             )
         if not os.access(path.absolute().parent, os.W_OK):
             raise InputError(f"{path}: no permission to write in {path.absolute().parent}")
+
+
+# Ctrl-C, also where a library catches it.
+
+
+class Interrupts:
+    """In a `with` block, a SIGINT raises KeyboardInterrupt, and again at every `check`.
+
+    CasADi catches a KeyboardInterrupt inside a solver and returns where the search stood, and
+    Python drops one that falls into a finaliser: without `check` the work would go on, with
+    results that depend on when the key was pressed.
+    """
+
+    def __init__(self) -> None:
+        self._caught = False
+        self._before: Callable[[int, FrameType | None], object] | None = None
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt where one came before."""
+        if self._caught:
+            raise KeyboardInterrupt
+
+    def __enter__(self) -> Self:
+        before = signal.getsignal(signal.SIGINT)
+        # Ignored, as under nohup, it stays ignored; and only the main thread may set handlers.
+        if callable(before) and threading.current_thread() is threading.main_thread():
+            self._before = before
+            signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+            self._before = None
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._caught = True
+        if self._before is not None:
+            self._before(number, frame)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -9,17 +10,84 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.compensation.levels import share_of_levels
-from elastocal.compensation.point import ToolPoint
-from elastocal.compensation.total import Total
-from elastocal.manipulator import rigid
-from elastocal.manipulator.calibrated import CalibratedArm
-from elastocal.manipulator.chain import Array
-from elastocal.manipulator.inputs import row_inputs
-from elastocal.manipulator.reaching import ARM_LENGTH
-from elastocal.manipulator.symbolic import SymbolicArm
-from elastocal.manipulator.tape import Tape
+from elastocal.compensation.tool_targets import ToolPoint
 from elastocal.measurements import Measurements
+from elastocal.model import rigid
+from elastocal.model.arm import row_inputs
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.evaluate import BatchFunction
+from elastocal.model.inverse_kinematics import ARM_LENGTH
+from elastocal.model.symbolic import SymbolicArm
+from elastocal.units import Array
+
+# Between the levels of a joint whose compliance is known at levels alone.
+
+
+def share_of_levels(angle: Array, levels: Array) -> Array:
+    """Shares (n, levels) of each level's compliance at joint values `angle` (n,), sum 1.
+
+    Linear between neighbouring levels, the outermost one's beyond them.  A level stands for a
+    gravity compensator's effect, which is a smooth function of the joint (Klimchik et al. 2013,
+    section 5), so that neighbours say what lies between them.
+    """
+    order = np.argsort(levels)
+    place = np.interp(angle, levels[order], np.arange(len(levels), dtype=float))
+    low = np.minimum(place.astype(int), len(levels) - 1)
+    high = np.minimum(low + 1, len(levels) - 1)
+    share = np.zeros((len(angle), len(levels)))
+    rows = np.arange(len(angle))
+    share[rows, order[low]] += 1 - (place - low)
+    share[rows, order[high]] += place - low
+    return share
+
+
+# An expression of the elastic arm and its total derivative, through the equilibrium.
+
+
+class Total:
+    """y(inputs, X, extra; θ) and dy/dz at the static equilibrium F(inputs, X; θ) = 0.
+
+    dy/dz = ∂y/∂z − ∂y/∂θ F_θ⁻¹ ∂F/∂z, by the adjoint λ = F_θ⁻ᵀ (∂y/∂θ)ᵀ as the partial
+    derivative of y − λᵀF.  `y` (m, 1) and `z` (k, 1) are expressions of `arm`, whose tapes follow
+    the backend; `extra` are further symbols in y.  Where the model is linear (eq. 3) or rigid,
+    y is explicit and nothing is solved.
+    """
+
+    def __init__(self, arm: SymbolicArm, y: ca.SX, z: ca.SX, extra: Sequence[ca.SX] = ()) -> None:
+        self._arm = arm
+        theta = arm.arm.theta
+        inputs = [*arm.arm.inputs.values(), *extra, arm.p, theta]
+        if not arm.implicit:
+            y = arm.explicit(y, 0)
+            self._slopes = None
+            self._tape = BatchFunction(inputs, [y, ca.jacobian(y, z)], arm.backend)
+            return
+        adjoint = ca.SX.sym("adjoint", y.shape[0], theta.shape[0])
+        lagrangian = y - adjoint @ arm.residual
+        self._slopes = BatchFunction(inputs, [ca.jacobian(y, theta)], arm.backend)
+        self._tape = BatchFunction(
+            [*inputs, ca.vec(adjoint.T)], [y, ca.jacobian(lagrangian, z)], arm.backend
+        )
+
+    def __call__(
+        self, inputs: list[NDArray], x: Array, extra: Sequence[NDArray] = ()
+    ) -> tuple[Array, Array]:
+        """y (n, m) and dy/dz (n, m, k) of every row; y is NaN where there is no equilibrium."""
+        springs = self._arm.arm.theta.shape[0]
+        if self._slopes is None:
+            y, slope = self._tape(*inputs, *extra, x, np.zeros((len(inputs[0]), springs)))
+            return y[..., 0], slope
+        theta, F_theta = self._arm.equilibrium.solve(inputs, x)
+        y_theta = self._slopes(*inputs, *extra, x, theta)[0]
+        y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
+        adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
+        adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
+        y, slope = self._tape(*inputs, *extra, x, theta, adjoint)
+        y[~np.isfinite(theta).all(axis=1)] = np.nan
+        return y[..., 0], slope
+
+
+# Where the calibrated arm puts its tool, as a function of the commanded joints.
 
 LEVEL = "level:"
 
@@ -135,10 +203,12 @@ class CalibratedTool:
         return self._errors[rotation is not None](self._at(rows, q), self.x, extra)
 
     @cached_property
-    def _frames(self) -> Tape:
+    def _frames(self) -> BatchFunction:
         own = self._symbolic.arm
         inputs = [*own.inputs.values(), self._symbolic.p]
-        return Tape(inputs, [own.T_tracker_base, self._place, self._turn], self._symbolic.backend)
+        return BatchFunction(
+            inputs, [own.T_tracker_base, self._place, self._turn], self._symbolic.backend
+        )
 
     def frames(self, rows: list[NDArray]) -> tuple[Array, Array, Array]:
         """T_tracker_base (n, 4, 4) as identified, with the drift that the rows' time asks for;

@@ -44,10 +44,10 @@ def run_demo(
     gets 1/√2 of it.  Raises InputError where the folder cannot be written, or holds files of the
     same names that are not the example's.
     """
-    from elastocal.cell import read_cell
+    from elastocal.cell.work_cell import read_cell
     from elastocal.identification.identify import identify
-    from elastocal.manipulator.model import Model
     from elastocal.measurements import read_plan, write_measurements
+    from elastocal.model.manipulator import Model
     from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
     progress("copying the example")

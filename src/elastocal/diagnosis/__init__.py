@@ -1,0 +1,45 @@
+"""The diagnosis of what is left over: hypotheses, their evidence, the verdict, the shrinkage."""
+
+from elastocal import loaded_on_demand
+
+ROOMS = {
+    "backlash_model": "doubt under_other_law with_likelier_backlash_model",
+    "baseline": "Baseline Blocks VisitPlaces fit_baseline made_once thinned",
+    "diagnose": "DiagnosisOptions",
+    "diagnosis": (
+        "Candidate Curve Diagnosis EffectAt ExtraPlan FaultyReading FittedParameter "
+        "FoundEffect Gap Location NoiseFloor RivalPair StructureTest Untested publish"
+    ),
+    "diagnosis_data": (
+        "DiagnosisData OutlierScreening away describe_faulty diagnosis_data_of reading_errors "
+        "screen_outliers widths"
+    ),
+    "discrimination": (
+        "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"
+    ),
+    "effect_search": "ForwardSelection SelectedEffects Slot base_score is_far relinearised",
+    "evidence": "EntrySums Grams Prior Scan direct evidence_of scales_of scan",
+    "extended_cell": "write_extended_cell",
+    "extra_poses": "expected expected_of_random fewest measuring_order plan_extra",
+    "hypotheses": (
+        "Hypothesis SettingsGrid change_times compute_columns grid_of model_keys possible "
+        "with_recorded_drivers"
+    ),
+    "model_set": (
+        "Item ModelSet distances extended fit_extended fit_set packed_columns refine "
+        "settings_to_try signal_of"
+    ),
+    "noise_floor": (
+        "NoiseValues NoisyData Weighted covariance fit_noise likelihood log_prior noise_draws "
+        "posterior project"
+    ),
+    "rivals": "RivalSet Suspects imitations with_neighbours",
+    "shrinkage": (
+        "Change Confirmation PosteriorDraw blocks_of_time left_out_residual new_pose_table "
+        "noise_rms rms_with_interval squared_lengths"
+    ),
+    "unknown": "Covariates Generic generic_blocks monomials waves",
+    "verdict": "warnings",
+}
+__all__ = [name for names in ROOMS.values() for name in names.split()]
+__getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

@@ -1,27 +1,144 @@
-"""The calibrated arm before any further effect, and what its readings look like beside it."""
+"""The calibrated arm before any further effect: its readings in blocks that share noise."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.diagnosis.blocks import Blocks
 from elastocal.errors import InputError
-from elastocal.identification.chunked import residual_at
-from elastocal.identification.fit import Fit
-from elastocal.identification.noise import Weights, stated_covariance, weights_for
-from elastocal.identification.selection import Problem
+from elastocal.identification.identifiability import Problem
+from elastocal.identification.least_squares import Fit
 from elastocal.identification.solve import PLACING, is_placed, sizes_and_check, tied_fit
 from elastocal.identification.start import start_values
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import Observations, observe
+from elastocal.identification.weighted_problem import (
+    Weights,
+    residual_at,
+    stated_covariance,
+    weights_for,
+)
 from elastocal.measurements import Measurements
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations, observe
 from elastocal.tracker_noise import available_noise
+from elastocal.units import Array, IntArray
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
+# Readings gathered by configuration: what shares noise stands in one block.
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """N observations of `size` components in C blocks of M places, padded where a block is short.
+
+    `member` (C, M) is the observation at each place, N where there is none; `visit` (N,) numbers
+    the times that the arm was sent to a pose (configuration, repeat and load state).
+    """
+
+    member: IntArray
+    visit: IntArray
+    size: int
+
+    @classmethod
+    def of(cls, configuration: IntArray, visit: IntArray, size: int) -> Blocks:
+        """Blocks by `configuration` (N,), in the order of its codes."""
+        _, code, count = np.unique(configuration, return_inverse=True, return_counts=True)
+        order = np.argsort(code, kind="stable")
+        start = np.concatenate([[0], np.cumsum(count)])[code[order]]
+        member = np.full((len(count), int(count.max())), len(configuration), dtype=np.int64)
+        member[code[order], np.arange(len(order)) - start] = order
+        return cls(member, visit, size)
+
+    @property
+    def n(self) -> int:
+        return len(self.visit)
+
+    @cached_property
+    def places(self) -> VisitPlaces:
+        """Where visits stand in the blocks."""
+        return VisitPlaces.of(self)
+
+    def pack(self, rows: Array) -> Array:
+        """(N, size, k) → (C, M·size, k), zeros where there is no observation."""
+        k = rows.shape[2]
+        padded = np.concatenate([rows, np.zeros((1, self.size, k))])
+        return padded[self.member].reshape(len(self.member), -1, k)
+
+    def unpack(self, packed: Array) -> Array:
+        """(C, M·size, k) → (N, size, k)."""
+        C, M = self.member.shape
+        rows = np.empty((self.n + 1, self.size, packed.shape[2]))
+        rows[self.member.ravel()] = packed.reshape(C * M, self.size, -1)
+        return rows[:-1]
+
+    def pack_square(self, blocks: Array) -> Array:
+        """Covariances (N, size, size) of single observations → (C, M·size, M·size)."""
+        C, M = self.member.shape
+        padded = np.concatenate([blocks, np.zeros((1, self.size, self.size))])[self.member]
+        out = np.zeros((C, M, self.size, M, self.size))
+        place = np.arange(M)
+        out[:, place, :, place, :] = padded.transpose(1, 0, 2, 3)
+        return out.reshape(C, M * self.size, M * self.size)
+
+    def unpack_square(self, packed: Array) -> Array:
+        """Diagonal blocks (N, size, size) of (C, M·size, M·size)."""
+        C, M = self.member.shape
+        place = np.arange(M)
+        own = packed.reshape(C, M, self.size, M, self.size)[:, place, :, place, :]
+        rows = np.empty((self.n + 1, self.size, self.size))
+        rows[self.member.T.ravel()] = own.reshape(M * C, self.size, self.size)
+        return rows[:-1]
+
+    @property
+    def absent(self) -> NDArray[np.bool_]:
+        """Rows (C, M·size) that hold no observation."""
+        return np.repeat(self.member == self.n, self.size, axis=1)
+
+    @property
+    def same_visit(self) -> Array:
+        """1 where two rows of a block belong to the same visit (C, M·size, M·size)."""
+        visit = np.concatenate([self.visit, [-1]])[self.member]
+        same = (visit[:, :, None] == visit[:, None, :]) & (visit >= 0)[:, :, None]
+        return np.repeat(np.repeat(same, self.size, axis=1), self.size, axis=2).astype(float)
+
+
+@dataclass(frozen=True)
+class VisitPlaces:
+    """Where visits stand in the blocks: `one_hot` (C, m, v), and an observation of each visit,
+    `example` (C, v), −1 where a block has fewer visits."""
+
+    one_hot: Array
+    example: IntArray
+
+    @classmethod
+    def of(cls, blocks: Blocks) -> VisitPlaces:
+        member = blocks.member
+        visit = np.concatenate([blocks.visit, [-1]])[member]
+        local = np.full(visit.shape, -1)
+        most = 1
+        for c, row in enumerate(visit):
+            known, first, inverse = np.unique(row, return_index=True, return_inverse=True)
+            order = np.argsort(np.argsort(np.where(known < 0, len(row), first)))
+            local[c] = np.where(row < 0, -1, order[inverse])
+            most = max(most, int(local[c].max()) + 1)
+        one_hot = (local[:, :, None] == np.arange(most)).astype(float)
+        example = np.full((len(member), most), -1, dtype=np.int64)
+        for v in range(most):
+            there = one_hot[:, :, v].any(axis=1)
+            example[there, v] = member[there, one_hot[there, :, v].argmax(axis=1)]
+        return cls(np.repeat(one_hot, blocks.size, axis=1), example)
+
+    def gather(self, values: Array) -> Array:
+        """Per observation (N, …) → per visit (C, v, …), zero where there is none."""
+        out = values[np.maximum(self.example, 0)]
+        out[self.example < 0] = 0.0
+        return out
+
+
+# The calibrated arm before any further effect, and what its readings look like beside it.
 
 
 @dataclass(frozen=True)
@@ -36,7 +153,7 @@ class Baseline:
     """
 
     model: Model
-    seen: Observations
+    observed: Observations
     x: Array
     sizes: Array
     residual: Array
@@ -47,16 +164,16 @@ class Baseline:
     @property
     def n_measured(self) -> int:
         """Observations that were measured; they come first."""
-        return len(self.seen.lead) - self.planned
+        return len(self.observed.lead) - self.planned
 
     @property
     def blocks(self) -> Blocks:
         """Readings by configuration; a visit is a configuration, repeat and load state."""
-        table, lead = self.seen.table, self.seen.lead
-        return Blocks.of(table.configuration[lead], visits(table)[lead], self.seen.size)
+        table, lead = self.observed.table, self.observed.lead
+        return Blocks.of(table.configuration[lead], visits(table)[lead], self.observed.size)
 
 
-def visits(table: Measurements) -> Labels:
+def visits(table: Measurements) -> IntArray:
     """Number (n,) of each row's visit: its configuration, repeat and force."""
     force = np.round(table.force, 6)
     key = np.column_stack([table.configuration, table.repeat, force])
@@ -70,13 +187,13 @@ def fit_baseline(
 
     `x0` (parameters,) spares the search for a start.
     """
-    seen = observe(table, model.observe)
+    observed = observe(table, model.observe)
     free = np.arange(len(model.parameters))
-    weights = weights_for(seen, model.cell.tracker, "auto")
+    weights = weights_for(observed, model.cell.tracker, "auto")
     started = x0 is not None
     if x0 is None:
         x0 = start_values(model, table, seed)
-    problem = Problem(model, seen, weights, x0, free, False)
+    problem = Problem(model, observed, weights, x0, free, False)
     sizes = sizes_and_check(problem)
     placed, nominal = free[is_placed(model)], None
     if len(placed) and not started:
@@ -88,17 +205,86 @@ def fit_baseline(
     if nominal is None:
         unknown = np.full_like(residual, np.nan)
         nominal = unknown if started else residual_at(model, problem.parts, problem.x0)
-    return Baseline(model, seen, x, sizes, residual, nominal, _stated(seen, model, weights))
+    return Baseline(model, observed, x, sizes, residual, nominal, _stated(observed, model, weights))
 
 
-def _stated(seen: Observations, model: Model, weights: Weights) -> Array | None:
+def _stated(observed: Observations, model: Model, weights: Weights) -> Array | None:
     """Stated covariance (N, size, size) of each observation, None where none is stated."""
     if weights.kind == "none":
         return None
-    kind = available_noise(seen.table, model.cell.tracker)
+    kind = available_noise(observed.table, model.cell.tracker)
     try:
-        rows = stated_covariance(seen, model.cell.tracker, kind)[0]
+        rows = stated_covariance(observed, model.cell.tracker, kind)[0]
     except InputError:
         return None
-    squared = seen.combine.power(2)
-    return np.asarray(squared @ rows.reshape(len(rows), -1)).reshape(-1, seen.size, seen.size)
+    squared = observed.combine.power(2)
+    return np.asarray(squared @ rows.reshape(len(rows), -1)).reshape(
+        -1, observed.size, observed.size
+    )
+
+
+# Large tables are looked at in part: what more readings would add is time and memory.
+
+# Evidence grows with the readings, and an effect worth finding has hundreds of nats in so many.
+MOST_ROWS = 12_000
+# Within one configuration noise is dense: its cost grows with the square of what it holds.
+MOST_IN_ONE = 60
+
+
+def thinned(table: Measurements) -> tuple[Measurements, str | None]:
+    """The table, or a part of it that is large enough, and what was left out.
+
+    Of each configuration the first readings of every marker under every load; of too many
+    configurations those evenly spaced in the order they were measured, so that whatever changes
+    with time still does.
+    """
+    kept = table.take(_first_of_each(table))
+    labels, first, rows = np.unique(kept.configuration, return_index=True, return_counts=True)
+    order = labels[np.argsort(first)]
+    wanted = int(MOST_ROWS / rows.mean())
+    if len(order) > wanted:
+        chosen = order[np.linspace(0, len(order) - 1, wanted).round().astype(int)]
+        kept = kept.take(np.isin(kept.configuration, chosen))
+    if len(kept) == len(table):
+        return table, None
+    return kept, (
+        f"the table is large: {len(kept)} of {len(table)} rows were looked at, from "
+        f"{min(len(order), wanted)} of {len(order)} configurations, evenly spaced"
+    )
+
+
+def _first_of_each(table: Measurements) -> NDArray[np.bool_]:
+    """Rows that are among the first of their configuration, load and marker, as many of each as
+    leave MOST_IN_ONE in the configuration."""
+    force = np.unique(table.force.round(6), axis=0, return_inverse=True)[1].ravel()
+    kinds = np.column_stack([table.configuration, force, table.marker])
+    _, kind, count = np.unique(kinds, axis=0, return_inverse=True, return_counts=True)
+    kind = kind.ravel()
+    order = np.argsort(kind, kind="stable")
+    rank = np.empty(len(table), dtype=np.int64)
+    rank[order] = np.arange(len(table)) - np.repeat(np.cumsum(count) - count, count)
+    _, at = np.unique(table.configuration, return_inverse=True)
+    at = at.ravel()
+    n_kinds = np.bincount(at[order[np.cumsum(count) - count]])
+    allowed = np.maximum(MOST_IN_ONE // n_kinds, 1)
+    return np.asarray(rank < allowed[at])
+
+
+# Models that are derived from another one, kept for as long as that one is.
+
+MOST = 12  # models that are kept of each; those asked for last
+
+_kept: WeakKeyDictionary[Model, dict[Hashable, Model]] = WeakKeyDictionary()
+
+
+def made_once(model: Model, key: Hashable, make: Callable[[], Model]) -> Model:
+    """What `make` derives from the model, or what it derived under the same `key` before.
+
+    A diagnosis comes back to the same few models, and to write and differentiate an arm takes
+    longer than to evaluate it at sixty poses.
+    """
+    known = _kept.setdefault(model, {})
+    known[key] = known.pop(key) if key in known else make()
+    while len(known) > MOST:
+        known.pop(next(iter(known)))
+    return known[key]

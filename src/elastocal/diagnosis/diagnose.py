@@ -2,40 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import Baseline, fit_baseline
-from elastocal.diagnosis.budget import budget
-from elastocal.diagnosis.confirm import shrinkage
-from elastocal.diagnosis.curves import curves_of
+from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
+from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
+from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
+from elastocal.diagnosis.diagnosis_data import (
+    DiagnosisData,
+    OutlierScreening,
+    diagnosis_data_of,
+    noise_floor,
+    screen_outliers,
+)
+from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
-from elastocal.diagnosis.extend import settings_of
-from elastocal.diagnosis.floor import noise_floor
-from elastocal.diagnosis.found import Found
-from elastocal.diagnosis.generic import generic_blocks
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.listing import candidates, too_small, warnings
-from elastocal.diagnosis.locate import location, structure_tests
-from elastocal.diagnosis.options import DiagnosisOptions
-from elastocal.diagnosis.play_law import with_likelier_play
-from elastocal.diagnosis.recorded_drivers import model_keys, with_recorded_drivers
-from elastocal.diagnosis.refit import refit
-from elastocal.diagnosis.result import Diagnosis, FoundEffect
-from elastocal.diagnosis.scene import Scene, scene_of
-from elastocal.diagnosis.screen import Screened, screen
-from elastocal.diagnosis.search import Search
-from elastocal.diagnosis.thin import thinned
-from elastocal.diagnosis.truths import Confirmation
-from elastocal.diagnosis.uncertain_settings import between_visits
-from elastocal.diagnosis.verdict import Answer, judge
-from elastocal.errors import InsufficientDataError
-from elastocal.identification.checks import check_table
-from elastocal.manipulator.model import Model
+from elastocal.diagnosis.gap import budget, curves_of, location, structure_tests
+from elastocal.diagnosis.hypotheses import Hypothesis, model_keys, possible, with_recorded_drivers
+from elastocal.diagnosis.model_set import settings_of
+from elastocal.diagnosis.shrinkage import Confirmation, between_visits, refit, shrinkage
+from elastocal.diagnosis.unknown import generic_blocks
+from elastocal.diagnosis.verdict import Answer, candidates, judge, too_small, warnings
+from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.manipulator import Model
+from elastocal.text import did_you_mean, listed
+from elastocal.units import Progress
 
-Progress = Callable[[str], None]
+# How to diagnose.
+
+
+@dataclass(frozen=True)
+class DiagnosisOptions:
+    """How to diagnose.
+
+    `false_alarm`: probability that something is claimed where nothing is, for the whole family of
+    hypotheses.  `without`: effects taken out of the catalogue.  `seed`: of the sign flips and of
+    the draws behind intervals.
+    """
+
+    seed: int = 0
+    without: tuple[str, ...] = ()
+    false_alarm: float = 0.05
+
+    def __post_init__(self) -> None:
+        require(
+            0 < self.false_alarm < 0.5,
+            f"{option('false_alarm')} takes a number between 0 and 0.5; found {self.false_alarm:g}",
+        )
+        for name in self.without:
+            if name not in CATALOGUE:
+                raise InputError(
+                    f"{option('without')}: unknown effect '{name}'"
+                    f"{did_you_mean(name, list(CATALOGUE))}; "
+                    f"the catalogue has: {listed(list(CATALOGUE))}"
+                )
+
+
+# Why the arm still differs from its model: the whole diagnosis, step by step.
 
 FEWEST = 8  # configurations
 
@@ -65,13 +92,13 @@ def diagnose(
     base = fit_baseline(model, table, options.seed)
     hypotheses, untested = possible(model, table, options.without)
     progress("columns of what could be missing")
-    scene = with_likelier_play(scene_of(base, hypotheses))
-    base = scene.base
-    scene, found, screened = _searched(scene, options, progress)
+    dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
+    base = dataset.base
+    dataset, found, screened = _searched(dataset, options, progress)
     answer = judge(found)
     progress("confirming")
     rng = np.random.default_rng(options.seed)
-    gap, steps = budget(scene, found, rng)
+    gap, steps = budget(dataset, found, rng)
     findings = _findings(found, answer, base, rng)
     tests = structure_tests(found.first)
     chosen = found.chosen
@@ -82,19 +109,19 @@ def diagnose(
         gap=gap,
         budget=steps,
         effects=findings,
-        candidates=candidates(scene, found, answer),
+        candidates=candidates(dataset, found, answer),
         indistinguishable=answer.indistinguishable,
         location=location(found, tests),
-        noise=noise_floor(found.scene, chosen.data, chosen.noise),
+        noise=noise_floor(found.dataset, chosen.data, chosen.noise),
         structure=tests,
         probability_nothing=nothing,
         probability_unknown=_unknown(found),
         p_value=found.p_values[0] if found.p_values else p_first,
-        curves=curves_of(found.scene, chosen),
-        untested=(*untested, *too_small(scene, found)),
-        warnings=(*filter(None, [left_out]), *warnings(scene, found, screened)),
-        n_readings=scene.blocks.n,
-        n_configurations=len(scene.blocks.member),
+        curves=curves_of(found.dataset, chosen),
+        untested=(*untested, *too_small(dataset, found)),
+        warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
+        n_readings=dataset.blocks.n,
+        n_configurations=len(dataset.blocks.member),
         model_keys=model_keys(base.model, findings),
         model=given,
         data=source,
@@ -102,7 +129,7 @@ def diagnose(
     )
 
 
-def _unknown(found: Found) -> float:
+def _unknown(found: SelectedEffects) -> float:
     """Probability that something without a name is at work, in whichever slot it is likeliest."""
     shares = []
     for slot in found.slots:
@@ -113,28 +140,28 @@ def _unknown(found: Found) -> float:
 
 
 def _searched(
-    scene: Scene, options: DiagnosisOptions, progress: Progress
-) -> tuple[Scene, Found, Screened]:
+    dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
+) -> tuple[DiagnosisData, SelectedEffects, OutlierScreening]:
     """What is missing, and the scene without the faulty readings, which are sought twice: beside a
     large effect nothing looks faulty, or the wrong readings do."""
     progress("noise floor")
-    screened = screen(scene, scene.data)
+    screened = screen_outliers(dataset, dataset.data)
     progress("searching for what is missing")
-    search = _search(scene.without(screened.faulty), options)
+    search = _search(dataset.without(screened.faulty), options)
     found = search.run()
     if found.chosen.items:
         before = screened.faulty
-        screened = screen(found.scene, found.chosen.data.without(np.zeros_like(before)))
+        screened = screen_outliers(found.dataset, found.chosen.data.without(np.zeros_like(before)))
         if (screened.faulty != before).any():
             progress("searching again without faulty readings")
-            search = _search(scene.without(screened.faulty), options)
+            search = _search(dataset.without(screened.faulty), options)
             found = search.run()
-    return scene.without(screened.faulty), search.settled(found), screened
+    return dataset.without(screened.faulty), search.settled(found), screened
 
 
-def _search(scene: Scene, options: DiagnosisOptions) -> Search:
-    blocks = generic_blocks(scene)
-    return Search(scene, blocks, scene.noise, options.false_alarm, options.seed)
+def _search(dataset: DiagnosisData, options: DiagnosisOptions) -> ForwardSelection:
+    blocks = generic_blocks(dataset)
+    return ForwardSelection(dataset, blocks, dataset.noise, options.false_alarm, options.seed)
 
 
 def _check_enough(table: Measurements) -> None:
@@ -147,10 +174,10 @@ def _check_enough(table: Measurements) -> None:
 
 
 def _findings(
-    found: Found, answer: Answer, plain: Baseline, rng: np.random.Generator
+    found: SelectedEffects, answer: Answer, plain: Baseline, rng: np.random.Generator
 ) -> tuple[FoundEffect, ...]:
     """The known items with their probabilities, parameters and confirmed shrinkage."""
-    chosen, scene = found.chosen, found.scene
+    chosen, dataset = found.chosen, found.dataset
     known = [k for k, item in enumerate(chosen.items) if item.known]
     if not known:
         return ()
@@ -160,10 +187,10 @@ def _findings(
     for k in known:
         what = chosen.items[k].what
         assert isinstance(what, Hypothesis)
-        truths = confirmation.truths(k, answer.rivals[k])
-        change = between_visits(scene, chosen, k)
-        measured = len(scene.blocks.member)
-        fall = shrinkage(truths, measured, confirmation.unnamed, change, rng)
+        posterior_draws = confirmation.posterior_draws(k, answer.rivals[k])
+        change = between_visits(dataset, chosen, k)
+        measured = len(dataset.blocks.member)
+        fall = shrinkage(posterior_draws, measured, confirmation.unnamed, change, rng)
         findings.append(
             FoundEffect(
                 what.name,

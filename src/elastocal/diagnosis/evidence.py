@@ -1,23 +1,31 @@
-"""Marginal likelihood of a group of columns in closed form.
-
-With columns C scaled to their typical sizes, γ ~ N(0, s² I) and everything else integrated out,
-
-    log ev(s) = −½ log|I + s²A| + ½ s² bᵀ(I + s²A)⁻¹ b,   A = CᵀPC,   b = CᵀPr,
-
-over the model without the group; s is mixed over SCALES with equal weights (a size prior with
-heavier tails than one Gaussian).  In the eigenvectors U of A, with β = Uᵀb:
-
-    log ev(s) = ½ Σ_k [s²β_k² / (1 + s²λ_k) − log(1 + s²λ_k)].
-"""
+"""Marginal likelihood of groups of columns in closed form, and priors fixed before any data."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.special import logsumexp
 
-Array = NDArray[np.float64]
+from elastocal.diagnosis.baseline import VisitPlaces
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.hypotheses import EntryKey, Hypothesis, entry_key, is_driven
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
+from elastocal.diagnosis.unknown import Generic
+from elastocal.units import Array
+
+# Marginal likelihood of a group of columns in closed form.
+#
+# With columns C scaled to their typical sizes, γ ~ N(0, s² I) and everything else integrated out,
+#
+#     log ev(s) = −½ log|I + s²A| + ½ s² bᵀ(I + s²A)⁻¹ b,   A = CᵀPC,   b = CᵀPr,
+#
+# over the model without the group; s is mixed over SCALES with equal weights (a size prior with
+# heavier tails than one Gaussian).  In the eigenvectors U of A, with β = Uᵀb:
+#
+#     log ev(s) = ½ Σ_k [s²β_k² / (1 + s²λ_k) − log(1 + s²λ_k)].
 
 SCALES = np.array([0.3, 1.0, 3.0])
 # A size that nobody has stated is known to an order of magnitude at best.
@@ -105,3 +113,275 @@ def _turned(b: Array, U: Array) -> Array:
     for j in range(U.shape[1]):
         out[..., j] = sum(b[..., k] * U[:, k, j] for k in range(U.shape[1]))
     return out
+
+
+# Prior probabilities, fixed before any data: nothing, something unknown, or a known effect.
+
+# Half that nothing more is there; of the rest a twentieth that the catalogue lacks it.
+# A second effect beside a first is rarer.
+SOMETHING, UNKNOWN = 0.5, 0.05
+ANOTHER = 0.2
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Log prior odds against nothing: of each hypothesis (H,) and each block (G,).
+
+    Effects are equally probable, and so are the places of one effect; kinds of blocks are equally
+    probable, and so are the blocks of one kind.
+    """
+
+    hypotheses: Array
+    blocks: Array
+
+    @property
+    def total(self) -> float:
+        """Log prior odds of anything against nothing."""
+        return float(logsumexp(np.concatenate([self.hypotheses, self.blocks])))
+
+    @classmethod
+    def of(
+        cls, hypotheses: tuple[Hypothesis, ...], blocks: list[Generic], something: float = SOMETHING
+    ) -> Prior:
+        odds = something / (1 - something)
+        known = _shares([h.name for h in hypotheses]) * (1 - UNKNOWN)
+        unknown = _shares([g.kind for g in blocks]) * UNKNOWN
+        return cls(np.log(odds * known), np.log(odds * unknown))
+
+
+def _shares(names: list[str]) -> Array:
+    count = Counter(names)
+    return np.array([1 / (len(count) * count[name]) for name in names])
+
+
+# Gram matrices of whatever drives an entry of the chain, without forming its columns.
+#
+# Columns of a driven group are C = E ∘ D: the entry's columns E (N, size, d), the same motion in
+# all readings of a visit, times the visit's drive D (d, k).  So
+#
+#     CᵀV⁻¹C = Σ_blocks Σ_{v,w} D_vᵀ (E_vᵀV⁻¹E_w) D_w,
+#     HᵀC = Σ_v (H_vᵀE_v) D_v,   CᵀPr = Σ_v D_vᵀ E_vᵀu
+#
+# and a search over thousands of drives costs a few products of matrices, all of them at once.
+# Where a drive is the same in all visits of a configuration, the sums over visits come first.
+
+
+@dataclass(frozen=True)
+class EntrySums:
+    """Of one entry under one noise: `local` (C, v, d, v, d), `H` (p, C, v, d), `b` (C, v, d).
+
+    `flip` (C, v, d) and `h` (F, p) are of residuals that are flipped by `signs` (F, C).
+    """
+
+    local: Array
+    H: Array
+    b: Array
+    signs: Array
+    flip: Array
+    h: Array
+
+    @classmethod
+    def of(
+        cls, E: Array, places: VisitPlaces, at: Projection, signs: Array | None = None
+    ) -> EntrySums:
+        """E (C, m, d): the entry's packed columns, zero in rows that do not count."""
+        C, m, d = E.shape
+        v = places.one_hot.shape[2]
+        wide = (places.one_hot[:, :, :, None] * E[:, :, None, :]).reshape(C, m, v * d)
+        local = wide.transpose(0, 2, 1) @ (at.inverse @ wide)
+        H = at.H.transpose(0, 2, 1) @ wide  # (C, p, v·d)
+        b = np.einsum("cmk,cm->ck", wide, at.u)
+        signs, u, h = _flipped(at, signs)
+        flip = np.einsum("cmk,cm->ck", wide, u)
+        return cls(
+            local.reshape(C, v, d, v, d), H.transpose(1, 0, 2).reshape(-1, C, v, d),
+            b.reshape(C, v, d), signs, flip.reshape(C, v, d), h,
+        )  # fmt: skip
+
+    @cached_property
+    def _of_configurations(self) -> EntrySums:
+        """The same for drives that do not differ within a configuration: v = 1."""
+        return replace(
+            self, local=self.local.sum(axis=(1, 3), keepdims=True),
+            H=self.H.sum(axis=2, keepdims=True), b=self.b.sum(axis=1, keepdims=True),
+            flip=self.flip.sum(axis=1, keepdims=True),
+        )  # fmt: skip
+
+    def driven(self, D: Array) -> Spectrum:
+        """Spectrum of the groups with drives D (C, v, d, V, k), or (C, 1, d, V, k) where all
+        visits of a configuration are driven alike."""
+        if D.shape[1] < self.b.shape[1]:
+            return self._of_configurations.driven(D)
+        C, v, d, V, k = D.shape
+        n = v * d
+        flat = D.reshape(C, n, V * k)
+        local = self.local.reshape(C, n, n)
+        moved = local * flat if n == 1 else local @ flat
+        Z = self.H.reshape(-1, C * n) @ flat.reshape(C * n, V * k)
+        A = _each_with_each(flat.reshape(-1, V, k), moved.reshape(-1, V, k))
+        A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
+        b = self.b.ravel() @ flat.reshape(C * n, V * k)
+        flips = np.zeros((len(self.signs), V * k))
+        if len(flips):
+            own = np.einsum("ci,cig->cg", self.flip.reshape(C, n), flat)
+            flips = self.signs @ own - self.h @ Z
+        return spectrum(A, b.reshape(V, k), flips.reshape(-1, V, k))
+
+
+def _each_with_each(a: Array, b: Array) -> Array:
+    """Σ_r a_rvk b_rvl (V, K, K) of a and b (R, V, K)."""
+    return np.asarray(a.transpose(1, 2, 0) @ b.transpose(1, 0, 2))
+
+
+def _flipped(at: Projection, signs: Array | None) -> tuple[Array, Array, Array]:
+    """The signs (F, C), what they flip in a projected residual, Σ_c signs (Hᵀe)_c (F, p)."""
+    if signs is None or not len(signs):
+        return np.zeros((0, len(at.u))), np.zeros_like(at.u), np.zeros((0, at.H.shape[2]))
+    u, h = at.spread
+    return signs, u, signs @ h
+
+
+def direct(C: Array, at: Projection, signs: Array | None = None) -> Spectrum:
+    """Spectrum of one group of packed columns C (blocks, m, k), zero in rows that do not count.
+
+    `signs` (F, blocks) are the flips that it holds.
+    """
+    k = C.shape[2]
+    A = C.reshape(-1, k).T @ (at.inverse @ C).reshape(-1, k)
+    Z = at.H.reshape(-1, at.H.shape[2]).T @ C.reshape(-1, k)
+    b = np.einsum("cmk,cm->k", C, at.u)
+    signs, u, h = _flipped(at, signs)
+    flips = np.zeros((0, k))
+    if len(signs):
+        flips = signs @ np.einsum("cmk,cm->ck", C, u) - h @ Z
+    return spectrum((A - Z.T @ Z)[None], b[None], flips[:, None, :])
+
+
+# Spectra of hypotheses and blocks beside a model, each entry's sums computed once.
+
+HELD = 4_000_000  # numbers of drives that are held at a time
+
+
+@dataclass
+class Grams:
+    """Spectra against `data` under the noise of its projection `at`, and against its residual
+    with flipped `signs` (F, C), where these are given."""
+
+    dataset: DiagnosisData
+    data: NoisyData
+    at: Projection
+    signs: Array | None = None
+    _entries: dict[EntryKey, EntrySums] = field(init=False, default_factory=dict)
+
+    def entry(self, key: EntryKey) -> EntrySums:
+        if key not in self._entries:
+            E = self.data.masked(self.dataset.entry(key))
+            self._entries[key] = EntrySums.of(E, self.dataset.places, self.at, self.signs)
+        return self._entries[key]
+
+    def of_hypothesis(self, h: Hypothesis, settings: Array | None = None) -> Spectrum:
+        """At every one of the `settings` (G, …), by default those of the search."""
+        if not is_driven(h):
+            return direct(
+                self.data.masked(self.dataset.packed(h, np.zeros(0))), self.at, self.signs
+            )
+        if settings is None:
+            settings = self.dataset.grids[h.name, h.where].values
+        sums = self.entry(entry_key(h, self.dataset.base.model))
+        # A large table's drives at thousands of settings do not fit into memory at once.
+        each = max(1, HELD // (sums.b.size * len(h.parameters)))
+        pieces = [settings[i : i + each] for i in range(0, len(settings), each)]
+        return Spectrum.joined([sums.driven(self.dataset.drive(h, piece)) for piece in pieces])
+
+    def of_block(self, g: Generic) -> Spectrum:
+        if g.columns is not None:
+            return direct(self.data.masked(g.columns), self.at, self.signs)
+        assert g.entry is not None and g.drive is not None
+        return self.entry(g.entry).driven(g.drive[:, :, :, None, :])
+
+
+def scales_of(h: Hypothesis) -> Array:
+    """Scales of the size prior: wider where no typical size is known."""
+    return UNSIZED_SCALES if any(p.typical is None for p in h.parameters) else SCALES
+
+
+# The evidence of everything that could be added to a model, under one noise.
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Evidence of one hypothesis or block over the model without it (nats).
+
+    `settings` are its best ones, `best` the evidence at them without the prior of the search;
+    `distance` is d of its typical size there, in standard deviations.
+    """
+
+    evidence: float
+    best: float
+    settings: Array
+    distance: float
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Everything scored under one noise: hypotheses, blocks, and the odds of all together.
+
+    `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior,
+    `flipped` (F,) the same for residuals whose configurations had their signs flipped;
+    `driver_odds` the largest evidence among the blocks of a driver, and its flips.
+    """
+
+    scored: tuple[Scored, ...]
+    blocks: tuple[Scored, ...]
+    odds: float
+    flipped: Array
+    driver_odds: dict[str, float]
+    driver_flips: dict[str, Array]
+    at: Projection
+    noise: NoiseValues
+
+
+def scan(
+    dataset: DiagnosisData, generic: list[Generic], prior: Prior, data: NoisyData,
+    noise: NoiseValues,
+    signs: Array,
+) -> Scan:  # fmt: skip
+    """Score all hypotheses and blocks beside the columns already in `data`.
+
+    `signs` (F, C) of ±1 are the flips.
+    """
+    at = project(data, noise)
+    grams = Grams(dataset, data, at, signs)
+    scored, blocks = [], []
+    total, flips = [], []
+    for h, weight in zip(dataset.hypotheses, prior.hypotheses, strict=True):
+        found = grams.of_hypothesis(h)
+        grid = dataset.grids[h.name, h.where] if is_driven(h) else None
+        log_prior = np.zeros(1) if grid is None else grid.log_prior
+        scales = scales_of(h)
+        each = found.evidence(scales)
+        evidence = float(log_sum(each + log_prior))
+        k = int(np.argmax(each + log_prior))
+        settings = np.zeros(0) if grid is None else grid.values[k]
+        scored.append(Scored(evidence, float(each[k]), settings, float(found.distance[k])))
+        total.append(weight + evidence)
+        if len(signs):
+            flips.append(weight + log_sum(found.flipped(scales) + log_prior))
+    covariates: dict[str, list[float]] = {}
+    driver_flips: dict[str, list[Array]] = {}
+    for g, weight in zip(generic, prior.blocks, strict=True):
+        found = grams.of_block(g)
+        evidence = float(found.evidence()[0])
+        blocks.append(Scored(evidence, evidence, np.zeros(0), float(found.distance[0])))
+        total.append(weight + evidence)
+        covariates.setdefault(g.covariate, []).append(evidence)
+        if len(signs):
+            flipped = found.flipped()[:, 0]
+            flips.append(weight + flipped)
+            driver_flips.setdefault(g.covariate, []).append(flipped)
+    return Scan(
+        tuple(scored), tuple(blocks), float(log_sum(np.array(total))) - prior.total,
+        log_sum(np.array(flips), axis=0) - prior.total if flips else np.zeros(0),
+        {d: max(v) for d, v in covariates.items()},
+        {d: np.max(v, axis=0) for d, v in driver_flips.items()}, at, noise,
+    )  # fmt: skip

@@ -10,8 +10,8 @@ from typing import Any
 
 import tomli_w
 
-from elastocal.cell import Cell, read_cell
-from elastocal.diagnosis.result import FoundEffect
+from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.diagnosis.diagnosis import FoundEffect
 from elastocal.files import atomic_write_text
 from elastocal.plugin_loader import is_plugin_file
 

@@ -1,20 +1,42 @@
-"""What might be missing from the model: every effect at every place where it could act."""
+"""What might be missing from the model: every effect at every place, and its columns."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
 
+import casadi as ca
 import numpy as np
 
-from elastocal.cell import Cell, EffectChoice
-from elastocal.diagnosis.result import Untested
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects import CATALOGUE
-from elastocal.manipulator.effects.base import Effect, Stage
-from elastocal.manipulator.effects.driven import DrivenEffect
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.parameter import ParameterSpec, Setting
+from elastocal.cell.arm_description import EffectChoice
+from elastocal.cell.work_cell import Cell
+from elastocal.diagnosis.baseline import Baseline, made_once
+from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Untested
 from elastocal.measurements import Measurements
+from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
+from elastocal.model.chain import Chain
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.base import Effect, Stage, index
+from elastocal.model.effects.changes_in_time import ThermalExpansion
+from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.driven import (
+    BaseMotion,
+    DrivenEffect,
+    Entry,
+    JointMotion,
+    LinkFrame,
+    LinkLength,
+    MarkerMotion,
+)
+from elastocal.model.effects.play import Backlash
+from elastocal.model.evaluate import BatchFunction
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
+from elastocal.units import Array
+
+# What might be missing from the model: every effect at every place where it could act.
 
 # What each need of an effect asks the user to record.
 RECORD = {
@@ -115,3 +137,391 @@ def _needed(at: list[Hypothesis], effect: Effect, cell: Cell) -> tuple[str, ...]
     kinds = {setting.kind for hypothesis in at for setting in hypothesis.settings}
     timed = ("time",) if kinds & {"change_time", "time_constant"} else ()
     return tuple(dict.fromkeys((*effect.needed(cell), *timed)))
+
+
+# What the table records decides how some effects are driven.
+
+# Key of [model], its value, the column that allows it, and the effect that it is about.
+CHOICES = (
+    ("thermal_driver", "temperature", "temperature", ThermalExpansion.name),
+    ("play_side", "load_and_approach", "approach", Backlash.name),
+)
+
+
+def with_recorded_drivers(
+    model: Model, table: Measurements, found: Diagnosis | None = None
+) -> Model:
+    """The model with effects driven by the best that the table records.
+
+    Growth follows a measured temperature rather than a warm-up curve, and play rests where the
+    last motion left it where that is known.  Effects that the cell has active stay as they are;
+    those of a diagnosis are driven as `found`.
+    """
+    spec = model.cell.model
+    active = {p.effect for p in model.parameters}
+    if found is not None:
+        otherwise = {effect for key, _, _, effect in CHOICES if key not in found.model_keys}
+        active |= otherwise & {e.effect for e in found.effects}
+    keys = {
+        key: value
+        for key, value, column, effect in CHOICES
+        if recorded(table, column) and effect not in active
+    }
+    if not keys:
+        return model
+    cell = replace(model.cell, model=replace(spec, **keys))  # type: ignore[arg-type]
+    return Model.assembled(model.chain, cell)
+
+
+def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
+    """Keys of [model] that the effects found rest on."""
+    names = {f.effect for f in found}
+    spec = model.cell.model
+    return {
+        key: value
+        for key, value, _, effect in CHOICES
+        if effect in names and getattr(spec, key) == value
+    }
+
+
+# Where an effect's constants are searched: change times, time constants, orders, ranges.
+
+CHANGE_TIMES = 120  # at most; more moments are refined after the search
+TIME_CONSTANTS = 8
+HIGHEST_ORDER, LOWEST_ORDER = 600.0, 2.5
+# Step of the orders in units of 1/range(q): half a step off, a ripple keeps 0.95 of its size.
+ORDER_STEP = 1.5
+RANGE_VALUES = 25
+MOST_POINTS = 20_000  # of several settings together
+KNOWN_SHARE = 0.5  # of the prior, on orders the cell names
+
+
+@dataclass(frozen=True)
+class SettingsGrid:
+    """Values (G, settings) to try, and the log prior of each, which sum to one."""
+
+    values: Array
+    log_prior: Array
+    step: Array
+
+    def nearest(self, settings: Array) -> int:
+        """The point that stands for `settings` (settings,), which were refined from it."""
+        return int(np.abs(self.values - settings).sum(axis=1).argmin())
+
+
+def grid_of(hypothesis: Hypothesis, visits: Measurements, chain: Chain) -> SettingsGrid:
+    """Grid of a hypothesis' settings for these visits; one empty point where it has none.
+
+    Of several settings it holds every combination.  Where those are more than MOST_POINTS, each
+    setting is tried at fewer values, and its step grows with their distance.
+    """
+    axes = [_axis(setting, hypothesis.where, visits) for setting in hypothesis.settings]
+    if not axes:
+        return SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
+    if len(axes) == 1:
+        return axes[0]
+    share = min(1.0, MOST_POINTS / math.prod(len(axis.values) for axis in axes))
+    return _product([_thinned(axis, share ** (1 / len(axes))) for axis in axes])
+
+
+def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
+    """Values (G, 1) of one setting."""
+    if setting.kind == "order":
+        return _orders(setting, where, visits)
+    if setting.kind == "range":
+        values = np.linspace(setting.lower, setting.upper, RANGE_VALUES)
+    elif setting.kind == "change_time":
+        values = change_times(_time(visits))
+    else:
+        span = float(np.ptp(_time(visits)))
+        low, high = max(span / 20, setting.lower), min(3 * span, setting.upper)
+        values = np.geomspace(min(low, high), high, TIME_CONSTANTS)
+    step = np.gradient(values) if len(values) > 1 else np.ones(1)
+    return SettingsGrid(values[:, None], np.full(len(values), -np.log(len(values))), step[:, None])
+
+
+def _time(visits: Measurements) -> Array:
+    assert visits.time is not None  # else the hypothesis is not tested
+    return visits.time
+
+
+def _product(axes: list[SettingsGrid]) -> SettingsGrid:
+    """Every combination of the axes' values; the priors of settings are independent."""
+    chosen = np.indices([len(axis.values) for axis in axes]).reshape(len(axes), -1)
+    picked = list(zip(axes, chosen, strict=True))
+    return SettingsGrid(
+        np.concatenate([axis.values[k] for axis, k in picked], axis=1),
+        np.sum([axis.log_prior[k] for axis, k in picked], axis=0),
+        np.concatenate([axis.step[k] for axis, k in picked], axis=1),
+    )
+
+
+def _thinned(axis: SettingsGrid, share: float) -> SettingsGrid:
+    """The axis at `share` of its values, from first to last."""
+    count = max(2, int(len(axis.values) * share))
+    if count >= len(axis.values):
+        return axis
+    kept = np.linspace(0, len(axis.values) - 1, count).round().astype(int)
+    prior = np.exp(axis.log_prior[kept])
+    wider = len(axis.values) / count
+    return SettingsGrid(axis.values[kept], np.log(prior / prior.sum()), axis.step[kept] * wider)
+
+
+def moments_between(time: Array) -> Array:
+    """Every moment between two visits, two visits at least on either side."""
+    known = np.sort(time)
+    middle = np.unique((known[1:-2] + known[2:-1]) / 2)
+    return middle if len(middle) else np.array([known.mean()])
+
+
+def change_times(time: Array) -> Array:
+    """Moments between visits that are tried first: CHANGE_TIMES at most, evenly spaced."""
+    middle = moments_between(time)
+    if len(middle) > CHANGE_TIMES:
+        chosen = np.linspace(0, len(middle) - 1, CHANGE_TIMES).round().astype(int)
+        middle = middle[chosen]
+    return middle
+
+
+def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
+    """Orders of a joint's angle; at another place than a joint, of the one that moves most."""
+    moved = np.ptp(visits.q, axis=0)
+    spread = max(float(moved[index(where)] if where.startswith("joint") else moved.max()), 1e-3)
+    step = ORDER_STEP / spread
+    values = np.arange(LOWEST_ORDER, HIGHEST_ORDER, step)
+    known = [] if setting.default is None else [setting.default]
+    share = KNOWN_SHARE if known else 0.0
+    prior = np.concatenate(
+        [np.full(len(known), share), np.full(len(values), (1 - share) / len(values))]
+    )
+    return SettingsGrid(
+        np.concatenate([known, values])[:, None], np.log(prior), np.full((len(prior), 1), step)
+    )
+
+
+# Columns of effects whose other parameters say nothing while the first is zero.
+#
+# The geometry of a spring has no derivative at stiffness zero.  So the stiffness is estimated for
+# each start that the effect proposes, the best start is kept, and the geometry's columns are those
+# at that stiffness.
+
+ROWS = 3000  # of the equations, as many as tell one start from another
+
+
+def with_tangents(
+    whole: Model, hypotheses: list[Hypothesis], base: Baseline, x: Array, B: Array
+) -> Array:
+    """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none."""
+    for h in hypotheses:
+        own = own_columns(whole, h)
+        shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
+        if shown.all() or shown.sum() != 1:
+            continue
+        best = min(tangents(whole, h, base, x, B), key=lambda t: t.left)
+        B = B.copy()
+        B[:, :, own] = best.columns
+    return B
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """Columns (n_rows, size, k) of an effect about one of its starts, at the amplitude that the
+    residual asks for, and what is `left` of the residual's sum of squares."""
+
+    left: float
+    columns: Array
+
+
+def tangents(whole: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> Iterator[Tangent]:
+    """One for each start that the effect proposes; x (K,) and B (n_rows, size, K) of `whole`.
+
+    The effect's first parameter is the amplitude that the others have no columns without.
+    """
+    table, model = base.observed.table, base.model
+    observed = observe(table, whole.observe)
+    names = {name: k for k, name in enumerate(whole.names)}
+    fitted, own = [names[name] for name in model.names], own_columns(whole, h)
+    X = base.observed.apply(B[:, :, fitted]).reshape(len(base.residual), -1) * base.sizes
+    # What is only planned has no residual yet that a spring could answer for.
+    last = base.n_measured * base.observed.size - 1
+    rows = np.unique(np.linspace(0, last, min(ROWS, last + 1)).astype(int))
+    for start in h.effect.starts(h.where, model.chain, model.cell) or ({},):
+        at = x.copy()
+        for key, value in start.items():
+            at[names[f"{h.where}.{key}"]] = value
+        column = whole.regressor(table, at, np.array(own[:1]), observed).B
+        c = base.observed.apply(column.reshape(len(table), observed.size, 1)).ravel()
+        size = max(float(np.abs(c).max()), 1e-300)
+        A = np.column_stack([X, c / size])[rows]
+        solution, *_ = np.linalg.lstsq(A, base.residual[rows], rcond=1e-9)
+        at[own[0]] += solution[-1] / size
+        columns = whole.regressor(table, at, np.array(own), observed).B
+        columns = columns.reshape(len(table), observed.size, -1)
+        columns[:, :, 0] = column.reshape(len(table), observed.size)
+        yield Tangent(float(((base.residual[rows] - A @ solution) ** 2).sum()), columns)
+
+
+def own_columns(whole: Model, h: Hypothesis) -> list[int]:
+    """Where the hypothesis' parameters stand among those of `whole`."""
+    return [k for k, p in enumerate(whole.parameters) if (p.effect, p.where) == (h.name, h.where)]
+
+
+# Columns of every hypothesis at the fitted arm: one symbolic model with everything in it.
+
+EntryKey = tuple[str, tuple[str, ...]]
+
+ENTRIES: tuple[Entry, ...] = (
+    JointMotion(),
+    LinkLength(),
+    LinkFrame(),
+    BaseMotion(),
+    MarkerMotion(),
+)
+# The signal that a parameter without a known size is expected to make, rms over its rows.
+UNSIZED_SIGNAL = 2e-4
+
+
+@dataclass(frozen=True)
+class Columns:
+    """B of the model, of direct hypotheses and of the chain's entries, row by row of the table.
+
+    `rows` (n_rows, size, K) at the fitted values, raw; `places` says which columns of it belong to
+    an effect (or entry) at a place.  `whole` is the model with all of them, at x (K,).
+    """
+
+    base: Baseline
+    rows: Array
+    places: dict[tuple[str, str], slice]
+    whole: Model
+    x: Array
+
+    @cached_property
+    def table(self) -> Measurements:
+        return self.base.observed.table
+
+    def observed(self, rows: Array) -> Array:
+        """Per table row (n_rows, size, k) → per observation (N, size, k)."""
+        return self.base.observed.apply(rows)
+
+    def of(self, hypothesis: Hypothesis) -> Array:
+        """Columns (n_rows, size, k) of a hypothesis that is not driven."""
+        return self.rows[:, :, self.places[hypothesis.name, hypothesis.where]]
+
+    def from_each_start(self, hypothesis: Hypothesis) -> Iterator[Array]:
+        """Its columns (n_rows, size, k) about each of the starts of which `of` has the best."""
+        for tangent in tangents(self.whole, hypothesis, self.base, self.x, self.rows):
+            yield tangent.columns
+
+    def torques(self) -> Array:
+        """The load's torque τ (n_rows, joints) on every joint, zero where nothing depends on it.
+
+        δq = k τ, so ∂(reading)/∂k = ∂(reading)/∂q · τ.
+        """
+        n = self.base.model.chain.n_joints
+        tau = np.zeros((len(self.rows), n))
+        for i in range(n):
+            span = self.places.get((JointCompliance.name, f"joint{i + 1}"))
+            if span is None:
+                continue
+            by_k = self.rows[:, :, span].sum(axis=2)
+            by_q = self.rows[:, :, self.places["joint_motion", f"joint{i + 1}"]][:, :, 0]
+            squared = (by_q**2).sum(axis=1)
+            along = (by_k * by_q).sum(axis=1)
+            tau[:, i] = np.divide(along, squared, out=np.zeros(len(along)), where=squared > 1e-12)
+        return tau
+
+    def entry(self, key: EntryKey) -> Array:
+        """∂(reading)/∂u (n_rows, size, d) of the entry's motions at its places, stacked."""
+        name, places = key
+        return np.concatenate([self.rows[:, :, self.places[name, w]] for w in places], axis=2)
+
+
+def is_driven(hypothesis: Hypothesis) -> bool:
+    return isinstance(hypothesis.effect, DrivenEffect)
+
+
+def entry_key(hypothesis: Hypothesis, model: Model) -> EntryKey:
+    """The entry that a driven hypothesis acts on."""
+    effect = hypothesis.effect
+    assert isinstance(effect, DrivenEffect)
+    return effect.entry.name, effect.entered_at(hypothesis.where, model.chain)
+
+
+def compute_columns(
+    base: Baseline, hypotheses: list[Hypothesis], found: dict[str, float] | None = None
+) -> Columns:
+    """One evaluation of B of the fitted arm with every hypothesis and entry at zero.
+
+    `found` are parameters of hypotheses that are not at zero, by name.
+
+    Deflections enter by eq. (3), the load's torques at the undeflected pose: the columns differ
+    from those of the equilibrium by the ratio of deflection to lever arm, a part in a thousand.
+    """
+    model, table = base.model, base.observed.table
+    chain, cell = model.chain, model.cell
+    direct = [h for h in hypotheses if not is_driven(h)]
+    spec = replace(
+        cell.model,
+        effects=(*cell.model.effects, *(h.choice for h in direct)),
+        observe="position" if cell.model.observe == "deflection" else cell.model.observe,
+        deflection_model="linear",
+    )
+    extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
+    key = "columns", spec.effects
+    whole = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
+    at = dict(zip(model.names, base.x, strict=True)) | (found or {})
+    x = np.array([at.get(p.name, p.nominal) for p in whole.parameters])
+    observed = observe(table, whole.observe)
+    B = whole.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
+    B = with_tangents(whole, direct, base, x, B)
+    spans: dict[tuple[str, str], list[int]] = {}
+    for k, p in enumerate(whole.parameters):
+        spans.setdefault((p.effect, p.where), []).append(k)
+    places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
+    return Columns(base, B, places, whole, x)
+
+
+def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:
+    """Prior standard deviation (k,) of each parameter: its typical size.
+
+    Where none is known, the value whose signal in the columns (…, k) is UNSIZED_SIGNAL rms.
+    """
+    flat = columns.reshape(-1, columns.shape[-1])
+    moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
+    rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
+    signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
+    typical = [p.typical for p in hypothesis.parameters]
+    return np.array([s if t is None else t for s, t in zip(signal, typical, strict=True)])
+
+
+class RegressorDirection:
+    """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression."""
+
+    def __init__(self, hypothesis: Hypothesis, model: Model) -> None:
+        effect = hypothesis.effect
+        assert isinstance(effect, DrivenEffect)
+        self.hypothesis = hypothesis
+        self._arm = Arm(model.chain, model.cell)
+        fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
+        searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
+        u = effect.drive(self._arm, hypothesis.where, {**fitted, **searched})
+        D = ca.jacobian(u, ca.vertcat(*fitted.values()))
+        constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
+        # Most drives ask for one or two numbers of a row: evaluated at thousands of settings, all
+        # that the arm declared would be copied as many times.
+        declared = ca.vertcat(*self._arm.inputs.values())
+        used = [k for k in range(declared.numel()) if ca.depends_on(D, declared[k])]
+        self._used = np.array(used, dtype=np.int64)
+        asked = ca.vertcat(ca.SX.zeros(0, 1), *(declared[k] for k in used))
+        self._tape = BatchFunction([asked, constants], [D])
+
+    def asked(self, table: Measurements) -> Array:
+        """What D depends on in each row of the table (n_rows, quantities)."""
+        return np.concatenate(row_inputs(self._arm, table), axis=1)[:, self._used]
+
+    def __call__(self, table: Measurements, settings: Array) -> Array:
+        """D (n_rows, G, d, k) at each of the `settings` (G, number of settings)."""
+        G, n = len(settings), len(table)
+        asked = np.repeat(self.asked(table), G, axis=0)
+        D = self._tape(asked, np.tile(settings, (n, 1)))[0]
+        return np.asarray(D.reshape(n, G, *D.shape[1:]))

@@ -1,26 +1,33 @@
-"""A set of additions to the model, with the noise that goes with it and its evidence."""
+"""A set of additions to the model: its noise, its evidence, its estimates, what looks alike."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
-from elastocal.diagnosis.columns import is_driven
-from elastocal.diagnosis.evidence import SCALES
-from elastocal.diagnosis.generic import Generic
-from elastocal.diagnosis.gram import Grams, scales_of
-from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.noise import NoiseValues, NoisyData, log_prior
-from elastocal.diagnosis.noise_fit import fit_noise
-from elastocal.diagnosis.projection import Projection, Weighted, project
-from elastocal.diagnosis.scene import Scene
+from elastocal.cell.work_cell import Cell
+from elastocal.diagnosis.baseline import Baseline, fit_baseline, made_once
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.evidence import SCALES, Grams, scales_of
+from elastocal.diagnosis.hypotheses import Hypothesis, is_driven
+from elastocal.diagnosis.noise_floor import (
+    NoiseValues,
+    NoisyData,
+    Projection,
+    Weighted,
+    fit_noise,
+    log_prior,
+    project,
+)
+from elastocal.diagnosis.unknown import Generic
+from elastocal.model.manipulator import Model
+from elastocal.units import Array
 
-Array = NDArray[np.float64]
+# A set of additions to the model, with the noise that goes with it and its evidence.
 
 REFINED_ROUNDS = 3  # of settings that depend on each other
 
@@ -101,38 +108,40 @@ def spans_of(items: tuple[Item, ...], total: int) -> tuple[slice, ...]:
     )
 
 
-def packed_columns(scene: Scene, item: Item) -> Array:
+def packed_columns(dataset: DiagnosisData, item: Item) -> Array:
     """Columns (C, m, k) of an item, scaled to its typical sizes."""
     what = item.what
     if isinstance(what, Hypothesis):
-        return scene.packed(what, item.settings)
+        return dataset.packed(what, item.settings)
     if what.columns is not None:
         return what.columns
     assert what.entry is not None and what.drive is not None
-    E = scene.entry(what.entry)  # (C, m, d)
-    drive = np.einsum("cmv,cvdk->cmdk", scene.places.one_hot, what.drive)
+    E = dataset.entry(what.entry)  # (C, m, d)
+    drive = np.einsum("cmv,cvdk->cmdk", dataset.places.one_hot, what.drive)
     return np.einsum("cmd,cmdk->cmk", E, drive)
 
 
-def fit_set(scene: Scene, items: tuple[Item, ...], start: NoiseValues | None = None) -> ModelSet:
+def fit_set(
+    dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None
+) -> ModelSet:
     """Fit the noise beside the items, twice where their best scale is not the typical one."""
     scales, noise = tuple(1.0 for _ in items), start
-    joined = with_items(scene, items, scales)
+    joined = with_items(dataset, items, scales)
 
     def at(scales: tuple[float, ...]) -> NoisyData:
-        return replace(joined, precision=_precision(scene.data, items, scales))
+        return replace(joined, precision=_precision(dataset.data, items, scales))
 
     for _ in range(2):
         noise = fit_noise(at(scales), noise)
         weighted = Weighted.of(joined, noise)
-        best, mixed = _mixed_scales(scene.data, weighted, items, scales)
+        best, mixed = _mixed_scales(dataset.data, weighted, items, scales)
         if best == scales:
             break
         scales = best
     assert noise is not None
     data = at(scales)
     mixed += _within_bounds(items, weighted.projection(data.precision))
-    prior = sum(item.log_prior for item in items) - 0.5 * log_prior(scene.data.stated, noise)[0]
+    prior = sum(item.log_prior for item in items) - 0.5 * log_prior(dataset.data.stated, noise)[0]
     return ModelSet(items, noise, data, mixed + prior, scales)
 
 
@@ -184,7 +193,7 @@ def _mixed_scales(
     return scales, top + spent
 
 
-def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
+def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
     """Item k's settings refined between the grid's points, at the set's noise.
 
     One setting after the other; where there are several, they go round REFINED_ROUNDS times.
@@ -193,9 +202,9 @@ def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
     what = item.what
     if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
         return chosen
-    data = beside(scene, chosen, k)
-    grams = Grams(scene, data, project(data, chosen.noise))
-    grid = scene.grids[what.name, what.where]
+    data = beside(dataset, chosen, k)
+    grams = Grams(dataset, data, project(data, chosen.noise))
+    grid = dataset.grids[what.name, what.where]
 
     def evidence(tried: Array) -> Array:
         return grams.of_hypothesis(what, tried).evidence(item.scales)
@@ -205,8 +214,8 @@ def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
     for _ in range(1 if len(settings) == 1 else REFINED_ROUNDS):
         for s, setting in enumerate(what.settings):
             if setting.kind == "change_time":
-                trial = scene.moments[np.abs(scene.moments - settings[s]) <= widths[s]]
-                if len(trial) <= 1 or len(scene.moments) == len(np.unique(grid.values[:, s])):
+                trial = dataset.moments[np.abs(dataset.moments - settings[s]) <= widths[s]]
+                if len(trial) <= 1 or len(dataset.moments) == len(np.unique(grid.values[:, s])):
                     continue
                 settings = _best_along(settings, s, trial, evidence)
             else:
@@ -218,7 +227,7 @@ def refine(scene: Scene, chosen: ModelSet, k: int) -> ModelSet:
     if not searched:
         return chosen
     refined = replace(item, settings=settings)
-    return fit_set(scene, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), chosen.noise)
+    return fit_set(dataset, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), chosen.noise)
 
 
 def _best_along(settings: Array, s: int, trial: Array, evidence: Callable[[Array], Array]) -> Array:
@@ -228,15 +237,126 @@ def _best_along(settings: Array, s: int, trial: Array, evidence: Callable[[Array
     return np.asarray(tried[int(np.argmax(evidence(tried)))])
 
 
-def with_items(scene: Scene, items: tuple[Item, ...], scales: tuple[float, ...]) -> NoisyData:
+def with_items(
+    dataset: DiagnosisData, items: tuple[Item, ...], scales: tuple[float, ...]
+) -> NoisyData:
     """The scene's data with the items' columns at the given scales."""
     if not items:
-        return scene.data
-    columns = np.concatenate([packed_columns(scene, item) for item in items], axis=2)
-    p = len(scene.data.precision)
-    return scene.data.with_columns(columns, _precision(scene.data, items, scales)[p:])
+        return dataset.data
+    columns = np.concatenate([packed_columns(dataset, item) for item in items], axis=2)
+    p = len(dataset.data.precision)
+    return dataset.data.with_columns(columns, _precision(dataset.data, items, scales)[p:])
 
 
-def beside(scene: Scene, chosen: ModelSet, k: int) -> NoisyData:
+def beside(dataset: DiagnosisData, chosen: ModelSet, k: int) -> NoisyData:
     """The set's data without item k."""
-    return with_items(scene, chosen.without(k), chosen.scales[:k] + chosen.scales[k + 1 :])
+    return with_items(dataset, chosen.without(k), chosen.scales[:k] + chosen.scales[k + 1 :])
+
+
+# Which other effects would look the same in these poses: what no size of noise can tell apart.
+
+PLAUSIBLE = 5.0
+
+
+def signal_of(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Array:
+    """What item k does to the readings (C, m) at its estimate."""
+    columns = packed_columns(dataset, chosen.items[k])
+    return dataset.data.masked(columns @ chosen.at.beta[chosen.spans[k]])
+
+
+def distances(
+    dataset: DiagnosisData, chosen: ModelSet, k: int
+) -> tuple[float, dict[tuple[str, str], float]]:
+    """d of item k from nothing, and from each other hypothesis that the data could mean instead.
+
+    d² = min over β, γ of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's
+    columns C at its best settings and s = PLAUSIBLE times the widest of the size prior: in
+    standard deviations.  A rival larger than usual is less probable, but it is no less alike.
+    """
+    v, data = signal_of(dataset, chosen, k), beside(dataset, chosen, k)
+    at = project(replace(data, r=v), chosen.noise)
+    grams = Grams(dataset, data, at)
+    whole = float((v * at.u).sum())
+    out: dict[tuple[str, str], float] = {}
+    for h in dataset.hypotheses:
+        if h is chosen.items[k].what:
+            continue
+        found = grams.of_hypothesis(h, settings_to_try(dataset, h, chosen.items[k]))
+        s = PLAUSIBLE * float(scales_of(h).max())
+        explained = float(found.explained(s).max())
+        out[h.name, h.where] = float(np.sqrt(max(whole - explained, 0.0)))
+    return float(np.sqrt(max(whole, 0.0))), out
+
+
+def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Array | None:
+    """Settings (G, …) at which a rival may imitate an item: those of the search and, where both
+    have the same kind of constant, the item's own, which was refined between them.  None where
+    the rival has none."""
+    what = item.what
+    if not rival.settings:
+        return None
+    values = dataset.grids[rival.name, rival.where].values
+    if not isinstance(what, Hypothesis):
+        return values
+    alike = [s.kind for s in rival.settings] == [s.kind for s in what.settings]
+    within = alike and all(
+        s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True)
+    )
+    return np.vstack([values, item.settings]) if within else values
+
+
+def item_key(item: Item) -> tuple[str, str]:
+    """(effect, place) of a known item."""
+    assert isinstance(item.what, Hypothesis)
+    return item.what.name, item.what.where
+
+
+# The model with found effects added.
+
+
+def extended(model: Model, items: Sequence[Item]) -> Model:
+    """The model with the effects of the known items active, at their settings."""
+    spec = model.cell.model
+    settings = {place: dict(values) for place, values in spec.nominal.settings.items()}
+    effects = list(spec.effects)
+    for item in items:
+        if not isinstance(item.what, Hypothesis):
+            continue
+        effects.append(item.what.choice)
+        for setting, value in zip(item.what.settings, item.settings, strict=True):
+            settings.setdefault(item.what.where, {})[setting.key] = float(value)
+    nominal = replace(spec.nominal, settings=settings)
+    cell: Cell = replace(model.cell, model=replace(spec, effects=tuple(effects), nominal=nominal))
+    key = "extended", tuple(effects), repr(settings)
+    return made_once(model, key, lambda: Model.assembled(model.chain, cell))
+
+
+def settings_of(item: Item) -> dict[str, float]:
+    """Searched constants of a known item by their keys."""
+    if not isinstance(item.what, Hypothesis):
+        return {}
+    keys = [s.key for s in item.what.settings]
+    return {k: float(v) for k, v in zip(keys, item.settings, strict=True)}
+
+
+# Estimates of a set: what its columns stand for, and the fit of the model with them in it.
+
+
+def linear_estimates(dataset: DiagnosisData, chosen: ModelSet) -> dict[str, float]:
+    """Posterior means of the known items' parameters by name."""
+    out: dict[str, float] = {}
+    for item, span in zip(chosen.items, chosen.spans, strict=True):
+        if isinstance(item.what, Hypothesis):
+            values = chosen.at.beta[span] * dataset.sizes[item.what.name, item.what.where]
+            for p, v in zip(item.what.parameters, values, strict=True):
+                out[f"{item.what.where}.{p.key}"] = float(v) + p.nominal
+    return out
+
+
+def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]) -> Baseline:
+    """The nonlinear fit of the model with `items` of the set in it, from the linear estimate."""
+    base = dataset.base
+    model = extended(base.model, items)
+    start = dict(zip(base.model.names, base.x, strict=True)) | linear_estimates(dataset, chosen)
+    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
+    return fit_baseline(model, base.observed.table, x0=x0)

@@ -1,19 +1,19 @@
-"""From scores to an answer: explained, ambiguous, unknown, or nothing significant."""
+"""From scores to an answer, with everything that was tried, best first."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from elastocal.diagnosis.alike import distances, item_key
-from elastocal.diagnosis.found import Found
+from elastocal.diagnosis.backlash_model import EFFECT
+from elastocal.diagnosis.diagnosis import Candidate, EffectAt, Untested, Verdict
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, OutlierScreening
+from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item
-from elastocal.diagnosis.result import EffectAt, Verdict
+from elastocal.diagnosis.model_set import Item, distances, item_key
 
-Array = NDArray[np.float64]
+# From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
 NAMED = 0.9  # probability from which an effect is named
 UNKNOWN_EFFECT = "unknown_effect"
@@ -47,7 +47,7 @@ def _named(item: Item) -> tuple[str, str]:
     return item_key(item) if item.known else (UNKNOWN_EFFECT, item.what.where)
 
 
-def judge(found: Found) -> Answer:
+def judge(found: SelectedEffects) -> Answer:
     """The verdict on what the search found."""
     if not found.chosen.items:
         return Answer("nothing_significant", (), ())
@@ -67,7 +67,9 @@ def judge(found: Found) -> Answer:
     return Answer(verdict, tuple(probability), tuple(rivals))
 
 
-def _of_item(found: Found, k: int, item: Item) -> tuple[float, tuple[tuple[Item, float], ...]]:
+def _of_item(
+    found: SelectedEffects, k: int, item: Item
+) -> tuple[float, tuple[tuple[Item, float], ...]]:
     """Probability of item k, and it with those that it may be instead."""
     slot = found.slots[k]
     each, nothing = slot.probabilities()
@@ -76,7 +78,7 @@ def _of_item(found: Found, k: int, item: Item) -> tuple[float, tuple[tuple[Item,
     own = next(i for i, other in enumerate(slot.items) if other.same_as(item))
     if not item.known:
         return float(each[own]), ((item, float(each[own])),)
-    near = distances(found.scene, found.chosen, k)[1]
+    near = distances(found.dataset, found.chosen, k)[1]
     taken = {id(other.what) for other in found.chosen.items}
     alike = [
         i
@@ -109,3 +111,105 @@ def _of_item(found: Found, k: int, item: Item) -> tuple[float, tuple[tuple[Item,
             chosen.append(int(i))
     chosen = [own, *sorted(chosen[1:], key=lambda i: -p[i])]
     return float(p[own]), tuple((slot.items[i], float(p[i])) for i in chosen)
+
+
+# Everything that was tried, best first; what could not be tested; what to beware of.
+
+DETECTABLE = 1.0  # standard deviations: below, a typical size does not move the data
+STATED_LOW, STATED_HIGH = 0.67, 1.5
+FAULTY_SHARE = 0.02
+SUSPECT_SHARE = 0.05
+OPEN_LAW = 0.2  # probability of the other law of play from which the reader is told
+
+
+def candidates(
+    dataset: DiagnosisData, found: SelectedEffects, answer: Answer
+) -> tuple[Candidate, ...]:
+    """Every hypothesis with its probability: in the slot where it is likeliest."""
+    best: dict[tuple[str, str], Candidate] = {}
+    distance = {
+        (h.name, h.where): s.distance
+        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+    }
+    for k, slot in enumerate(found.slots):
+        rivals = answer.rivals[k] if k < len(answer.rivals) else ()
+        named = {id(item.what): p for item, p in rivals if item.known}
+        each, _ = slot.probabilities()
+        for item, p, score in zip(slot.items, each, slot.scores, strict=True):
+            what = item.what
+            if not isinstance(what, Hypothesis):
+                continue
+            settings = {s.key: float(v) for s, v in zip(what.settings, item.settings, strict=True)}
+            probability = named.get(id(what), float(p))
+            key = what.name, what.where
+            row = Candidate(
+                what.name, what.where, what.stage, probability, float(score),
+                distance[key], settings,
+            )  # fmt: skip
+            if key not in best or row.probability > best[key].probability:
+                best[key] = row
+    return tuple(sorted(best.values(), key=lambda c: (-c.probability, -c.score)))
+
+
+def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested, ...]:
+    """Hypotheses whose typical size these poses would not show."""
+    chosen = {id(item.what) for item in found.chosen.items}
+    rows = []
+    for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True):
+        if s.distance < DETECTABLE and id(h) not in chosen:
+            rows.append(
+                Untested(
+                    h.name,
+                    h.where,
+                    "at its typical size it does not show in these poses: the fitted parameters "
+                    "follow it, or it is smaller than the noise",
+                    "spread the poses over more of the work space, or raise the load",
+                )
+            )
+    return tuple(rows)
+
+
+def warnings(
+    dataset: DiagnosisData, found: SelectedEffects, screened: OutlierScreening
+) -> tuple[str, ...]:
+    """What a reader should know before trusting the verdict."""
+    out = []
+    noise, data = found.chosen.noise, found.chosen.data
+    if data.stated and not STATED_LOW < noise.factor < STATED_HIGH:
+        out.append(
+            f"the readings scatter {noise.factor:.2g} times as much as cell or table state; "
+            "correct the stated noise"
+        )
+    faulty = (data.left_out & ~dataset.blocks.absent).sum() / max((~dataset.blocks.absent).sum(), 1)
+    if faulty > FAULTY_SHARE:
+        out.append(
+            f"{faulty:.0%} of the readings disagree with all others and were left out; look for "
+            "the cause before trusting the rest"
+        )
+    kept = np.flatnonzero(screened.suspects)
+    if len(kept) > SUSPECT_SHARE * len(screened.suspects):
+        lines = dataset.base.observed.table.row[dataset.base.observed.lead[kept]]
+        out.append(
+            f"{len(kept)} of {len(screened.suspects)} readings (lines {lines.min()} to "
+            f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
+            "other to be accidents; they were kept: look at them with `elastocal identify` first"
+        )
+    if text := _undecided_play(found):
+        out.append(text)
+    if dataset.base.observed.table.time is None:
+        out.append("without times neither drifts nor jumps can be seen: record time_s")
+    return tuple(out)
+
+
+def _undecided_play(found: SelectedEffects) -> str:
+    """That the law of the play that was found is not known, where it is not."""
+    named = [i.what.where for i in found.chosen.items if isinstance(i.what, Hypothesis)
+             and i.what.name == EFFECT]  # fmt: skip
+    if not named or found.dataset.other_play <= OPEN_LAW:
+        return ""
+    places = " and ".join(named)
+    return (
+        f"hardly a reading tells whether the play of {places} follows the load alone or also the "
+        "last motion, so the error left at fresh poses is uncertain: measure poses in which the "
+        f"load hardly turns {places}, approached from both sides"
+    )

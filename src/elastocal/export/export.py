@@ -1,34 +1,155 @@
-"""A calibrated arm written in one of the formats, checked, and with what that costs."""
+"""A calibrated arm written in one of the formats, read back, and with what that costs."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from elastocal.errors import option
-from elastocal.export.check import check_chain, check_rest
-from elastocal.export.cost import Cost, cost_of
-from elastocal.export.dh import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
-from elastocal.export.inertia import link_inertias
-from elastocal.export.kept import Conditions, Kept, Valued, keep
-from elastocal.export.mjcf import RIGID, calibrated_mjcf
-from elastocal.export.parameters import (
+import casadi as ca
+import numpy as np
+
+from elastocal.errors import ElastocalError, InputError, option
+from elastocal.export.dh_table import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
+from elastocal.export.exportable import (
+    Conditions,
+    Cost,
+    ExportNumbers,
+    Kept,
+    Valued,
+    cost_of,
+    evaluate_pieces,
+    keep,
+    link_inertias,
+    random_table,
+)
+from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
+from elastocal.export.parameter_file import (
     cost_json,
     estimates_of,
     held_values,
     parameter_document,
+    to_yaml,
 )
-from elastocal.export.pieces import Pieces, evaluate_pieces
-from elastocal.export.urdf import Frames, calibrated_urdf
-from elastocal.export.urdf_new import BASE, FLANGE, new_urdf
-from elastocal.export.yaml_text import to_yaml
-from elastocal.manipulator.calibrated import CalibratedArm
-from elastocal.manipulator.chain import Array, Chain
-from elastocal.manipulator.effects import effect_of
-from elastocal.text import json_text
+from elastocal.export.urdf_file import BASE, FLANGE, Frames, calibrated_urdf, new_urdf
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.chain import Chain
+from elastocal.model.effects import effect_of
+from elastocal.model.rigid import nominal_flange
+from elastocal.text import did_you_mean, json_text
+from elastocal.units import Array
+
+# Which format a file is written in: by its ending, or as asked for.
+
+ENDINGS = {
+    ".urdf": "urdf",
+    ".xml": "mjcf",
+    ".mjcf": "mjcf",
+    ".csv": "dh",
+    ".yaml": "yaml",
+    ".yml": "yaml",
+    ".json": "json",
+}
+FORMATS = ("urdf", "mjcf", "dh", "mdh", "yaml", "json")
+
+
+def format_of(path: Path, asked: str | None) -> str:
+    """The format `asked` for, else that of the file's ending.
+
+    Raises InputError for an unknown format, and for an ending that tells none.
+    """
+    if asked is not None:
+        if asked.lower() not in FORMATS:
+            raise InputError(
+                f"{option('format')} takes one of {', '.join(FORMATS)}; found '{asked}'"
+                f"{did_you_mean(asked.lower(), FORMATS)}"
+            )
+        return asked.lower()
+    found = ENDINGS.get(path.suffix.lower())
+    if found is None:
+        raise InputError(
+            f"{path}: the ending '{path.suffix}' tells no format; use one of "
+            f"{', '.join(ENDINGS)}, or name it by {option('format')}: {', '.join(FORMATS)}"
+        )
+    return found
+
+
+# What was written is read back, by the library that users read it with, before it is kept.
+
+LARGEST = 1e-8  # m; a hundred times the rounding of a chain of a few metres
+# Origin and points 0.1 m along the flange's axes, homogeneous (4, 4).
+CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1, 4))])
+LARGEST_AT_REST = 1e-6  # m
+
+
+def flanges(chain: Chain, q: Array) -> Array:
+    """T_base_flange (n, 4, 4) of a chain at joint values q (n, joints)."""
+    symbol = ca.SX.sym("q", chain.n_joints)
+    function = ca.Function("flange", [symbol], [nominal_flange(chain, symbol)])
+    return np.array([function(row).full() for row in q])
+
+
+def check_chain(
+    text: str,
+    ending: str,
+    read: Callable[[Path], Chain],
+    chain: Chain,
+    kept: Kept,
+    seed: int,
+    largest: float | None = LARGEST,
+) -> float:
+    """Largest distance in m between the flange of the written text, read back, and `chain`'s: of
+    its origin and of points on its axes, so that its orientation counts.
+
+    Raises ElastocalError where it is more than `largest` (None: any will do).
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"written{ending}"
+        path.write_text(text, encoding="utf-8", newline="\n")
+        back = read(path)
+    q = random_table(kept.full.model, kept.conditions, 100, seed).q
+    apart = (flanges(back, q) - flanges(chain, q))[:, :3] @ CORNERS
+    worst = float(np.linalg.norm(apart, axis=1).max())
+    return worst if largest is None else _accepted(worst, largest)
+
+
+def check_rest(
+    mjcf: str, pieces: ExportNumbers, kept: Kept, base_frame: bool, poses: int, seed: int
+) -> float:
+    """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
+
+    Raises InputError where MuJoCo is not installed, ElastocalError where they differ.
+    """
+    arm = MujocoRest(mjcf)
+    part, force = kept.exported, kept.conditions.force
+    table = random_table(kept.full.model, kept.conditions, poses, seed)
+    expected = part.model.flange_poses(table, part.x)
+    if not base_frame:
+        expected = np.linalg.inv(pieces.T_tracker_base) @ expected
+    names = ["flange", *(f"marker_{name}" for name in pieces.markers)]
+    points = np.array([np.zeros(3), *(T[:3, 3] for T in pieces.markers.values())])
+    worst = 0.0
+    for q, T in zip(table.q, expected, strict=True):
+        if np.isfinite(T).all():
+            found = arm.sites(q, force, names)
+            away = found - (points @ T[:3, :3].T + T[:3, 3])
+            worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
+    return _accepted(worst, LARGEST_AT_REST)
+
+
+def _accepted(distance: float, largest: float) -> float:
+    if not distance <= largest:
+        raise ElastocalError(
+            f"the written file, read back, is {distance * 1e6:.3g} µm from the model and was not "
+            "kept; please report this robot description"
+        )
+    return distance
+
+
+# A calibrated arm written in one of the formats, checked, and with what that costs.
 
 SCHEMA = "elastocal/export/1"
 POSES_AT_REST = 20
@@ -113,7 +234,7 @@ def _written(
     calibrated: CalibratedArm,
     wish: Wish,
     kept: Kept,
-    pieces: Pieces,
+    pieces: ExportNumbers,
     cost: Cost,
     estimates: list[dict[str, Any]],
 ) -> Written:
@@ -142,8 +263,8 @@ def _note(calibrated: CalibratedArm, wish: Wish) -> str:
     return told
 
 
-def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
-    from elastocal.manipulator.urdf import read_urdf
+def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
+    from elastocal.model.urdf import read_urdf
 
     robot = calibrated.model.cell.robot
     note = _note(calibrated, wish)
@@ -151,7 +272,7 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> 
         text = calibrated_urdf(robot, pieces, wish.frames, note)
         base, flange = robot.base, robot.flange
         if wish.frames.base and base is None:
-            from elastocal.manipulator.urdf_check import check_urdf
+            from elastocal.model.urdf import check_urdf
 
             base = check_urdf(robot.urdf).root
     else:
@@ -162,7 +283,7 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> 
     return text, check_chain(text, ".urdf", read, chain, kept, wish.seed), "pinocchio", [], None
 
 
-def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
+def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
     cell = calibrated.model.cell
     inertias: tuple[Array, ...] = ()
     if pieces.masses and cell.robot.urdf is not None:
@@ -204,8 +325,8 @@ def _compensator(part: Valued) -> dict[str, float] | None:
     return {name.partition(".")[2]: v for name, v in values.items()} | {"joint": joint}
 
 
-def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Pieces) -> Written:
-    from elastocal.manipulator.dh import read_dh
+def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
+    from elastocal.model.dh import read_dh
 
     convention = CONVENTIONS[wish.format]
     lines = dh_lines(calibrated.model.cell.robot, pieces, convention)

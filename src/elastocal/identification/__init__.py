@@ -1,0 +1,52 @@
+"""The weighted identification: least squares on B, noise, intervals, faulty readings."""
+
+from elastocal import loaded_on_demand
+
+ROOMS = {
+    "bootstrap": "ParametricBootstrap parametric_bootstrap wild_cluster_bootstrap",
+    "constrained": "ActiveConstraint constrained_fit on_columns solve_constrained",
+    "constrained_intervals": (
+        "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_intervals"
+    ),
+    "constrained_solver": "ConstrainedObjective ResidualLoss",
+    "covariance": "Covariance classical cluster_robust hc t_quantile",
+    "error_budget": "BudgetStep gap_budget",
+    "faulty_readings": "FaultyGroup OutlierReport influence outlier_report",
+    "findings": "judged next_steps standings warning_sentences",
+    "identifiability": "Problem Reduction reduce residual_sigma",
+    "intervals": "cluster_by_parts profile_interval profile_of worth_clustering",
+    "knowledge": (
+        "Bounds Constraints GaussianPrior LinearEquality SemidefiniteMatrix equal "
+        "non_negative passivity physical_constraints share_of_prior"
+    ),
+    "knowledge_file": "Knowledge KnowledgeTable read_knowledge",
+    "least_squares": "FitProblem SumOfSquares descend fit",
+    "linear_solver": "solve_weighted",
+    "noise_choice": "Trial beyond_noise estimate_noise own_noise screen",
+    "noise_structure": (
+        "NoiseModel Readings by_axis by_group independent noise_models shared_effects"
+    ),
+    "noise_summary": "LackOfFit Noise NoiseSize lack_of_fit",
+    "options": "Method Options",
+    "outliers": "Outlier blocks describe find_faulty least_trimmed_squares majority verdict",
+    "published": "eq14 eq14_weights group_sigma ols wls",
+    "reml": "LogPrior evaluate kenward_roger prior_of_groups slope stacks",
+    "residuals": (
+        "ResidualSummary held_out_by_parts held_out_residual normal_scores rms_3d "
+        "simultaneous_level summarise_residuals"
+    ),
+    "result": "Calibration Combination Finding TestErrors",
+    "robust": "asymptotic_covariance clustered_covariance robust_fit",
+    "robust_core": (
+        "Absolute Bisquare Huber StudentT bisquare breakdown_bisquare design efficiency huber "
+        "m_scale normal_mean normal_moments proposal_2"
+    ),
+    "robust_fits": "log_likelihood m_estimate mm_estimate student_t",
+    "solve": "Solution sizes_and_check",
+    "start": "RegistrationProblem check_limits check_table fixed_and_free register start_values",
+    "weighted_problem": (
+        "Evaluation Partition RFactor Weights merge part_of scaled_by_component weights_for"
+    ),
+}
+__all__ = [name for names in ROOMS.values() for name in names.split()]
+__getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.heldout import held_out_residual
-from elastocal.identification.noise import weights_for
+from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.result import Calibration
-from elastocal.manipulator.effects import CATALOGUE
-
-Array = NDArray[np.float64]
+from elastocal.identification.weighted_problem import weights_for
+from elastocal.model.effects import CATALOGUE
+from elastocal.units import Array
 
 STAGES = ("nominal_arm", "geometry", "compliance")
 MOST_NUMBERS = 30_000_000  # of a regressor held at once; larger tables get no budget
@@ -75,13 +74,13 @@ def _fitted(
     result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
 ) -> Array | None:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
-    model, seen = result.model, result.observations
-    weights = weights_for(seen, model.cell.tracker, "auto")
+    model, observed = result.model, result.observations
+    weights = weights_for(observed, model.cell.tracker, "auto")
     x = np.where(held, model.nominal, result.x)
     best: tuple[float, Array, Array] | None = None
     try:
         for _ in range(STEPS):
-            at = model.regressor(seen.table, x, columns, seen)
+            at = model.regressor(observed.table, x, columns, observed)
             error = weights.apply(at.residual)
             cost = float(error @ error)
             if best is not None and cost > (1 - SETTLED) * best[0]:
@@ -97,26 +96,26 @@ def _fitted(
     _, B, residual = best
     if not len(columns):
         return residual
-    found = held_out_residual(B, residual, weights, seen.configuration, seen.size)
+    found = held_out_residual(B, residual, weights, observed.configuration, observed.size)
     return found if np.isfinite(found).all() else None
 
 
 def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
-    seen = result.observations
-    squared = (residual.reshape(-1, seen.size)[:, :3] ** 2).sum(axis=1)
-    _, code = np.unique(seen.configuration, return_inverse=True)
+    observed = result.observations
+    squared = (residual.reshape(-1, observed.size)[:, :3] ** 2).sum(axis=1)
+    _, code = np.unique(observed.configuration, return_inverse=True)
     rms, ci95 = resampled_rms(np.bincount(code, squared), np.bincount(code), rng)
     return BudgetStep(name, rms, ci95)
 
 
 def _floor(result: Calibration) -> tuple[float | None, str]:
     """What repeats scatter, else what the stated noise gives."""
-    seen = result.observations
-    force = np.round(seen.table.force[seen.lead], 3)
-    key = np.column_stack([seen.configuration, seen.table.marker[seen.lead], force])
+    observed = result.observations
+    force = np.round(observed.table.force[observed.lead], 3)
+    key = np.column_stack([observed.configuration, observed.table.marker[observed.lead], force])
     _, code = np.unique(key, axis=0, return_inverse=True)
     code = code.ravel()
-    parts = result.residual.reshape(-1, seen.size)[:, :3]
+    parts = result.residual.reshape(-1, observed.size)[:, :3]
     dof = len(parts) - int(code.max()) - 1
     if dof >= FEWEST_REPEATS:
         count = np.bincount(code)

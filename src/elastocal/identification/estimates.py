@@ -5,32 +5,26 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
-from elastocal.identification.faulty_report import report_faulty
+from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution, warning_sentences
-from elastocal.identification.heldout import rms_3d
+from elastocal.identification.identifiability import residual_sigma
 from elastocal.identification.intervals import Intervals
-from elastocal.identification.methods import Found, is_exact
+from elastocal.identification.methods import MethodResult, is_exact
 from elastocal.identification.noise_summary import noise_of
-from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
-from elastocal.identification.result import (
-    Calibration,
-    Combination,
-    Estimate,
-    Outlier,
-)
-from elastocal.identification.solve import Solution, residual_sigma
-from elastocal.manipulator.model import Model
-
-Array = NDArray[np.float64]
+from elastocal.identification.outliers import Outlier
+from elastocal.identification.residuals import ResidualSummary, rms_3d, summarise_residuals
+from elastocal.identification.result import Calibration, Combination, Estimate
+from elastocal.identification.solve import Solution
+from elastocal.model.manipulator import Model
+from elastocal.units import Array
 
 CORRELATED = 0.9
 
 
 def summarise(
-    model: Model, whole: Solution, clean: Solution, found: Found, beyond: tuple[Outlier, ...]
+    model: Model, whole: Solution, clean: Solution, found: MethodResult, beyond: tuple[Outlier, ...]
 ) -> Calibration:
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
@@ -43,8 +37,8 @@ def summarise(
     sigma = residual_sigma(final, spent)
     estimates, combinations = _estimates(model, solution, found.intervals)
     determined = tuple(model.names[c] for c in kept)
-    seen = solution.problem.observations
-    set_apart = len(seen.lead) < len(whole.problem.observations.lead)
+    observed = solution.problem.observations
+    set_apart = len(observed.lead) < len(whole.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
     result = Calibration(
         model=model,
@@ -56,13 +50,13 @@ def summarise(
         determined=determined,
         covariance=covariance,
         correlations=_correlations(covariance, determined),
-        observations=seen,
+        observations=observed,
         residual=final.residual,
         held_out=solution.heldout,
         sigma=sigma,
         dof=len(final.whitened) - spent,
-        residual_rms=rms_3d(final.residual, seen.size),
-        heldout_rms=rms_3d(solution.heldout, seen.size),
+        residual_rms=rms_3d(final.residual, observed.size),
+        heldout_rms=rms_3d(solution.heldout, observed.size),
         nominal_rms=solution.nominal_rms,
         converged=final.converged,
         reason=final.reason,
@@ -87,7 +81,7 @@ def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSum
     """
     problem, fit = solution.problem, solution.fit
     if leverage is None and not problem.large:
-        R = fit.triangle.R[: len(fit.columns)]
+        R = fit.r_factor.R[: len(fit.columns)]
         Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
         leverage = np.minimum((Q**2).sum(axis=0), 1.0)
     return summarise_residuals(

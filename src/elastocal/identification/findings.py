@@ -14,16 +14,9 @@ import numpy as np
 from scipy import linalg, stats
 
 from elastocal.errors import option
-from elastocal.identification.outliers import blocks
-from elastocal.identification.residual_summary import ResidualSummary
-from elastocal.identification.result import (
-    Calibration,
-    Estimate,
-    Finding,
-    Number,
-    Outlier,
-    Severity,
-)
+from elastocal.identification.outliers import Outlier, blocks
+from elastocal.identification.residuals import ResidualSummary
+from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
 from elastocal.identification.solve import Solution
 
 STATED = (0.025, 0.975)  # quantiles of χ² between which the residual agrees with the stated noise
@@ -299,7 +292,7 @@ def of_solution(result: Calibration, solution: Solution) -> tuple[Finding, ...]:
 def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
     kept = solution.reduction.kept
     # Unit columns: what is judged is how far they are from parallel, not their units.
-    scaled = solution.fit.triangle.R
+    scaled = solution.fit.r_factor.R
     scaled = scaled / np.linalg.norm(scaled, axis=0)
     _, singular, Vt = linalg.svd(scaled[: len(kept)])
     if singular[0] <= ILL_CONDITIONED * singular[-1]:

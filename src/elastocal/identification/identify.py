@@ -7,24 +7,27 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.checks import check_rows, check_table, fixed_and_free
-from elastocal.identification.chunked import residual_at
 from elastocal.identification.estimates import summarise
 from elastocal.identification.findings import judged
-from elastocal.identification.heldout import rms_3d
+from elastocal.identification.identifiability import Problem
 from elastocal.identification.methods import is_exact, run_method
-from elastocal.identification.noise import Weights, scaled_by_component, weights_for
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
-from elastocal.identification.partition import partition
+from elastocal.identification.residuals import rms_3d
 from elastocal.identification.result import Calibration, TestErrors
-from elastocal.identification.solve import Problem, Progress, Solution, solve
-from elastocal.identification.start import start_values
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import Observations, observe, subset
+from elastocal.identification.solve import Solution, solve
+from elastocal.identification.start import check_rows, check_table, fixed_and_free, start_values
+from elastocal.identification.weighted_problem import (
+    Weights,
+    partition,
+    residual_at,
+    scaled_by_component,
+    weights_for,
+)
 from elastocal.measurements import Measurements
-
-Array = NDArray[np.float64]
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations, observe, subset
+from elastocal.units import Array, Progress
 
 __all__ = ["Options", "identify"]
 
@@ -49,22 +52,22 @@ def identify(
     check_table(model, table)
     if test is not None:
         check_rows(model, test)
-    seen = observe(table, model.observe)
+    observed = observe(table, model.observe)
     progress("finding the start")
     free = fixed_and_free(model, options.fixed)
     x0 = start_values(model, table, options.seed, free)
-    whole = _solution(model, seen, x0, free, options, progress)
+    whole = _solution(model, observed, x0, free, options, progress)
 
     def refit(good: NDArray[np.bool_], final: bool = False) -> Solution:
         chosen = options
         if options.covariance is not None:
-            rows = np.repeat(good, seen.size)
+            rows = np.repeat(good, observed.size)
             chosen = replace(options, covariance=options.covariance[np.ix_(rows, rows)])
         silent = progress if final else _silent
-        return _solution(model, subset(seen, good), x0, free, chosen, silent, final)
+        return _solution(model, subset(observed, good), x0, free, chosen, silent, final)
 
     progress("looking for faulty readings")
-    faulty, clean = np.zeros(len(seen.lead), dtype=bool), whole
+    faulty, clean = np.zeros(len(observed.lead), dtype=bool), whole
     if not is_exact(whole):
         faulty, clean = find_faulty(whole, refit)
     if 0 < faulty.mean() < 1:
@@ -84,7 +87,7 @@ def _silent(message: str) -> None:
 
 def _solution(
     model: Model,
-    seen: Observations,
+    observed: Observations,
     x0: Array,
     free: NDArray[np.int64],
     options: Options,
@@ -92,22 +95,22 @@ def _solution(
     try_wider: bool = True,
 ) -> Solution:
     kind = "none" if options.method == "ols" else options.weights
-    weights = weights_for(seen, model.cell.tracker, kind, options.covariance)
-    problem = Problem(model, seen, weights, x0, free, options.bounded)
+    weights = weights_for(observed, model.cell.tracker, kind, options.covariance)
+    problem = Problem(model, observed, weights, x0, free, options.bounded)
     solution = solve(problem, progress, try_wider)
-    if seen.kind == "pose" and weights.kind == "none" and kind == "auto":
+    if observed.kind == "pose" and weights.kind == "none" and kind == "auto":
         # Without stated noise, metres and radians get their relative weight from a first fit.
         parts = solution.fit.residual.reshape(-1, 6)
         sigma = np.repeat([parts[:, :3].std(), parts[:, 3:].std()], 3)
-        weights = scaled_by_component(seen, np.maximum(sigma, 1e-12))
+        weights = scaled_by_component(observed, np.maximum(sigma, 1e-12))
         solution = solve(replace(problem, weights=weights), progress, try_wider)
     return solution
 
 
 def _test_errors(model: Model, x: Array, table: Measurements) -> TestErrors:
-    seen = observe(table, model.observe)
-    parts = partition(seen, Weights("none", None, False, ""), len(model.parameters))
+    observed = observe(table, model.observe)
+    parts = partition(observed, Weights("none", None, False, ""), len(model.parameters))
     error = residual_at(model, parts, x)
-    length = np.linalg.norm(error.reshape(-1, seen.size)[:, :3], axis=1)
-    rms = rms_3d(error, seen.size)
+    length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
+    rms = rms_3d(error, observed.size)
     return TestErrors(rms, float(length.mean()), float(length.max()), len(length))

@@ -1,144 +1,541 @@
-"""The knowledge file: what is known of the parameters besides the readings (TOML)."""
+"""What is known of the parameters besides the readings: constraints, physics and priors."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import re
+import tomllib
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-from pydantic import Field
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
 
-from elastocal.config import Positive, Table, Text, checked, read_toml, required
 from elastocal.errors import InputError, require
-from elastocal.identification.constrained.constraints import (
-    Bounds,
-    Constraints,
-    LinearEquality,
-    SemidefiniteMatrix,
-)
-from elastocal.identification.constrained.physical import physical_constraints
-from elastocal.identification.constrained.prior import GaussianPrior
-from elastocal.manipulator.model import Model
-from elastocal.text import quoted
+from elastocal.model.arm import Parameter
+from elastocal.model.manipulator import Model
+from elastocal.text import did_you_mean, listed, quoted
+from elastocal.units import Array
 
-Terms = Annotated[dict[Text, float], Field(min_length=1)]
-FACTORS = (
-    "factors by parameter, with names in quotes, as in "
-    '{ "joint2.compliance" = 1.0, "joint3.compliance" = -1.0 }'
-)
+# Constraints as numbers: bounds, linear equalities and matrix inequalities on a vector.
 
-
-class PriorTable(Table):
-    mean: float = required("a finite number in SI units")
-    std: Positive = required("a positive number in SI units")
-
-
-class BoundsTable(Table):
-    parameter: Text = required('the name of a parameter, as in "joint2.compliance"')
-    lower: float | None = Field(None, description="a finite number in SI units; without one, none")
-    upper: float | None = Field(None, description="a finite number in SI units; without one, none")
-
-
-class EqualityTable(Table):
-    terms: Terms = required(FACTORS)
-    value: float = Field(0.0, description="a finite number in SI units")
-    label: str = Field("", description="a text")
-
-
-class SemidefiniteTable(Table):
-    entries: Annotated[list[list[str | float | dict[str, float]]], Field(min_length=1)] = Field(
-        description="rows of parameter names, numbers or factors by parameter, as in "
-        '[["a", "b"], ["b", "c"]]'
-    )
-    label: str = Field("", description="a text")
-
-
-class KnowledgeTable(Table):
-    physical: bool = Field(False, description="true or false")
-    prior: dict[Text, PriorTable] = Field(
-        default_factory=dict,
-        description='tables by parameter, as in [prior."joint2.compliance"]',
-    )
-    bounds: list[BoundsTable] = Field(default_factory=list, description="[[bounds]] tables")
-    equality: list[EqualityTable] = Field(default_factory=list, description="[[equality]] tables")
-    semidefinite: list[SemidefiniteTable] = Field(
-        default_factory=list, description="[[semidefinite]] tables"
-    )
+# A constraint may be missed by this fraction of the numbers in it: round-off only.
+ROUND_OFF = 1e-12
 
 
 @dataclass(frozen=True)
-class Knowledge:
-    """What is known of the parameters besides the readings, in SI units.
+class Matrix:
+    """M(x) = constant + Σ x_i slopes_i ⪰ 0; constant (n, n), slopes (p, n, n), all symmetric.
 
-    Attributes:
-        physical: Adds the constraints that physics puts on the model: no negative compliance.
-        constraints: Bounds, equalities and matrices.
-        prior: A Gaussian prior.
-        source: Where it was stated, for messages.
-
-    Examples:
-        >>> fit = ec.identify("cell.toml", "data.csv", knowledge=ec.Knowledge(physical=True))
-        >>> fit["joint3.compliance"].ci95[0] > 0
-        True
+    `balance` (n,) is d where the matrix stands for diag(d) M diag(d): a congruence changes no
+    sign of an eigenvalue, and brings rows of different units to one size.
     """
 
-    physical: bool = False
-    constraints: Constraints = field(default_factory=Constraints)
-    prior: GaussianPrior | None = None
-    source: str = "knowledge"
+    label: str
+    constant: Array
+    slopes: Array
+    balance: Array
 
-    def of(self, model: Model) -> tuple[Constraints, GaussianPrior | None]:
-        """Constraints and prior on the model's parameters.
+    def at(self, x: Array) -> Array:
+        """M(x) (n, n)."""
+        return self.constant + np.tensordot(x, self.slopes, axes=1)
 
-        Raises InputError where a name is no parameter of the model, or bounds exclude each other.
-        """
-        constraints = self.constraints
-        if self.physical:
-            constraints = physical_constraints(model) + constraints
-        try:
-            constraints.resolve(model.names)
-            if self.prior is not None:
-                self.prior.rows(model.names)
-        except InputError as error:
-            raise InputError(f"{self.source}: {error}") from None
-        return constraints, self.prior
+    def balanced(self) -> Matrix:
+        """The same inequality with diagonal entries that change by about 1 per unit of x."""
+        largest = np.abs(np.diagonal(self.slopes, axis1=1, axis2=2)).max(axis=0, initial=0.0)
+        d = 1 / np.sqrt(np.where(largest > 0, largest, 1.0))
+        both = np.outer(d, d)
+        return Matrix(self.label, self.constant * both, self.slopes * both, self.balance * d)
 
-
-def read_knowledge(path: str | Path) -> Knowledge:
-    """What a knowledge file states (docs: file formats); names are checked by `Knowledge.of`.
-
-    Raises InputError that names file, key, what the key takes and the nearest valid key.
-    """
-    path = Path(path)
-    table = checked(KnowledgeTable, read_toml(path, "knowledge file"), path)
-    try:
-        return Knowledge(table.physical, _constraints(table), _prior(table), str(path))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    def shortfall(self, x: Array) -> float:
+        """How far the smallest eigenvalue of M(x) lies below zero; 0 where M(x) ⪰ 0."""
+        return max(0.0, -float(np.linalg.eigvalsh(self.at(x))[0]))
 
 
-def _constraints(table: KnowledgeTable) -> Constraints:
-    bounds = []
-    for b in table.bounds:
-        require(
-            b.lower is not None or b.upper is not None,
-            f"the bounds of {quoted(b.parameter)} state neither lower nor upper; state one",
+@dataclass(frozen=True)
+class System:
+    """lower ≤ x ≤ upper, A x = b, and every matrix ⪰ 0, for x (p,) with `names`."""
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    A: Array
+    b: Array
+    equality_labels: tuple[str, ...]
+    matrices: tuple[Matrix, ...]
+
+    def moved(self, centre: Array, unit: Array) -> System:
+        """The same constraints on z, where x = centre + unit · z (unit positive)."""
+        matrices = tuple(
+            Matrix(m.label, m.at(centre), m.slopes * unit[:, None, None], m.balance).balanced()
+            for m in self.matrices
         )
-        lower = -math.inf if b.lower is None else b.lower
-        bounds.append(Bounds(b.parameter, lower, math.inf if b.upper is None else b.upper))
-    equalities = [LinearEquality(e.terms, e.value, e.label) for e in table.equality]
-    matrices = [
-        SemidefiniteMatrix(m.label or f"matrix {k}", tuple(tuple(row) for row in m.entries))
-        for k, m in enumerate(table.semidefinite, start=1)
-    ]
-    return Constraints(tuple(bounds), tuple(equalities), tuple(matrices))
+        return replace(
+            self,
+            lower=(self.lower - centre) / unit,
+            upper=(self.upper - centre) / unit,
+            A=self.A * unit,
+            b=self.b - self.A @ centre,
+            matrices=matrices,
+        )
+
+    def boxed(self, half_width: Array) -> System:
+        """With |x| ≤ half_width (p,) as well; what a step may do inside a trust region."""
+        lower, upper = np.maximum(self.lower, -half_width), np.minimum(self.upper, half_width)
+        return replace(self, lower=lower, upper=upper)
+
+    def with_value(self, index: int, value: float) -> System:
+        """With x[index] = value as a further equality, in place of its bounds."""
+        row = np.zeros(len(self.names))
+        row[index] = 1.0
+        lower, upper = self.lower.copy(), self.upper.copy()
+        lower[index], upper[index] = -np.inf, np.inf
+        return replace(
+            self,
+            lower=lower,
+            upper=upper,
+            A=np.vstack([self.A, row]),
+            b=np.append(self.b, value),
+            equality_labels=(*self.equality_labels, f"{self.names[index]} = {value:.6g}"),
+        )
+
+    def violation(self, x: Array) -> float:
+        """The largest amount by which x breaks a bound, an equality (unit rows) or a matrix."""
+        norms = np.linalg.norm(self.A, axis=1)
+        missed = np.abs(self.A @ x - self.b) / np.where(norms > 0, norms, 1.0)
+        parts = (self.lower - x, x - self.upper, missed, [m.shortfall(x) for m in self.matrices])
+        return float(max(0.0, *(np.max(part, initial=0.0) for part in parts)))
+
+    def distance(self, x: Array) -> float:
+        """A lower bound of the way |Δx| from x to where bounds and matrices hold."""
+        parts = [self.lower - x, x - self.upper]
+        # An eigenvalue of M changes by at most |Δx| √(Σ ‖slopes_i‖²).
+        parts += [np.array([m.shortfall(x) / np.linalg.norm(m.slopes)]) for m in self.matrices]
+        return float(max(0.0, *(np.max(part, initial=0.0) for part in parts)))
+
+    def restricted(self, columns: NDArray[np.int64], x: Array) -> System:
+        """The constraints on x[columns], all other parameters held at x (p,).
+
+        Raises InputError where the held values alone break a constraint.
+        """
+        held = np.setdiff1d(np.arange(len(self.names)), columns)
+        slack = ROUND_OFF * np.abs(x)
+        outside = (x < self.lower - slack) | (x > self.upper + slack)
+        for c in held[outside[held]]:
+            require(
+                False,
+                f"{self.names[c]} is held at {x[c]:.6g}, outside its bounds "
+                f"[{self.lower[c]:.6g}, {self.upper[c]:.6g}]; free it, move it or widen them",
+            )
+        b = self.b - self.A[:, held] @ x[held]
+        size = np.abs(self.A[:, held]) @ np.abs(x[held]) + np.abs(self.b)
+        free = (self.A[:, columns] != 0).any(axis=1)
+        for k in np.flatnonzero(~free):
+            require(
+                bool(abs(b[k]) <= ROUND_OFF * size[k]),
+                f"'{self.equality_labels[k]}' does not hold ({b[k]:+.3g} is missing), and every "
+                "parameter in it is held; free one of them or drop the equality",
+            )
+        rest = np.where(np.isin(np.arange(len(x)), held), x, 0.0)
+        matrices = []
+        for m in self.matrices:
+            constant, slopes = m.at(rest), m.slopes[columns]
+            if slopes.any():
+                matrices.append(replace(m, constant=constant, slopes=slopes))
+                continue
+            require(
+                m.shortfall(rest) <= ROUND_OFF * float(np.abs(constant).max(initial=0.0)),
+                f"'{m.label}' is not positive semidefinite, and every parameter in it is held; "
+                "free one of them or drop the matrix",
+            )
+        return System(
+            tuple(self.names[c] for c in columns),
+            self.lower[columns],
+            self.upper[columns],
+            self.A[np.ix_(free, columns)],
+            b[free],
+            tuple(s for s, keep in zip(self.equality_labels, free, strict=True) if keep),
+            tuple(matrices),
+        )
 
 
-def _prior(table: KnowledgeTable) -> GaussianPrior | None:
-    if not table.prior:
-        return None
-    stated = table.prior.values()
-    return GaussianPrior.independent(
-        tuple(table.prior), [p.mean for p in stated], [p.std for p in stated]
+# Constraints as people state them: by the names of parameters.
+
+# An entry of a matrix: a parameter, a linear combination of parameters, or a number.
+Entry = str | float | Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """lower ≤ x ≤ upper for one parameter, in its unit; equal bounds fix it."""
+
+    name: str
+    lower: float = -math.inf
+    upper: float = math.inf
+
+    def __post_init__(self) -> None:
+        require(
+            self.lower <= self.upper and self.lower < math.inf and self.upper > -math.inf,
+            f"the bounds of {quoted(self.name)} leave no value: "
+            f"found lower = {self.lower}, upper = {self.upper}",
+        )
+
+
+@dataclass(frozen=True)
+class LinearEquality:
+    """Σ coefficient · x = value over the named parameters: a symmetry, a known sum."""
+
+    terms: Mapping[str, float]
+    value: float = 0.0
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        numbers = [*self.terms.values(), self.value]
+        require(
+            bool(np.isfinite(numbers).all()) and any(self.terms.values()),
+            f"equality '{self}' needs finite numbers and at least one non-zero coefficient",
+        )
+
+    def __str__(self) -> str:
+        left = " + ".join(n if c == 1 else f"{c:g}·{n}" for n, c in self.terms.items())
+        return self.label or f"{left} = {self.value:.6g}".replace("+ -1·", "- ").replace(
+            "+ -", "- "
+        )
+
+
+@dataclass(frozen=True)
+class SemidefiniteMatrix:
+    """A symmetric matrix of parameters that is positive semidefinite: no load gains energy.
+
+    `entries` are its rows; an entry is a parameter's name, {name: coefficient, …}, or a number.
+    """
+
+    label: str
+    entries: tuple[tuple[Entry, ...], ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.entries)
+        require(
+            n > 0 and all(len(row) == n for row in self.entries),
+            f"matrix '{self.label}' is not square: rows of {[len(row) for row in self.entries]}",
+        )
+        cells = [[combination(entry) for entry in row] for row in self.entries]
+        numbers = [c for row in cells for cell in row for c in cell.values()]
+        require(
+            bool(np.isfinite(numbers).all())
+            and any(n for row in cells for cell in row for n in cell),
+            f"matrix '{self.label}' needs finite numbers and at least one parameter",
+        )
+        for i in range(n):
+            for j in range(i):
+                require(
+                    cells[i][j] == cells[j][i],
+                    f"matrix '{self.label}' is not symmetric: entry ({i + 1}, {j + 1}) is "
+                    f"{self.entries[i][j]!r}, entry ({j + 1}, {i + 1}) is {self.entries[j][i]!r}",
+                )
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Any number of each kind; `a + b` holds both."""
+
+    bounds: tuple[Bounds, ...] = ()
+    equalities: tuple[LinearEquality, ...] = ()
+    matrices: tuple[SemidefiniteMatrix, ...] = ()
+
+    def __add__(self, other: Constraints) -> Constraints:
+        return Constraints(
+            self.bounds + other.bounds,
+            self.equalities + other.equalities,
+            self.matrices + other.matrices,
+        )
+
+    def resolve(self, names: Sequence[str]) -> System:
+        """The constraints as numbers on the vector (p,) of these parameters.
+
+        Several bounds of one parameter all hold.  Raises InputError for a name that is not a
+        parameter, and where the bounds of one parameter exclude each other.
+        """
+        position = {name: i for i, name in enumerate(names)}
+        p = len(position)
+        lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
+        for bound in self.bounds:
+            i = _index(bound.name, position, "bounds")
+            lower[i], upper[i] = max(lower[i], bound.lower), min(upper[i], bound.upper)
+            require(
+                bool(lower[i] <= upper[i]),
+                f"the bounds of {bound.name} contradict each other: at least {lower[i]:.6g} and "
+                f"at most {upper[i]:.6g}; drop one of them",
+            )
+        rows, values, labels = [], [], []
+        for equality in self.equalities:
+            row, _ = _row(equality.terms, position, f"equality '{equality}'")
+            rows.append(row)
+            values.append(equality.value)
+            labels.append(str(equality))
+        # Equal bounds have no inside, which an inequality solver needs; they are an equality.
+        for i in np.flatnonzero(lower == upper).tolist():
+            rows.append(np.eye(p)[i])
+            values.append(lower[i])
+            labels.append(f"{names[i]} = {lower[i]:.6g}")
+            lower[i], upper[i] = -np.inf, np.inf
+        return System(
+            tuple(names),
+            lower,
+            upper,
+            np.array(rows).reshape(-1, p),
+            np.array(values, dtype=float),
+            tuple(labels),
+            tuple(_matrix(m, position) for m in self.matrices),
+        )
+
+
+def non_negative(*names: str) -> Constraints:
+    """x ≥ 0 for each of the named parameters."""
+    return Constraints(bounds=tuple(Bounds(name, lower=0.0) for name in names))
+
+
+def equal(first: str, *others: str) -> Constraints:
+    """All named parameters have one value: two drives of one type, a symmetric wrist."""
+    return Constraints(equalities=tuple(LinearEquality({first: 1.0, o: -1.0}) for o in others))
+
+
+def combination(entry: Entry) -> dict[str, float]:
+    """An entry as {name: coefficient}, its constant under the empty name; zeros left out."""
+    if isinstance(entry, str):
+        return {entry: 1.0}
+    terms = dict(entry) if isinstance(entry, Mapping) else {"": float(entry)}
+    return {name: float(c) for name, c in terms.items() if c}
+
+
+def _index(name: str, position: Mapping[str, int], where: str) -> int:
+    require(
+        name in position,
+        f"{where}: {quoted(name)} is not a parameter{did_you_mean(name, position)}; "
+        f"there are {listed(position)}",
     )
+    return position[name]
+
+
+def _row(
+    terms: Mapping[str, float], position: Mapping[str, int], where: str
+) -> tuple[Array, float]:
+    """Coefficients (p,) and the constant of a combination."""
+    row, constant = np.zeros(len(position)), 0.0
+    for name, coefficient in terms.items():
+        if name:
+            row[_index(name, position, where)] += coefficient
+        else:
+            constant += coefficient
+    return row, constant
+
+
+def _matrix(stated: SemidefiniteMatrix, position: Mapping[str, int]) -> Matrix:
+    n = len(stated.entries)
+    constant, slopes = np.zeros((n, n)), np.zeros((len(position), n, n))
+    for i, row in enumerate(stated.entries):
+        for j, entry in enumerate(row):
+            where = f"matrix '{stated.label}', entry ({i + 1}, {j + 1})"
+            slopes[:, i, j], constant[i, j] = _row(combination(entry), position, where)
+    return Matrix(stated.label, constant, slopes, np.ones(n))
+
+
+# What physics demands of the parameters of a model.
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+_ENDING = re.compile(r"(?P<stem>.+)_(?P<first>r?[xyz])(?P<second>r?[xyz])?")
+
+
+def physical_constraints(model: Model) -> Constraints:
+    """Passivity of the arm: bounds that effects state, and compliance matrices ⪰ 0.
+
+    A spring cannot give energy away, so a compliance matrix K, θ = K M, has xᵀKx ≥ 0.  Where an
+    effect has no coupling terms its matrix is diagonal, which is semidefinite exactly where its
+    entries are non-negative: bounds say that (`ParameterSpec.lower`), and are solved exactly.
+    """
+    return passivity(model.parameters)
+
+
+def passivity(parameters: Sequence[Parameter]) -> Constraints:
+    """Bounds, and a matrix for every family of parameters with coupling terms.
+
+    A family is `PLACE.STEM_x`, `PLACE.STEM_xy`, … of one effect: doubled axes (of x, y, z, rx,
+    ry, rz) are off the diagonal.  At a joint, z is its own axis: where the family has no `_z`,
+    the diagonal there is the drive's `PLACE.compliance`.  An entry that no parameter names is 0.
+    """
+    names = {p.name for p in parameters}
+    families: dict[tuple[str, str], dict[frozenset[str], str]] = defaultdict(dict)
+    for p in parameters:
+        ending = _ENDING.fullmatch(p.name.partition(".")[2])
+        if ending and "compliance" in ending["stem"]:
+            axes = frozenset({ending["first"], ending["second"] or ending["first"]})
+            families[p.where, ending["stem"]][axes] = p.name
+    matrices = []
+    for (where, stem), entries in families.items():
+        coupled = [axes for axes in entries if len(axes) == 2]
+        if not coupled:
+            continue
+        drive = f"{where}.compliance"
+        if drive in names and any("z" in axes for axes in coupled):
+            entries.setdefault(frozenset({"z"}), drive)
+        used = [a for a in AXES if any(a in axes for axes in entries)]
+        for axes in coupled:
+            missing = [a for a in sorted(axes) if frozenset({a}) not in entries]
+            require(
+                not missing,
+                f"{entries[axes]} couples an axis that has no compliance of its own: "
+                f"{where}.{stem}_{''.join(missing[:1])} is not a parameter; add it to the effect",
+            )
+        matrices.append(_inertia_matrix(f"{where}.{stem}", used, entries))
+    # A semidefinite matrix has a non-negative diagonal; saying it twice only blurs multipliers.
+    implied = {str(m.entries[i][i]) for m in matrices for i in range(len(m.entries))}
+    bounds = tuple(
+        Bounds(p.name, p.lower, p.upper)
+        for p in parameters
+        if (np.isfinite(p.lower) and not (p.lower == 0 and p.name in implied))
+        or np.isfinite(p.upper)
+    )
+    return Constraints(bounds=bounds, matrices=tuple(matrices))
+
+
+def _inertia_matrix(
+    label: str, axes: list[str], entries: dict[frozenset[str], str]
+) -> SemidefiniteMatrix:
+    n = len(axes)
+    cells: list[list[Entry]] = [[0.0] * n for _ in range(n)]
+    for i, a in enumerate(axes):
+        cells[i][i] = entries.get(frozenset({a}), 0.0)
+    for (i, a), (j, b) in combinations(enumerate(axes), 2):
+        cells[i][j] = cells[j][i] = entries.get(frozenset({a, b}), 0.0)
+    return SemidefiniteMatrix(label, tuple(tuple(row) for row in cells))
+
+
+# Prior knowledge of parameters: data sheets, an earlier calibration, a sister robot.
+
+KEYS = ("mean", "std")
+
+
+@dataclass(frozen=True)
+class GaussianPrior:
+    """x[names] ~ N(mean, covariance): mean (k,) and covariance (k, k) in the parameters' units.
+
+    Raises InputError where the numbers are not finite or the covariance not positive definite.
+    """
+
+    names: tuple[str, ...]
+    mean: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        k = len(self.names)
+        require(len(set(self.names)) == k, f"the prior names a parameter twice: {self.names}")
+        require(
+            self.mean.shape == (k,) and self.covariance.shape == (k, k),
+            f"a prior of {k} parameters needs {k} means and a {k} × {k} covariance; found shapes "
+            f"{self.mean.shape} and {self.covariance.shape}",
+        )
+        finite = np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()
+        require(bool(finite), "the prior's means and covariance must be finite")
+        self._root()
+
+    @classmethod
+    def independent(
+        cls, names: Sequence[str], mean: Sequence[float] | Array, std: Sequence[float] | Array
+    ) -> GaussianPrior:
+        """x_i ~ N(mean_i, std_i²), independent of each other."""
+        spread = np.asarray(std, dtype=float)
+        for name, value in zip(names, spread, strict=True):
+            require(
+                bool(np.isfinite(value) and value > 0),
+                f"prior of {quoted(name)}: std must be positive and finite, found {value}",
+            )
+        return cls(tuple(names), np.asarray(mean, dtype=float), np.diag(spread**2))
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> GaussianPrior:
+        """From {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}, …}, in SI units."""
+        require(bool(table), "the prior is empty; name at least one parameter")
+        means: list[float] = []
+        stds: list[float] = []
+        for name, entry in table.items():
+            where = f"prior of {quoted(name)}"
+            require(
+                isinstance(entry, Mapping),
+                f"{where}: expected {{ mean = …, std = … }}, found {quoted(entry)}",
+            )
+            nested = [f'"{name}.{key}"' for key in entry if isinstance(entry[key], Mapping)]
+            require(not nested, f"{where}: write the full name in quotes: {listed(nested)}")
+            for key in entry:
+                require(key in KEYS, f"{where}: unknown key {quoted(key)}{did_you_mean(key, KEYS)}")
+            for key, target in (("mean", means), ("std", stds)):
+                require(key in entry, f"{where}: '{key}' is missing")
+                value = entry[key]
+                require(
+                    isinstance(value, int | float) and not isinstance(value, bool),
+                    f"{where}: '{key}' must be a number, found {quoted(value)}",
+                )
+                target.append(float(value))
+        return cls.independent(tuple(table), means, stds)
+
+    @classmethod
+    def from_toml(cls, path: Path) -> GaussianPrior:
+        """From a file of lines `"joint2.compliance" = { mean = 2.9e-7, std = 3e-8 }`."""
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(f"{path}: cannot read the prior ({error.strerror})") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: not a TOML file: {error}") from None
+        try:
+            return cls.from_dict(table)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    def rows(self, names: Sequence[str]) -> tuple[Array, Array]:
+        """P (k, p) and target (k,) with |target − P x|² = (x − mean)ᵀ covariance⁻¹ (x − mean).
+
+        Raises InputError for a name that is not among the parameters `names` (p,).
+        """
+        position = {name: i for i, name in enumerate(names)}
+        for name in self.names:
+            require(
+                name in position,
+                f"the prior names {quoted(name)}, which is not a parameter"
+                f"{did_you_mean(name, position)}; there are {listed(position)}",
+            )
+        root = self._root()
+        P = np.zeros((len(self.names), len(position)))
+        P[:, [position[name] for name in self.names]] = root
+        return P, root @ self.mean
+
+    def _root(self) -> Array:
+        """L⁻¹ of the Cholesky factor; by standardised parameters, whose units are alike."""
+        std = np.sqrt(np.abs(np.diag(self.covariance)))
+        try:
+            require(bool((std > 0).all()), "")
+            L = linalg.cholesky(self.covariance / np.outer(std, std), lower=True)
+        except (linalg.LinAlgError, InputError):
+            raise InputError(
+                "the prior's covariance is not positive definite; leave out parameters that are "
+                "known exactly (fix them) or that repeat another one"
+            ) from None
+        return linalg.solve_triangular(L, np.diag(1 / std), lower=True)
+
+
+def share_of_prior(cofactor: Array, P: Array) -> Array:
+    """Share (p,) of each estimate's information that the prior gave, 0 to 1.
+
+    With V = (H_data + H_prior)⁻¹ (on the active face), V = V H_data V + V H_prior V: the posterior
+    variance splits into what the noise and what the prior's uncertainty pass on, and the share is
+    (V H_prior V)_ii / V_ii; for a single parameter τ⁻²/(τ⁻² + σ⁻²).  NaN where V_ii = 0: a value
+    that the constraints fix.
+    """
+    passed = ((P @ cofactor) ** 2).sum(axis=0)
+    variance = np.diag(cofactor)
+    share = np.full(len(variance), np.nan)
+    return np.divide(passed, variance, out=share, where=variance > 0)

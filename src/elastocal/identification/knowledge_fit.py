@@ -9,24 +9,26 @@ from numpy.typing import NDArray
 from scipy import sparse, stats
 
 from elastocal.errors import InputError, option
-from elastocal.identification.constrained.constraints import Constraints
-from elastocal.identification.constrained.minimise import ActiveConstraint
-from elastocal.identification.constrained.nonlinear import ConstrainedFit, constrained_fit
-from elastocal.identification.constrained.objective import Loss, loss_of
-from elastocal.identification.fit import Fit, FitProblem
-from elastocal.identification.heldout import held_out_residual
+from elastocal.identification.constrained import (
+    ActiveConstraint,
+    ConstrainedFit,
+    constrained_fit,
+    fitted_columns,
+    own_bounds,
+)
+from elastocal.identification.constrained_intervals import LinearisedFit, intervals_with_knowledge
+from elastocal.identification.constrained_solver import ResidualLoss, loss_of
+from elastocal.identification.identifiability import Reduction, residual_sigma
 from elastocal.identification.intervals import Intervals
-from elastocal.identification.knowledge_columns import fitted_columns, own_bounds
-from elastocal.identification.knowledge_intervals import intervals_with_knowledge
-from elastocal.identification.knowledge_local import Local
+from elastocal.identification.knowledge import Constraints
+from elastocal.identification.least_squares import Fit, FitProblem
 from elastocal.identification.options import Options
-from elastocal.identification.reduction import Reduction
-from elastocal.identification.robust.scale import median_scale
-from elastocal.identification.solve import Progress, Solution, residual_sigma
-from elastocal.identification.triangle import Triangle
+from elastocal.identification.residuals import held_out_residual
+from elastocal.identification.robust_core import median_scale
+from elastocal.identification.solve import Solution
+from elastocal.identification.weighted_problem import RFactor
 from elastocal.text import listed
-
-Array = NDArray[np.float64]
+from elastocal.units import Array, Progress
 
 ROUNDING = 1e-9  # factors below this share of a typical size are no combination
 CONTRADICTED = 0.001  # false-alarm rate of a sentence that doubts what the user knows
@@ -78,8 +80,8 @@ def fit_with_knowledge(
     posed = replace(problem, bounded=False).fit_of(columns, solution.fit.x, solution.sizes)
     progress("fitting under constraints" if prior is None else "fitting with the prior")
     found = constrained_fit(posed, constraints, prior=prior, loss=name, sigma=sigma)  # type: ignore[arg-type]
-    loss: Loss = loss_of(name, size, sigma)  # type: ignore[arg-type]
-    local = Local.at(posed, found, constraints, prior, loss, sigma)
+    loss: ResidualLoss = loss_of(name, size, sigma)  # type: ignore[arg-type]
+    local = LinearisedFit.at(posed, found, constraints, prior, loss, sigma)
     progress("intervals under constraints" if prior is None else "intervals with the prior")
     intervals = intervals_with_knowledge(
         posed, found, local, constraints, prior, _dof(solution, before, columns),
@@ -109,7 +111,7 @@ def _noise(solution: Solution, loss: str, size: int) -> float:
 
 
 def _contradiction(
-    solution: Solution, before: Intervals, found: ConstrainedFit, local: Local
+    solution: Solution, before: Intervals, found: ConstrainedFit, local: LinearisedFit
 ) -> tuple[str, ...]:
     """A sentence where the objective grew by more than noise explains (F-test), for squares.
 
@@ -141,7 +143,7 @@ def _dof(solution: Solution, before: Intervals, columns: NDArray[np.int64]) -> A
     return np.array([known.get(c, fewest) for c in columns.tolist()])
 
 
-def _as_fit(problem: FitProblem, found: ConstrainedFit, local: Local) -> Fit:
+def _as_fit(problem: FitProblem, found: ConstrainedFit, local: LinearisedFit) -> Fit:
     """As the fit of a method; its triangle has prior and equalities as further rows.
 
     Without them a parameter that no reading shows would leave it singular; equalities weigh as
@@ -151,20 +153,20 @@ def _as_fit(problem: FitProblem, found: ConstrainedFit, local: Local) -> Fit:
     rows = np.vstack([local.B, local.P, A / np.linalg.norm(A, axis=1)[:, None] / local.unit])
     rest = np.concatenate([local.e, local.lack, np.zeros(len(A))])
     return Fit(
-        found.x, found.residual, found.whitened, Triangle.of(rows, rest), found.converged,
+        found.x, found.residual, found.whitened, RFactor.of(rows, rest), found.converged,
         found.reason, found.steps, replace(problem, x=found.x),
     )  # fmt: skip
 
 
-def _reduction(solution: Solution, found: ConstrainedFit, local: Local) -> Reduction:
+def _reduction(solution: Solution, found: ConstrainedFit, local: LinearisedFit) -> Reduction:
     """What is fitted, what is held, and how a held parameter's error would move the estimates.
 
     A parameter that an active constraint holds back does not move: it stands for itself.
     """
     before, problem = solution.reduction, solution.problem
-    seen, columns = problem.observations, found.columns
+    observed, columns = problem.observations, found.columns
     dropped = np.setdiff1d(before.dropped, columns)
-    at = problem.model.regressor(seen.table, found.x, dropped, seen)
+    at = problem.model.regressor(observed.table, found.x, dropped, observed)
     K = local.loss.root(problem.weights.apply(at.B), local.e)
     mixing = local.on_face @ (local.K.T @ K)
     share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
@@ -172,18 +174,18 @@ def _reduction(solution: Solution, found: ConstrainedFit, local: Local) -> Reduc
     return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))
 
 
-def _held_out(solution: Solution, found: ConstrainedFit, local: Local) -> Array:
+def _held_out(solution: Solution, found: ConstrainedFit, local: LinearisedFit) -> Array:
     """Residual (rows,) of each configuration under a fit to the others and the prior.
 
     Linearised, with the active constraints kept active and Huber's weights as they are.
     """
     if not local.face.shape[1]:
         return found.residual
-    seen, weights = solution.problem.observations, solution.problem.weights
+    observed, weights = solution.problem.observations, solution.problem.weights
     # The prior's rows go with no configuration, so that they are never left out.
-    more = -len(local.P) % seen.size
+    more = -len(local.P) % observed.size
     P = np.vstack([local.P, np.zeros((more, len(local.x)))])
-    own = seen.configuration.max() + 1 + np.arange(len(P) // seen.size)
+    own = observed.configuration.max() + 1 + np.arange(len(P) // observed.size)
     whiten = sparse.diags_array(np.sqrt(local.loss.weights(local.e)))
     if weights.whiten is not None:
         whiten = whiten @ weights.whiten
@@ -192,7 +194,7 @@ def _held_out(solution: Solution, found: ConstrainedFit, local: Local) -> Array:
         np.vstack([found.B, P]) @ local.face,
         np.concatenate([found.residual, local.lack, np.zeros(more)]),
         replace(weights, whiten=sparse.csr_array(both)),
-        np.concatenate([seen.configuration, own]),
-        seen.size,
+        np.concatenate([observed.configuration, own]),
+        observed.size,
     )
     return held[: len(found.residual)]

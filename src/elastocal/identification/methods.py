@@ -2,28 +2,124 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from elastocal.errors import InputError
 from elastocal.identification import published
-from elastocal.identification.adaptive import Refit, adapt, adapt_all, refined
-from elastocal.identification.constrained.minimise import ActiveConstraint
-from elastocal.identification.covariance.estimate import Covariance
-from elastocal.identification.heldout import held_out_residual, rms_3d
+from elastocal.identification.constrained import ActiveConstraint
+from elastocal.identification.covariance import Covariance
+from elastocal.identification.identifiability import Problem, fit_kept, held_at_bounds, heldout_of
 from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
 from elastocal.identification.knowledge_fit import fit_with_knowledge
-from elastocal.identification.noise import Weights
+from elastocal.identification.noise_choice import (
+    NoiseFit,
+    estimate_noise,
+    linearised,
+    screen,
+    settle,
+    weights_of,
+)
 from elastocal.identification.options import ROBUST, Options
-from elastocal.identification.robust.nonlinear import robust_fit
-from elastocal.identification.solve import Progress, Solution
-from elastocal.identification.variance.choose import NoiseFit
+from elastocal.identification.residuals import held_out_residual, rms_3d
+from elastocal.identification.robust import robust_fit
+from elastocal.identification.solve import Solution
+from elastocal.identification.weighted_problem import Weights
+from elastocal.model.observations import subset
+from elastocal.units import Array, BoolArray, Progress
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+# The default method: noise estimated from the residuals, faulty readings judged by that noise.
+
+Refit = Callable[[BoolArray, bool], Solution]  # of these observations, with wider sets tried
+
+ROUNDS = 6
+RESTARTS = 3
+SETTLED = 0.01  # of a standard deviation: what relinearising may still move an estimate by
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """The fit to the `good` observations (N,) under the noise found from them."""
+
+    solution: Solution
+    noise: NoiseFit
+    good: BoolArray
+
+
+def adapt(
+    whole: Solution, clean: Solution, faulty: BoolArray, refit: Refit, kind: str, progress: Progress
+) -> Adapted:
+    """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
+
+    `whole` holds all observations, `clean` the fit to those that are not `faulty` (N,) at equal or
+    stated weights.  At its values readings are screened, noise model and faulty readings settled
+    (variance.search) and the kept parameters fitted anew with the weights found, until neither
+    changes.  Where other readings turn out good than `clean` was fitted to, its parameters are
+    chosen again for these.
+    """
+    start, good = clean, ~faulty
+    for _ in range(RESTARTS):
+        found = _settled(whole, start, good, kind, progress)
+        if np.array_equal(found.good, good):
+            break
+        good = found.good
+        start = whole if good.all() else refit(good, True)
+    return found
+
+
+def adapt_all(whole: Solution, kind: str, progress: Progress) -> Adapted:
+    """As `adapt`, with all observations, whatever they are."""
+    return _settled(whole, whole, None, kind, progress)
+
+
+def _settled(
+    whole: Solution, start: Solution, good: BoolArray | None, kind: str, progress: Progress
+) -> Adapted:
+    problem, kept = whole.problem, start.reduction.kept
+    model, observed = problem.model, problem.observations
+    solution, every = start, np.ones(len(observed.lead), dtype=bool)
+    readings = linearised(model, observed, start.fit.x, kept)
+    now = every if good is None else screen(readings, readings.e, good)
+    for _ in range(ROUNDS):
+        before = now
+        if good is None:
+            noise = estimate_noise(readings, kind)
+        else:
+            verdict = settle(readings, kind, now)
+            noise, now = verdict.noise, verdict.good
+        progress(f"fitting with the noise found ({noise.kind})")
+        expected = solution.fit.x[kept] + noise.x
+        solution = refined(whole, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
+        readings = linearised(model, observed, solution.fit.x, kept)
+        moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
+        if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
+            break
+    # One that ended at a bound is held there and no longer a column.
+    fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
+    final = estimate_noise(fitted, noise.kind, noise)
+    final = replace(final, trials=noise.trials, reason=noise.reason)
+    return Adapted(solution, final, now)
+
+
+def refined(
+    whole: Solution, start: Solution, x: Array, good: BoolArray, weights: Weights
+) -> Solution:
+    """The kept parameters of `start` fitted from x to the good observations with other weights."""
+    observed = whole.problem.observations
+    chosen = observed if good.all() else subset(observed, good)
+    problem: Problem = replace(start.problem, observations=chosen, weights=weights)
+    found = fit_kept(problem, start.sizes, x, start.reduction)
+    reduction = start.reduction
+    if problem.bounded:
+        found, reduction = held_at_bounds(problem, start.sizes, found, reduction)
+    heldout = heldout_of(problem, found)
+    return replace(start, problem=problem, fit=found, reduction=reduction, heldout=heldout)
+
+
+# The methods: from a first fit to the final one, its noise and its intervals.
 
 # A larger share of readings beyond the noise is no accident of measuring: an effect that the model
 # lacks looks like that.  Setting them apart would hide it.
@@ -37,7 +133,7 @@ COMPUTED = (
 
 
 @dataclass(frozen=True)
-class Found:
+class MethodResult:
     """The final fit, its intervals, and the noise where it was estimated.
 
     Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
@@ -51,7 +147,7 @@ class Found:
     solution: Solution
     intervals: Intervals
     noise: NoiseFit | None
-    good: Mask
+    good: BoolArray
     active: tuple[ActiveConstraint, ...] = ()
     prior_share: dict[str, float] = field(default_factory=dict)
     effective: int | None = None
@@ -62,11 +158,11 @@ class Found:
 def run_method(
     whole: Solution,
     clean: Solution,
-    faulty: Mask,
+    faulty: BoolArray,
     refit: Refit,
     options: Options,
     progress: Progress,
-) -> Found:
+) -> MethodResult:
     """Carry out `options.method` from the fit to all observations and that to the good ones.
 
     `clean` is the fit to the observations that are not `faulty` (N,), `refit` makes another such.
@@ -77,7 +173,7 @@ def run_method(
     alone = replace(options, constraints=None, prior=None, intervals="auto")
     found = _by_readings(whole, clean, faulty, refit, alone, progress)
     known = fit_with_knowledge(found.solution, found.intervals, options, progress)
-    return Found(
+    return MethodResult(
         "constrained", known.solution, known.intervals, found.noise, found.good,
         known.active, known.prior_share, known.effective, known.leverage, known.warnings,
     )  # fmt: skip
@@ -86,11 +182,11 @@ def run_method(
 def _by_readings(
     whole: Solution,
     clean: Solution,
-    faulty: Mask,
+    faulty: BoolArray,
     refit: Refit,
     options: Options,
     progress: Progress,
-) -> Found:
+) -> MethodResult:
     """What the method makes of the readings alone."""
     method = options.resolved
     exact = is_exact(clean)
@@ -106,7 +202,7 @@ def _by_readings(
     kind = "ols" if solution.problem.weights.kind == "none" else "wls"
     intervals = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
     warnings = (COMPUTED,) if exact else ()
-    return Found(kind, solution, intervals, None, good, warnings=warnings)
+    return MethodResult(kind, solution, intervals, None, good, warnings=warnings)
 
 
 def is_exact(solution: Solution) -> bool:
@@ -114,7 +210,7 @@ def is_exact(solution: Solution) -> bool:
     return rms_3d(solution.fit.residual, solution.problem.observations.size) < EXACT
 
 
-def _set_aside(faulty: Mask, options: Options) -> bool:
+def _set_aside(faulty: BoolArray, options: Options) -> bool:
     if options.faulty == "auto":
         return bool(0 < faulty.mean() <= MOST_SET_ASIDE)
     return options.faulty == "drop" and bool(faulty.any())
@@ -123,48 +219,57 @@ def _set_aside(faulty: Mask, options: Options) -> bool:
 def _reml(
     whole: Solution,
     clean: Solution,
-    faulty: Mask,
+    faulty: BoolArray,
     refit: Refit,
     options: Options,
     progress: Progress,
-) -> Found:
+) -> MethodResult:
     found = adapt(whole, clean, faulty, refit, options.noise, progress)
     if not found.good.all() and not _set_aside(~found.good, options):
         found = replace(adapt_all(whole, options.noise, progress), good=found.good)
     intervals = intervals_of(
         found.solution, options.intervals, found.noise, options.seed, options.jobs
     )
-    return Found("reml", found.solution, intervals, found.noise, found.good)
+    return MethodResult("reml", found.solution, intervals, found.noise, found.good)
 
 
 def _published(
-    method: str, whole: Solution, start: Solution, good: Mask, options: Options, progress: Progress
-) -> Found:
+    method: str,
+    whole: Solution,
+    start: Solution,
+    good: BoolArray,
+    options: Options,
+    progress: Progress,
+) -> MethodResult:
     """Eq. (14) on the linearised model, and a fit of the exact one with the weights it ends at."""
     progress("iterating the weights of eq. (14)")
-    seen, fit = start.problem.observations, start.fit
+    observed, fit = start.problem.observations, start.fit
     group = None
     if method == "eq14":
-        key = seen.configuration[:, None] * seen.size + np.arange(seen.size)
+        key = observed.configuration[:, None] * observed.size + np.arange(observed.size)
         group = np.unique(key.ravel(), return_inverse=True)[1].ravel()
     size = start.sizes[fit.columns]
     last = published.eq14(fit.B * size, fit.residual, group)[-1]
     text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
     weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)
-    kept = good if len(seen.lead) < len(good) else np.ones_like(good)
+    kept = good if len(observed.lead) < len(good) else np.ones_like(good)
     solution = refined(whole, start, start.fit.x, kept, weights)
     if options.intervals != "auto":
         own = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
-        return Found(method, solution, own, None, good)
+        return MethodResult(method, solution, own, None, good)
     covariance = Covariance(
         "eq13", last.covariance * np.outer(size, size), np.full(len(size), np.inf),
         "as published, eq. (13) with the σ of eq. (14): not corrected for estimated weights",
     )  # fmt: skip
     x = solution.fit.x[fit.columns]
-    return Found(method, solution, Intervals(covariance, covariance.interval(x, LEVEL)), None, good)
+    return MethodResult(
+        method, solution, Intervals(covariance, covariance.interval(x, LEVEL)), None, good
+    )
 
 
-def _robust(method: str, clean: Solution, whole: Solution, good: Mask, options: Options) -> Found:
+def _robust(
+    method: str, clean: Solution, whole: Solution, good: BoolArray, options: Options
+) -> MethodResult:
     """A robust fit of all readings in the parameters that the good ones determine."""
     if whole.problem.bounded or whole.problem.large:
         raise InputError(
@@ -177,10 +282,10 @@ def _robust(method: str, clean: Solution, whole: Solution, good: Mask, options: 
             "'cr3' where readings of a configuration depend on each other"
         )
     problem, kept = whole.problem, clean.reduction.kept
-    seen = problem.observations
+    observed = problem.observations
     found = robust_fit(problem.fit_of(kept, clean.fit.x, clean.sizes), method, None, options.seed)  # type: ignore[arg-type]
     clustered = options.intervals == "cr3"
-    covariance = found.clustered(seen.configuration) if clustered else found.covariance()
+    covariance = found.clustered(observed.configuration) if clustered else found.covariance()
     fit = replace(
         clean.fit, x=found.x, residual=found.residual, whitened=found.whitened,
         converged=found.converged, steps=found.steps,
@@ -188,7 +293,7 @@ def _robust(method: str, clean: Solution, whole: Solution, good: Mask, options: 
         reason=clean.fit.reason if found.converged else "the robust steps did not settle",
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
-    share = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), seen.size))
+    share = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), observed.size))
     whiten = sparse.csr_array(sparse.diags_array(share))
     if problem.weights.whiten is not None:
         whiten = sparse.csr_array(whiten @ problem.weights.whiten)
@@ -196,12 +301,12 @@ def _robust(method: str, clean: Solution, whole: Solution, good: Mask, options: 
         fit.B,
         found.residual,
         replace(problem.weights, whiten=whiten),
-        seen.configuration,
-        seen.size,
+        observed.configuration,
+        observed.size,
     )
     solution = replace(
         clean, problem=replace(problem, x0=clean.problem.x0), fit=fit, heldout=heldout
     )
     x = found.x[kept]
     intervals = Intervals(covariance, covariance.interval(x, LEVEL))
-    return Found(method, solution, intervals, None, good)
+    return MethodResult(method, solution, intervals, None, good)

@@ -1,4 +1,4 @@
-"""The noise of a result: which model, its size, why, and whether repeats agree."""
+"""What a result says of the noise: which model, its size, why, whether repeats agree."""
 
 from __future__ import annotations
 
@@ -7,18 +7,61 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy import stats
 
 from elastocal.errors import InputError
-from elastocal.identification.lack_of_fit import LackOfFit, lack_of_fit
-from elastocal.identification.methods import Found
-from elastocal.identification.noise import Weights, block_diagonal, weights_for, whitener
-from elastocal.identification.variance.choose import SHARED, NoiseFit, Trial
-from elastocal.identification.variance.judge import own_noise
-from elastocal.identification.weighting import linearised
+from elastocal.identification.methods import MethodResult
+from elastocal.identification.noise_choice import NoiseFit, Trial, linearised, own_noise
+from elastocal.identification.noise_structure import SHARED
+from elastocal.identification.weighted_problem import Weights, block_diagonal, weights_for, whitener
 from elastocal.measurements import Measurements
+from elastocal.model.observations import Observations
+from elastocal.units import Array
 
-Array = NDArray[np.float64]
+# Lack of fit: do configurations scatter more than repeats of one configuration?
+
+
+@dataclass(frozen=True)
+class LackOfFit:
+    """F = (SS_between / dof_between) / (SS_pure / dof_pure), its p-value, and both dofs."""
+
+    F: float
+    p: float
+    dof_between: int
+    dof_pure: int
+
+
+def lack_of_fit(observed: Observations, whitened: Array, n_parameters: int) -> LackOfFit | None:
+    """F-test of the residual between configurations against pure error from repeats.
+
+    Repeats are observations of the same configuration, marker and force.  Within them the
+    whitened residual (rows,) scatters by pure error, SS_pure with Σ (repeats − 1) · size degrees
+    of freedom; what is left of the residual sum of squares lies between them (Draper and Smith
+    1998, section 2.1).  None where nothing is repeated, or no degree of freedom is left.
+    """
+    table, size = observed.table, observed.size
+    key = np.column_stack(
+        [table.configuration, table.marker, np.round(table.force, 6)],
+    )[observed.lead]
+    _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    group = group.ravel()
+    dof_pure = int((count - 1).sum()) * size
+    dof_between = len(whitened) - n_parameters - dof_pure
+    if dof_pure < 1 or dof_between < 1:
+        return None
+    residual = whitened.reshape(-1, size)
+    mean = np.zeros((len(count), size))
+    np.add.at(mean, group, residual)
+    mean /= count[:, None]
+    pure = float(((residual - mean[group]) ** 2).sum())
+    between = max(float((residual**2).sum()) - pure, 0.0)
+    if pure <= 0:
+        return None
+    F = (between / dof_between) / (pure / dof_pure)
+    return LackOfFit(F, float(stats.f.sf(F, dof_between, dof_pure)), dof_between, dof_pure)
+
+
+# The noise of a result: which model, its size, why, and whether repeats agree.
 
 NUMBERED = re.compile(r"^(marker|configuration) (\d+)")
 COMMON = "common to each"
@@ -109,7 +152,7 @@ def _um(metres: float | None) -> float | None:
     return None if metres is None else metres * 1e6
 
 
-def noise_of(found: Found, sigma: float) -> Noise:
+def noise_of(found: MethodResult, sigma: float) -> Noise:
     """The noise behind what was `found`; `sigma` is the standard deviation of a whitened row."""
     weights, covariance = found.solution.problem.weights, found.intervals.covariance
     noise = Noise(
@@ -157,7 +200,7 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
     )
 
 
-def _ratio_to_stated(found: Found, sigma: float) -> float | None:
+def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
     """Root mean square of the residual in units of the stated noise, per degree of freedom."""
     solution = found.solution
     if found.method == "wls" and solution.problem.weights.absolute:
@@ -172,7 +215,7 @@ def _ratio_to_stated(found: Found, sigma: float) -> float | None:
     return float(np.sqrt(e @ e / max(len(e) - len(solution.fit.columns), 1)))
 
 
-def _lack_of_fit(found: Found) -> LackOfFit | None:
+def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
     """Repeats against configurations, each reading weighted by its own noise alone."""
     solution = found.solution
     problem, fit = solution.problem, solution.fit

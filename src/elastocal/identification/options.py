@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError, option
-from elastocal.identification.constrained.constraints import Constraints
-from elastocal.identification.constrained.prior import GaussianPrior
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.intervals import IntervalKind
-from elastocal.identification.noise import WeightKind
-from elastocal.identification.variance.structure import noise_models
+from elastocal.identification.knowledge import Constraints, GaussianPrior
+from elastocal.identification.noise_structure import noise_models
+from elastocal.identification.weighted_problem import WeightKind
 from elastocal.text import did_you_mean, quoted
 
 Method = Literal[

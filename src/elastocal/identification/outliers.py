@@ -1,30 +1,310 @@
-"""Readings that the noise does not explain: found by the fit of the majority."""
+"""Readings that the noise does not explain: found by the fit of the majority, judged in turns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.chunked import evaluate, residual_at
-from elastocal.identification.judgement import Visit, judge, verdict
-from elastocal.identification.outlier import FALSE_ALARM, Outlier, blocks
-from elastocal.identification.partition import part_of, sample
-from elastocal.identification.selection import WORTH_A_COLUMN, choose
+from elastocal.identification.identifiability import WORTH_A_COLUMN, choose
 from elastocal.identification.solve import SAMPLE, Solution, is_placed, settle
-from elastocal.identification.triangle import Triangle
-from elastocal.identification.trimmed import majority, median_scale
+from elastocal.identification.weighted_problem import (
+    Part,
+    RFactor,
+    each,
+    evaluate,
+    merge,
+    part_of,
+    regressor,
+    residual_at,
+    sample,
+)
+from elastocal.units import Array, BoolArray
 
-__all__ = ["FALSE_ALARM", "blocks", "describe", "find_faulty"]
+# A reading beyond the noise, and runs of such readings.
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
 
 
-def find_faulty(solution: Solution, refit: Callable[[Mask], Solution]) -> tuple[Mask, Solution]:
+@dataclass(frozen=True)
+class Outlier:
+    """A reading whose residual lies beyond what the noise explains."""
+
+    line: int
+    configuration: str
+    marker: str
+    residual: float
+    ratio: float
+
+
+def blocks(lines: list[int], gap: int = 3) -> list[tuple[int, int]]:
+    """Runs of faulty lines, (first, last), bridging gaps of up to `gap` lines."""
+    runs: list[tuple[int, int]] = []
+    for line in sorted(lines):
+        if runs and line - runs[-1][1] <= gap:
+            runs[-1] = (runs[-1][0], line)
+        else:
+            runs.append((line, line))
+    return runs
+
+
+# Least trimmed squares: the fit of the majority, whatever the rest says.
+
+STARTS = 500
+FINALISTS = 10
+SEARCH_ROWS = 2000
+STEPS = 2  # of every start before the best are chosen
+TOGETHER = 100  # starts whose residuals are held at a time
+RIDGE = 1e-12
+INSIDE = 0.99
+
+
+def least_trimmed_squares(
+    B: Array, e: Array, size: int, seed: int = 0, starts: int = STARTS
+) -> Array:
+    """Shift Δ (columns,) minimising the sum of the smaller half of |e_i − B_i Δ|².
+
+    B (n·size, columns) and e (n·size,) whitened, `size` rows per observation; up to half of the
+    observations may be arbitrarily wrong.  FAST-LTS (Rousseeuw and Van Driessen 2006): many
+    smallest possible random subsets, concentration steps, the best few run to the end.
+    """
+    n, p = len(e) // size, B.shape[1]
+    if p == 0:
+        return np.zeros(0)
+    B3, e2 = B.reshape(n, size, p), e.reshape(n, size)
+    rng = np.random.default_rng(seed)
+    search = np.arange(n) if n <= SEARCH_ROWS else rng.choice(n, SEARCH_ROWS, replace=False)
+    need = min(-(-p // size) + 1, n)
+    subsets = np.array([rng.choice(len(search), need, replace=False) for _ in range(starts)])
+    shifts, costs = _searched(B3[search], e2[search], subsets)
+    finalists = shifts[np.argsort(costs, kind="stable")[:FINALISTS]]
+    best, best_cost = np.zeros(p), np.inf
+    for shift in [*finalists, np.zeros(p)]:
+        cost = np.inf
+        for _ in range(100):
+            previous = cost
+            shift, cost = _concentrate(B3, e2, shift)
+            if cost >= previous * (1 - 1e-10):
+                break
+        if cost < best_cost:
+            best, best_cost = shift, cost
+    return best
+
+
+def _searched(B: Array, e: Array, subsets: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Shifts (starts, p) and trimmed costs (starts,) two steps from `subsets` (starts, need).
+
+    The normal equations of any choice of observations are a sum of those of single ones, so one
+    product sets them up for all starts.  They cost half the digits, which a search can spare: the
+    finalists go on with B itself.
+    """
+    n, size, p = B.shape
+    scale = np.linalg.norm(B.reshape(-1, p), axis=0)
+    scale[scale == 0] = 1.0
+    unit = B / scale
+    back = unit.transpose(0, 2, 1)
+    products = np.concatenate([back @ unit, back @ e[:, :, None]], axis=2).reshape(n, -1)
+    half = (n + p // size + 1) // 2
+    shifts, costs = np.empty((len(subsets), p)), np.empty(len(subsets))
+    for first in range(0, len(subsets), TOGETHER):
+        which = slice(first, first + TOGETHER)
+        nearest = subsets[which]
+        for step in range(STEPS + 1):
+            shift = _solve_normal(products, nearest)
+            left = e.ravel()[:, None] - unit.reshape(-1, p) @ shift.T
+            squared = (left.reshape(n, size, -1) ** 2).sum(axis=1).T  # (starts, n)
+            if step < STEPS:
+                nearest = np.argpartition(squared, half - 1, axis=1)[:, :half]
+        shifts[which] = shift / scale
+        costs[which] = np.partition(squared, half - 1, axis=1)[:, :half].sum(axis=1)
+    return shifts, costs
+
+
+def _solve_normal(products: Array, chosen: NDArray[np.int64]) -> Array:
+    """Least squares (starts, p) of the `chosen` (starts, k) observations, from their products.
+
+    A ridge keeps a direction that they do not show where it is.
+    """
+    inside = np.zeros((len(chosen), len(products)))
+    np.put_along_axis(inside, chosen, 1.0, axis=1)
+    p = int(np.sqrt(products.shape[1]))
+    summed = (inside @ products).reshape(len(chosen), p, p + 1)
+    normal, right = summed[:, :, :p].copy(), summed[:, :, p:]
+    own = np.arange(p)
+    normal[:, own, own] += RIDGE * np.maximum(
+        np.trace(normal, axis1=1, axis2=2)[:, None], np.finfo(float).tiny / RIDGE
+    )
+    return np.asarray(np.linalg.solve(normal, right)[..., 0], dtype=np.float64)
+
+
+def _concentrate(B: Array, e: Array, shift: Array) -> tuple[Array, float]:
+    """Refit to the half with the smallest residuals; the trimmed cost never rises."""
+    squared = ((e - B @ shift) ** 2).sum(axis=1)
+    half = (len(e) + len(shift) // e.shape[1] + 1) // 2
+    chosen = np.argpartition(squared, half - 1)[:half]
+    shift = _solve(B[chosen], e[chosen])
+    squared = np.sort(((e - B @ shift) ** 2).sum(axis=1))
+    return shift, float(squared[:half].sum())
+
+
+def _solve(B: Array, e: Array) -> Array:
+    if B.shape[2] == 0:
+        return np.zeros(0)
+    return linalg.lstsq(B.reshape(-1, B.shape[2]), e.ravel(), cond=1e-10, check_finite=False)[0]
+
+
+def majority(B: Array, e: Array, size: int, seed: int = 0) -> NDArray[np.bool_]:
+    """Observations (n,) that agree with the least trimmed squares fit of the majority.
+
+    Reweighted LTS, repeated: fit to the observations inside the 99 % limit of χ²(size), scale
+    from those corrected for the cut, new limit.  Up to one in a hundred clean observations is
+    left outside, so this is a suspicion, not a verdict.
+    """
+    n = len(e) // size
+    B3, e2 = B.reshape(n, size, B.shape[1]), e.reshape(n, size)
+    limit = stats.chi2.ppf(INSIDE, size)
+    # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
+    cut = stats.chi2.cdf(limit, size + 2) / INSIDE
+    squared = ((e2 - B3 @ least_trimmed_squares(B, e, size, seed)) ** 2).sum(axis=1)
+    good = squared <= limit * median_scale(squared, size) ** 2
+    for _ in range(50):
+        shift = _solve(B3[good], e2[good])
+        squared = ((e2 - B3 @ shift) ** 2).sum(axis=1)
+        scale2 = squared[good].mean() / (size * cut)
+        updated = squared <= limit * scale2
+        if np.array_equal(updated, good) or updated.sum() <= n // 2:
+            break
+        good = updated
+    return good
+
+
+def median_scale(squared: Array, size: int) -> float:
+    """Standard deviation per row from the median of squared lengths (n,), Gaussian-consistent."""
+    return float(np.sqrt(np.median(squared) / stats.chi2.median(size)))
+
+
+# Which observations does a fit of the others contradict?  Judged in turns until it stands.
+
+ROUNDS = 12
+ALONE = 1e-9  # share of an observation's direction that the other observations must see
+
+
+# The trimmed cost of a fit (`judge`), the observations (N,) it is of, and the fit.
+Visit = tuple[float, BoolArray, Solution]
+
+
+def verdict(
+    solution: Solution,
+    refit: Callable[[BoolArray], Solution],
+    good: BoolArray,
+    before: tuple[Visit, ...] = (),
+) -> tuple[BoolArray, Solution]:
+    """Which observations (N,) are faulty, and the fit to the others, beginning with the `good`.
+
+    Every observation is judged against the fit to the good ones at a Bonferroni limit for the
+    whole table, which makes new good ones, and so on until the verdict stands.  Where taking
+    readings back in has bent the fit away from the majority, the earlier verdict stands.
+    `before` are fits to others that have been judged already.
+    """
+    visited = list(before)
+    for _ in range(ROUNDS):
+        try:
+            current = solution if good.all() else refit(good)
+            beyond, cost = judge(solution, current, good)
+        except (ElastocalError, np.linalg.LinAlgError):
+            break  # that subset does not determine a valid arm: it cannot judge the others
+        if beyond.sum() >= len(beyond) // 2:
+            break  # no majority agrees with this fit: it cannot judge
+        visited.append((cost, good, current))
+        if any(np.array_equal(~beyond, mask) for _, mask, _ in visited):
+            good = ~beyond
+            break
+        good = ~beyond
+    if not visited:
+        return np.zeros(len(good), dtype=bool), solution
+    final = next((v for v in reversed(visited) if np.array_equal(v[1], good)), visited[-1])
+    best = min(visited, key=lambda v: v[0])
+    half = len(good) // 2
+    if final[0] > best[0] * stats.f.isf(FALSE_ALARM, half, half):
+        final = best
+    return ~final[1], final[2]
+
+
+def judge(whole: Solution, fitted: Solution, good: BoolArray) -> tuple[BoolArray, float]:
+    """Observations (N,) beyond the limit under a fit to the `good` ones, and its trimmed cost.
+
+    An observation in the fit is judged by its residual as if left out, any other by its
+    prediction error; both have variance s² (1 ± leverage) and follow F(size, dof).  The trimmed
+    cost is the sum of the smaller half of the squared lengths.
+
+    Raises LinAlgError where the good ones do not determine the fitted parameters.
+    """
+    problem = whole.problem
+    n, size = len(good), problem.observations.size
+    kept = fitted.reduction.kept
+    r_factor = _inside(whole, fitted, good)
+    s2 = r_factor.rss / max(r_factor.rows - len(kept), 1)
+    alone_squared, squared = np.empty(n), np.empty(n)
+
+    def of_part(part: Part) -> None:
+        at = regressor(problem.model, part, fitted.fit.x, kept)
+        WB, e = part.weights.apply(at.B), part.weights.apply(at.residual)
+        Q = linalg.solve_triangular(r_factor.R, WB.T, trans="T").T
+        e2 = e.reshape(-1, size)
+        squared[part.index] = (e2**2).sum(axis=1)
+        alone_squared[part.index] = _studentised(Q.reshape(-1, size, len(kept)), e2,
+                                                 good[part.index])  # fmt: skip
+
+    for _ in each(problem.parts, of_part):
+        pass
+    dof = max(int(good.sum()) * size - len(kept), 1)
+    trimmed = float(np.sort(squared)[: n // 2 + 1].sum())
+    return alone_squared > size * s2 * stats.f.isf(FALSE_ALARM / n, size, dof), trimmed
+
+
+def _inside(whole: Solution, fitted: Solution, good: BoolArray) -> RFactor:
+    """The triangle of the good observations at the fit, whitened as the whole table is."""
+    problem = whole.problem
+    kept, size = fitted.reduction.kept, problem.observations.size
+    if fitted.fit is whole.fit and good.all() and len(whole.fit.whitened) == len(good) * size:
+        return whole.fit.r_factor
+
+    def of_part(part: Part) -> RFactor:
+        at = regressor(problem.model, part, fitted.fit.x, kept)
+        inside = np.repeat(good[part.index], size)
+        e = part.weights.apply(at.residual)
+        return RFactor.of(part.weights.apply(at.B)[inside], e[inside])
+
+    return merge(each(problem.parts, of_part))
+
+
+def _studentised(Q: Array, e: Array, good: BoolArray) -> Array:
+    """eᵀ (I ± QQᵀ)⁻¹ e per observation: minus in the fit, plus out of it.
+
+    Q (n, size, p), e (n, size); zero where an observation of the fit alone determines a direction.
+    """
+    size = e.shape[1]
+    H = Q @ Q.transpose(0, 2, 1)
+    spread = np.eye(size) + np.where(good, -1.0, 1.0)[:, None, None] * np.minimum(H, 1e12)
+    alone = np.zeros(len(e), dtype=bool)
+    # The largest eigenvalue is at most the trace: only observations of weight need theirs.
+    heavy = np.flatnonzero(good & (np.trace(H, axis1=1, axis2=2) >= 0.5))
+    alone[heavy] = np.linalg.eigvalsh(spread[heavy])[:, 0] < ALONE
+    spread[alone] = np.eye(size)
+    squared = (e * np.linalg.solve(spread, e[..., None])[..., 0]).sum(axis=1)
+    return np.where(alone, 0.0, squared)
+
+
+# Readings that the noise does not explain: found by the fit of the majority.
+
+
+def find_faulty(
+    solution: Solution, refit: Callable[[BoolArray], Solution]
+) -> tuple[BoolArray, Solution]:
     """Which observations (N,) are faulty, and the solution without them.
 
     A trimmed fit of base, markers and cable to the nominal arm shows the suspects; then the whole
@@ -43,13 +323,13 @@ def find_faulty(solution: Solution, refit: Callable[[Mask], Solution]) -> tuple[
                 return found
         return verdict(solution, refit, good)
 
-    def fit_others(good: Mask) -> Solution:
+    def fit_others(good: BoolArray) -> Solution:
         return _fit_to(solution, good)
 
     return verdict(solution, fit_others, _agreeing_with_a_sample(solution))
 
 
-def _acquitted(solution: Solution, good: Mask) -> Visit | None:
+def _acquitted(solution: Solution, good: BoolArray) -> Visit | None:
     """The judgement by one Gauss–Newton step from the fit of all to the `good` observations.
 
     None where it accuses anybody, or where the good ones ask for other parameters: then the fit
@@ -59,18 +339,18 @@ def _acquitted(solution: Solution, good: Mask) -> Visit | None:
     independent = problem.parts.blocks is None and problem.weights.kind != "component"
     if good.all() or problem.bounded or not independent:
         return None  # what is correlated, or weighted by its residuals, is whitened anew
-    seen, free, sizes = problem.observations, problem.free, solution.sizes
+    observed, free, sizes = problem.observations, problem.free, solution.sizes
     try:
-        at = problem.model.regressor(seen.table, solution.fit.x, free, seen)
-        rows = np.repeat(good, seen.size)
-        triangle = Triangle.of(
+        at = problem.model.regressor(observed.table, solution.fit.x, free, observed)
+        rows = np.repeat(good, observed.size)
+        r_factor = RFactor.of(
             problem.weights.apply(at.B)[rows], problem.weights.apply(at.residual)[rows]
         )
-        own = triangle.of_columns(np.searchsorted(free, kept))
+        own = r_factor.of_columns(np.searchsorted(free, kept))
         if own.rows <= len(kept):
             return None
         sigma = max(own.rest / float(np.sqrt(own.rows - len(kept))), 1e-12)
-        chosen = choose(problem, sizes, triangle, sigma, WORTH_A_COLUMN)
+        chosen = choose(problem, sizes, r_factor, sigma, WORTH_A_COLUMN)
         if not np.array_equal(chosen.kept, kept):
             return None
         x = solution.fit.x.copy()
@@ -82,25 +362,25 @@ def _acquitted(solution: Solution, good: Mask) -> Visit | None:
     return None if beyond.any() else (cost, good, stepped)
 
 
-def _suspects(solution: Solution) -> Mask:
+def _suspects(solution: Solution) -> BoolArray:
     """Observations outside the majority of a trimmed fit of base, markers and cable alone.
 
     From the nominal geometry: faulty readings have bent everything else in the whole fit.
     """
     problem = solution.problem
-    model, seen = problem.model, problem.observations
+    model, observed = problem.model, problem.observations
     placed = problem.free[is_placed(model)[problem.free]]
     if not len(placed):
         e = problem.weights.apply(residual_at(model, problem.parts, solution.fit.x))
-        return ~majority(np.zeros((len(e), 0)), e, seen.size)
-    at = model.regressor(seen.table, problem.x0, placed, seen)
+        return ~majority(np.zeros((len(e), 0)), e, observed.size)
+    at = model.regressor(observed.table, problem.x0, placed, observed)
     B = problem.weights.apply(at.B)
     scale = np.linalg.norm(B, axis=0)
     residual = problem.weights.apply(at.residual)
-    return ~majority(B / np.where(scale > 0, scale, 1.0), residual, seen.size)
+    return ~majority(B / np.where(scale > 0, scale, 1.0), residual, observed.size)
 
 
-def _agreeing_with_a_sample(solution: Solution) -> Mask:
+def _agreeing_with_a_sample(solution: Solution) -> BoolArray:
     """Observations within the limit under the fit to the majority of a sample of them.
 
     All, where the sample does not show a parameter that the solution has.
@@ -111,7 +391,7 @@ def _agreeing_with_a_sample(solution: Solution) -> Mask:
     own = replace(problem, observations=part.observations, weights=part.weights)
     rough = replace(solution, problem=own)
     faulty, fitted = verdict(rough, lambda good: _fit_to(rough, good), ~_suspects(rough))
-    shown = evaluate(problem.model, own.parts, fitted.fit.x, solution.reduction.kept).triangle
+    shown = evaluate(problem.model, own.parts, fitted.fit.x, solution.reduction.kept).r_factor
     if not np.linalg.norm(shown.R, axis=0).all():
         return every
     inside = ~every
@@ -122,7 +402,7 @@ def _agreeing_with_a_sample(solution: Solution) -> Mask:
         return every
 
 
-def _fit_to(solution: Solution, good: Mask) -> Solution:
+def _fit_to(solution: Solution, good: BoolArray) -> Solution:
     """The parameters chosen anew for the good observations, and fitted to them.
 
     An observation that is correlated with one that is not good stays out with it.
@@ -138,19 +418,19 @@ def _fit_to(solution: Solution, good: Mask) -> Solution:
     return replace(solution, problem=settled.problem, fit=settled.fit, reduction=settled.reduction)
 
 
-def describe(solution: Solution, fitted: Solution, faulty: Mask) -> tuple[Outlier, ...]:
+def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[Outlier, ...]:
     """The faulty observations with their error under the fit to the others, in table order."""
-    seen, model = solution.problem.observations, solution.problem.model
+    observed, model = solution.problem.observations, solution.problem.model
     error = residual_at(model, solution.problem.parts, fitted.fit.x)
-    length = np.linalg.norm(error.reshape(-1, seen.size)[:, :3], axis=1)
-    squared = (solution.problem.weights.apply(error).reshape(-1, seen.size) ** 2).sum(axis=1)
-    sigma = median_scale(squared[~faulty], seen.size)
-    table = seen.table
+    length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
+    squared = (solution.problem.weights.apply(error).reshape(-1, observed.size) ** 2).sum(axis=1)
+    sigma = median_scale(squared[~faulty], observed.size)
+    table = observed.table
     return tuple(
         Outlier(
-            int(table.row[seen.lead[k]]),
-            table.configuration_labels[table.configuration[seen.lead[k]]],
-            table.marker_names[table.marker[seen.lead[k]]],
+            int(table.row[observed.lead[k]]),
+            table.configuration_labels[table.configuration[observed.lead[k]]],
+            table.marker_names[table.marker[observed.lead[k]]],
             float(length[k]),
             float(np.sqrt(squared[k]) / sigma),
         )

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError
-from elastocal.identification.linear import LinearSolution, solve_weighted
-
-Array = NDArray[np.float64]
+from elastocal.identification.linear_solver import LinearSolution, solve_weighted
+from elastocal.units import Array
 
 SMALLEST = 1e-9  # m, below any tracker's resolution: σ_i of zero has no inverse
 SIGMA_0 = 10e-6  # m, the tracker's claimed precision, σ₀ of eq. (14)

@@ -9,20 +9,18 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from elastocal.above import Result
 from elastocal.errors import UnknownNameError
-from elastocal.identification.constrained.minimise import ActiveConstraint
+from elastocal.identification.constrained import ActiveConstraint
+from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.noise_summary import Noise
-from elastocal.identification.outlier import Outlier
-from elastocal.identification.residual_summary import ResidualSummary
-from elastocal.identification.robust.report import OutlierReport
-from elastocal.manipulator.calibrated import CalibratedArm, nominal_flange_rows
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import COMPONENTS, Observations
-
-Array = NDArray[np.float64]
+from elastocal.identification.outliers import Outlier
+from elastocal.identification.residuals import ResidualSummary
+from elastocal.model.calibrated import CalibratedArm, nominal_flange_rows
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import COMPONENTS, Observations
+from elastocal.units import Array
 
 SCHEMA = "elastocal/identification/1"
 LOPSIDED = 0.1  # difference of the halves of an interval that one half width cannot tell
@@ -265,8 +263,8 @@ class Calibration(Result):
     @property
     def B(self) -> Array:
         """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
-        seen = self.observations
-        return self.model.regressor(seen.table, self.x, observations=seen).B
+        observed = self.observations
+        return self.model.regressor(observed.table, self.x, observations=observed).B
 
     @cached_property
     def arm(self) -> CalibratedArm:
@@ -294,18 +292,20 @@ class Calibration(Result):
 
     def residual_table(self) -> list[dict[str, Any]]:
         """One row per observation: line, configuration, repeat, marker, residuals in µm (µrad)."""
-        seen = self.observations
-        parts = self.residual.reshape(-1, seen.size)
-        held = self.held_out.reshape(-1, seen.size)
+        observed = self.observations
+        parts = self.residual.reshape(-1, observed.size)
+        held = self.held_out.reshape(-1, observed.size)
         rows = []
-        for k, i in enumerate(seen.lead):
+        for k, i in enumerate(observed.lead):
             row: dict[str, Any] = {
-                "line": int(seen.table.row[i]),
-                "configuration": seen.table.configuration_labels[seen.table.configuration[i]],
-                "repeat": int(seen.table.repeat[i]),
-                "marker": seen.table.marker_names[seen.table.marker[i]],
+                "line": int(observed.table.row[i]),
+                "configuration": observed.table.configuration_labels[
+                    observed.table.configuration[i]
+                ],
+                "repeat": int(observed.table.repeat[i]),
+                "marker": observed.table.marker_names[observed.table.marker[i]],
             }
-            for j, name in enumerate(COMPONENTS[seen.kind]):
+            for j, name in enumerate(COMPONENTS[observed.kind]):
                 unit = "urad" if name.startswith("r") else "um"
                 row[f"residual_{name}_{unit}"] = float(parts[k, j]) * 1e6
                 row[f"heldout_{name}_{unit}"] = float(held[k, j]) * 1e6

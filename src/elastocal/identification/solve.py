@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.checks import check_enough
-from elastocal.identification.chunked import each, regressor, residual_at
-from elastocal.identification.fit import Fit, fit
-from elastocal.identification.heldout import rms_3d
-from elastocal.identification.partition import Part, sample
-from elastocal.identification.reduction import Reduction
-from elastocal.identification.selection import (
+from elastocal.identification.identifiability import (
     WORTH_A_COLUMN,
     Problem,
+    Reduction,
     choose,
     fit_kept,
-    free_triangle,
+    free_r_factor,
     held_at_bounds,
     heldout_of,
     prefer_wider,
     residual_sigma,
 )
-from elastocal.identification.triangle import Triangle, merge
-from elastocal.manipulator.effects import effect_of
-from elastocal.manipulator.model import Model
-
-Array = NDArray[np.float64]
-Progress = Callable[[str], None]
+from elastocal.identification.least_squares import Fit, fit
+from elastocal.identification.residuals import rms_3d
+from elastocal.identification.start import check_enough
+from elastocal.identification.weighted_problem import (
+    Part,
+    RFactor,
+    each,
+    merge,
+    regressor,
+    residual_at,
+    sample,
+)
+from elastocal.model.effects import effect_of
+from elastocal.model.manipulator import Model
+from elastocal.units import Array, Progress
 
 # Width of the weak tie that keeps undetermined directions still before they are recognised:
 # in typical sizes for deviations from nominal, in m and rad for what registration placed.
@@ -74,7 +77,7 @@ def solve(
     if try_wider:
         progress("comparing with wider sets")
         found, reduction, heldout = prefer_wider(
-            problem, sizes, found, reduction, heldout, settled.triangle
+            problem, sizes, found, reduction, heldout, settled.r_factor
         )
     if problem.bounded:
         found, reduction = held_at_bounds(problem, sizes, found, reduction)
@@ -91,7 +94,7 @@ class Settled:
     problem: Problem
     fit: Fit
     reduction: Reduction
-    triangle: Triangle
+    r_factor: RFactor
     nominal: Array
 
 
@@ -112,16 +115,16 @@ def settle(problem: Problem, sizes: Array, progress: Progress = lambda message: 
     progress("first fit, tied weakly to the start")
     found = tied_fit(problem, sizes, CHOOSING)
     progress("choosing the parameters that the data determine")
-    sigma, kept, triangle = residual_sigma(found, 0), None, found.triangle
+    sigma, kept, r_factor = residual_sigma(found, 0), None, found.r_factor
     for _ in range(5):
-        reduction = choose(problem, sizes, triangle, sigma, WORTH_A_COLUMN)
+        reduction = choose(problem, sizes, r_factor, sigma, WORTH_A_COLUMN)
         if kept is not None and np.array_equal(kept, reduction.kept):
             break
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
         found = fit_kept(problem, sizes, found.x, reduction, again=True)
-        sigma, triangle = residual_sigma(found, len(kept)), free_triangle(problem, found)
-    return Settled(problem, found, reduction, triangle, nominal)
+        sigma, r_factor = residual_sigma(found, len(kept)), free_r_factor(problem, found)
+    return Settled(problem, found, reduction, r_factor, nominal)
 
 
 def is_placed(model: Model) -> NDArray[np.bool_]:
@@ -131,20 +134,20 @@ def is_placed(model: Model) -> NDArray[np.bool_]:
 
 def sizes_and_check(problem: Problem) -> Array:
     """Typical sizes (parameters,) at the start; refuses where the equations are too few."""
-    model, seen, free = problem.model, problem.observations, problem.free
+    model, observed, free = problem.model, problem.observations, problem.free
     every = np.arange(len(model.parameters))
-    few = len(seen.value) <= len(free)  # more equations than unknowns need no rank
+    few = len(observed.value) <= len(free)  # more equations than unknowns need no rank
 
-    def of_part(part: Part) -> tuple[Array, Triangle | None]:
+    def of_part(part: Part) -> tuple[Array, RFactor | None]:
         at = regressor(model, part, problem.x0, every)
-        triangle = Triangle.of(at.B[:, free], at.residual) if few else None
-        return np.abs(at.B).max(axis=0, initial=0.0), triangle
+        r_factor = RFactor.of(at.B[:, free], at.residual) if few else None
+        return np.abs(at.B).max(axis=0, initial=0.0), r_factor
 
     largest, triangles = zip(*each(problem.parts, of_part), strict=True)
     sizes = model.sizes(np.stack(largest))
     sizes[is_placed(model)] = PLACED
     if few:
-        check_enough(model, seen, merge(t for t in triangles if t is not None).R * sizes[free])
+        check_enough(model, observed, merge(t for t in triangles if t is not None).R * sizes[free])
     return sizes
 
 

@@ -1,29 +1,38 @@
-"""Points and their joint values → the checked measurement table."""
+"""Points and their joint values → the rows of the measurement table, if they are plausible."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell import Cell
+from elastocal.cell.arm_description import ModelSpec, Tool
+from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.importing.joining import DEFAULT, Array, Joined, PooledRecords, groups_alike
-from elastocal.importing.schema import JoinTable, LoadTable, MappingTable
+from elastocal.identification.start import RegistrationProblem, register
+from elastocal.importing.joining import DEFAULT, Joined, PooledRecords, groups_alike
+from elastocal.importing.mapping_file import JoinTable, LoadStatesTable, MappingTable
 from elastocal.measurements import Measurements, families, read_measurements
+from elastocal.model.chain import joint_limits
+from elastocal.model.choice import load_chain
+from elastocal.model.manipulator import Model
 from elastocal.tables import Family, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import convert, quantities
+from elastocal.units import Array, convert, quantities
+
+# Points and their joint values → the checked measurement table.
 
 GRAVITY = 9.80665  # m/s², standard
 UNLOADED = ("none", "unloaded", "0")
 
 
 def forces_of(
-    where: str, points: PooledRecords, loads: Mapping[str, NDArray[np.float64] | LoadTable] | None
+    where: str,
+    points: PooledRecords,
+    loads: Mapping[str, NDArray[np.float64] | LoadStatesTable] | None,
 ) -> NDArray[np.float64] | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
 
@@ -45,9 +54,9 @@ def forces_of(
         )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in (loads or {}).items():
-        down = stated.mass_kg * GRAVITY if isinstance(stated, LoadTable) else 0.0
+        down = stated.mass_kg * GRAVITY if isinstance(stated, LoadStatesTable) else 0.0
         known[name] = np.array(
-            [0.0, 0.0, -down] if isinstance(stated, LoadTable) else list(stated), dtype=float
+            [0.0, 0.0, -down] if isinstance(stated, LoadStatesTable) else list(stated), dtype=float
         ) + 0.0  # no -0.0  # fmt: skip
     for i, name in enumerate(named):
         if name not in known:
@@ -192,7 +201,7 @@ def _repeats(
 ) -> NDArray[np.int64]:
     stated = points.labels.get("repeat")
     count: dict[tuple, int] = {}
-    seen: dict[tuple, int] = {}
+    observed: dict[tuple, int] = {}
     repeats = np.zeros(len(rows), dtype=np.int64)
     for k, (i, key) in enumerate(zip(rows, keys, strict=True)):
         if stated is None:
@@ -204,7 +213,7 @@ def _repeats(
             raise InputError(f"{points.where(int(i))}: repeat {quoted(text)} is no whole number; "
                              "correct the pattern or the column")  # fmt: skip
         repeats[k] = int(text)
-        first = seen.setdefault((*key, int(text)), k)
+        first = observed.setdefault((*key, int(text)), k)
         if first != k:
             raise InputError(
                 f"{points.where(int(i))}: repeat {text} of configuration {key[0]}"
@@ -260,7 +269,7 @@ def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measu
     markers: tuple[str, ...] = ()
     observe = "position" if any(c.startswith("x_") for c in made.columns) else "distance"
     if cell is not None:
-        from elastocal.manipulator.choice import load_chain
+        from elastocal.model.choice import load_chain
 
         kinds = load_chain(cell).kinds
         markers = tuple(cell.tool.markers)
@@ -282,3 +291,268 @@ def _meant(made: Assembled, message: str) -> str:
     found = re.search(r"line (\d+)", message)
     row = int(found[1]) - 2 if found else -1
     return f" (from {made.origin[row]})" if 0 <= row < len(made) else ""
+
+
+# Whether an imported table can be right: its units, and whether the robot of a cell fits it.
+
+# Industrial arms measured by trackers: radians of a campaign span more than this, degrees too.
+SMALLEST_SPREAD_DEG = 7.0  # 2 pi: a column of radians read as degrees spans less
+LARGEST_TURN = 4 * np.pi
+FARTHEST_M, LARGEST_SPREAD_M, LEAST_SPREAD_M = 150.0, 30.0, 0.02
+LARGEST_FORCE_N = 2e5
+LARGEST_SIGMA_M = 5e-3
+
+
+def plausibility(made: Assembled, table: Measurements, observe: str | None) -> list[str]:
+    """Sentences about columns that are likely in another unit, and about pairs that are missing."""
+    with np.errstate(over="ignore"):  # numbers of 1e300 are told as implausible, too
+        warnings = [*_joints(made, table), *_positions(table)]
+        force = np.linalg.norm(table.force, axis=1)
+    if force.max() > LARGEST_FORCE_N:
+        warnings.append(
+            f"forces reach {force.max():.3g} N, more than any arm carries; check [loads]"
+        )
+    if table.sigma is not None and table.sigma.max() > LARGEST_SIGMA_M:
+        warnings.append(
+            f"standard deviations reach {table.sigma.max() * 1e3:.3g} mm; are they in µm?"
+        )
+    if table.position is not None and np.any(table.force[:, 2] > 0):
+        warnings.append(
+            "some forces point up (+z of the tracker's frame); a hanging load is negative"
+        )
+    if observe == "deflection":
+        warnings += _pairs(table)
+    return warnings
+
+
+def _joints(made: Assembled, table: Measurements) -> list[str]:
+    revolute = np.array([kind == "revolute" for kind in made.kinds])
+    q = table.q[:, revolute]
+    if not q.size:
+        return []
+    first = next(header for header in made.columns if header.startswith("q1"))
+    if np.abs(q).max() > LARGEST_TURN:
+        return [
+            f"a joint stands at {np.degrees(np.abs(q).max()):.4g}°, more than two turns: degrees "
+            "read as radians? Map q#_deg"
+        ]
+    several = len(np.unique(table.q, axis=0)) >= 5
+    if (
+        several
+        and first.endswith("_deg")
+        and np.degrees(np.ptp(q, axis=0)).max() < (SMALLEST_SPREAD_DEG)
+    ):
+        return [
+            f"no joint moves by more than {np.degrees(np.ptp(q, axis=0)).max():.3g}°: radians read "
+            "as degrees? Map q#_rad"
+        ]
+    still = [f"joint {j + 1}" for j in range(table.q.shape[1]) if np.ptp(table.q[:, j]) == 0]
+    if several and still:
+        return [f"{listed(still)} never moved; is it mapped to the right column?"]
+    return []
+
+
+def _positions(table: Measurements) -> list[str]:
+    if table.position is None:
+        return []
+    far = float(np.linalg.norm(table.position, axis=1).max())
+    spread = float(np.linalg.norm(np.ptp(table.position, axis=0)))
+    if far > FARTHEST_M or spread > LARGEST_SPREAD_M:
+        return [
+            f"points lie up to {far:.3g} m from the tracker and span {spread:.3g} m: mm read as m? "
+            "Map x_mm, y_mm, z_mm"
+        ]
+    moved = float(np.ptp(table.q, axis=0).max()) if len(table) else 0.0
+    if moved > 0.3 and spread < LEAST_SPREAD_M:
+        return [
+            f"all points lie within {spread * 1e3:.3g} mm although the arm moved: m read as mm? "
+            "Map x_m, y_m, z_m"
+        ]
+    return []
+
+
+def _pairs(table: Measurements) -> list[str]:
+    """Configurations that lack the loaded or the unloaded state, which deflections need."""
+    loaded = np.any(table.force != 0, axis=1)
+    lonely = [
+        label
+        for code, label in enumerate(table.configuration_labels)
+        if (here := table.configuration == code).any() and len(set(loaded[here])) < 2
+    ]
+    if not lonely:
+        return []
+    return [
+        f"{len(lonely)} of {len(table.configuration_labels)} configurations were not measured both "
+        f"unloaded and loaded, as deflections need: {listed(lonely, 8)}"
+    ]
+
+
+FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
+POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
+BETTER = 5.0  # a correction must reduce the error by this factor to be named
+SLACK = 1e-6  # rad or m beyond a limit that rounding explains
+FARTHEST = 1e5  # m; beyond it no fit is worth its overflows, and plausibility speaks
+SAMPLE = 80
+CONFIRMED = 2  # corrections that are tried in earnest
+
+
+@dataclass(frozen=True)
+class NominalFit:
+    """Median distance `error` (m) of the readings from the nominal arm with base and markers
+    fitted; `warning` names what would make them fit, "" where they do."""
+
+    error: float
+    warning: str
+
+
+def against_cell(
+    cell: Cell, table: Measurements, made: Assembled, spherical: bool = False
+) -> tuple[NominalFit | None, str]:
+    """The fit to the nominal arm (None without positions or with few poses), and why the cell's
+    limits refuse the table ("" where they do not).
+
+    `spherical`: positions were read as distance and angles, which invites mistakes of their own.
+    """
+    chain = load_chain(cell)
+    lower, upper = joint_limits(cell, chain)
+    beyond = (table.q < lower - SLACK) | (table.q > upper + SLACK)
+    refused = ""
+    if beyond.any():
+        rows = np.flatnonzero(beyond.any(axis=1))
+        i, j = int(rows[0]), int(np.argmax(beyond[rows[0]]))
+        revolute = chain.kinds[j] == "revolute"
+        factor, unit = (180 / np.pi, "°") if revolute else (1e3, " mm")
+        refused = (
+            f"{made.origin[i]}: joint{j + 1} ({chain.joints[j].name}) at "
+            f"{table.q[i, j] * factor:.4g}{unit} is beyond its limits "
+            f"[{lower[j] * factor:.4g}, {upper[j] * factor:.4g}]{unit} ({len(rows)} of "
+            f"{len(table)} rows); correct unit, sign, offset_deg or order in [joints], or "
+            "the limits of the cell"
+        )
+    poses = len(np.unique(table.q, axis=0))
+    if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
+        return None, refused
+    return _fit(cell, table, spherical), refused
+
+
+def _fit(cell: Cell, table: Measurements, spherical: bool) -> NominalFit:
+    rigid = _rigid(cell, table.marker_names)
+    light = np.flatnonzero(~np.any(table.force != 0, axis=1))
+    rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
+    if len(rows) > SAMPLE:
+        rows = np.sort(np.random.default_rng(0).choice(rows, SAMPLE, replace=False))
+    used = table.take(rows)
+    error = _error(rigid, used)
+    if error <= POOR:
+        return NominalFit(error, "")
+    # A registration takes time; the linear one, exact where the base is a rotation, chooses.
+    guesses = sorted(
+        _corrections(used, spherical), key=lambda guess: _linear_error(rigid, guess[1])
+    )
+    tried = [(_error(rigid, changed), words) for words, changed in guesses[:CONFIRMED]]
+    best, words = min(tried, key=lambda t: t[0])
+    said = f"the readings fit the nominal arm only to {error * 1e3:.3g} mm"
+    if best < error / BETTER:
+        return NominalFit(error, f"{said}; {words} they would fit to {best * 1e3:.3g} mm")
+    return NominalFit(
+        error,
+        f"{said}, and neither another unit, sign or coupling of a joint nor a shift by one pose "
+        "mends that: check the robot of the cell, offsets of joints, and which joint values belong "
+        "to which point",
+    )
+
+
+def _rigid(cell: Cell, markers: tuple[str, ...]) -> Model:
+    """The nominal arm without effects, its markers at the flange."""
+    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in markers})
+    return Model(replace(cell, tool=tool, model=ModelSpec()))
+
+
+def _error(model: Model, table: Measurements) -> float:
+    T = model.rigid.flange_poses(table)
+    problem = RegistrationProblem(
+        T[:, :3, :3], T[:, :3, 3], np.asarray(table.position), table.marker,
+        np.zeros((len(table.marker_names), 3)), np.ones(len(table.marker_names), dtype=bool),
+        True, np.eye(3), np.zeros(3),
+    )  # fmt: skip
+    return register(problem).error
+
+
+def _linear_error(model: Model, table: Measurements) -> float:
+    """Rms of A p + s - R_i m - t_i over readings p, with any matrix A, shift s and markers m.
+
+    Infinite where A is no rotation at all: it mirrors, or its scale is off by a quarter.
+    """
+    T = model.rigid.flange_poses(table)
+    n, markers = len(table), len(table.marker_names)
+    columns = np.zeros((n, 3, 12 + 3 * markers))
+    for k in range(3):
+        columns[:, k, 3 * k : 3 * k + 3] = table.position
+        columns[:, k, 9 + k] = 1.0
+    for c in range(markers):
+        here = (table.marker == c)[:, None, None]
+        columns[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * T[:, :3, :3])
+    matrix, target = columns.reshape(3 * n, -1), T[:, :3, 3].ravel()
+    x = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
+    volume = float(np.linalg.det(x[:9].reshape(3, 3)))
+    if not 0.75**3 < volume < 1.25**3:
+        return np.inf
+    return float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
+
+
+def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Measurements]]:
+    """Mistakes that are often made, each undone."""
+
+    def other(q: Array) -> Measurements:
+        return replace(table, q=q)
+
+    def other_place(position: Array) -> Measurements:
+        return replace(table, position=position)
+
+    position = np.asarray(table.position)
+    for factor, words in ((1e-3, "mm read as m"), (1e3, "m read as mm"),
+                          (25.4, "inches read as mm"),
+                                                    (1 / 25.4, "mm read as inches")):  # fmt: skip
+        yield f"if positions were {words}", other_place(position * factor)
+    # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
+    mirrored = position[:, [1, 0, 2]]
+    if spherical:
+        yield (
+            "with azimuths counted the other way (azimuth = … in [[source]])",
+            other_place(mirrored),
+        )
+        level = np.hypot(*position[:, :2].T)
+        turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
+        yield (
+            "with zenith angles read as elevations or the other way round",
+            other_place(np.column_stack([position[:, :2] * turned[:, None], level])),
+        )
+    yield (
+        "with two columns of the positions swapped, or the sign of one turned round (now they "
+        "make a left-handed frame),",
+        other_place(mirrored),
+    )
+    yield "if joints were degrees read as radians", other(np.radians(table.q))
+    yield "if joints were radians read as degrees", other(np.degrees(table.q))
+    n = table.q.shape[1]
+    for j in range(n):
+        q = table.q.copy()
+        q[:, j] *= -1
+        yield f"with the sign of joint {j + 1} turned round", other(q)
+    for factor in (1.0, -1.0):
+        if n >= 3:
+            q = table.q.copy()
+            q[:, 2] += factor * q[:, 1]
+            yield f"with coupling {{ joint = 3, of = 2, factor = {factor:g} }}", other(q)
+    for j in range(n):
+        for degrees in (90, -90, 180):
+            q = table.q.copy()
+            q[:, j] += np.radians(degrees)
+            yield f"with offset_deg {degrees} at joint {j + 1}", other(q)
+    visit = np.cumsum(np.r_[0, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
+    poses = np.array([table.q[visit == v][0] for v in range(visit.max() + 1)])
+    for shift, words in ((1, "earlier"), (-1, "later")):
+        yield (
+            f"with the joint values of one pose {words}",
+            other(np.roll(poses, shift, axis=0)[visit]),
+        )

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from elastocal.errors import InputError
-from elastocal.importing.schema import UnitsTable
+from elastocal.importing.mapping_file import UnitsTable
 from elastocal.measurements import families
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
@@ -134,18 +134,18 @@ class Wanted:
 
 def wanted(where: str, required: Mapping[str, Where], optional: Mapping[str, Where]) -> Wanted:
     """The keys checked.  Raises InputError for unknown columns and columns given twice."""
-    seen: dict[str, str] = {}
+    observed: dict[str, str] = {}
     result: list[list[tuple[ColumnKey, Where]]] = []
     for part in (required, optional):
         targets = [(column_key(where, key), at) for key, at in part.items()]
         for target, at in targets:
             # Seconds and nanoseconds of one clock stand in two columns, and are added.
             name = target.key if target.stem == "time" else target.stem
-            if name in seen:
+            if name in observed:
                 raise InputError(
-                    f"{where}: {seen[name]} and {target.key} fill the same column; keep one"
+                    f"{where}: {observed[name]} and {target.key} fill the same column; keep one"
                 )
-            seen[name] = target.key
+            observed[name] = target.key
             if target.is_template and any(isinstance(p, int) for p in _parts(at)):
                 raise InputError(
                     f"{where}: {target.key} takes a name with # or #0 in it, as in "

@@ -1,4 +1,4 @@
-"""Text of unknown origin: encodings, delimited tables in it, robot programs, numbers and times."""
+"""Text of unknown origin: encodings, delimited tables in it, robot programs, number cells."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 from elastocal.csv_lines import MAX_LINE, NUMBER, first_bad_cell
 from elastocal.errors import InputError
 from elastocal.files import decoded, open_input
-from elastocal.importing.schema import TextTable
+from elastocal.importing.mapping_file import TextSourceKeys
 from elastocal.text import quoted
 from elastocal.units import known_unit
 
@@ -163,7 +163,7 @@ class Rows:
 
 
 def table_rows(
-    text: Text, settings: TextTable, is_header: IsHeader | None, is_data: IsData
+    text: Text, settings: TextSourceKeys, is_header: IsHeader | None, is_data: IsData
 ) -> Rows:
     """The rows of a delimited table.
 

@@ -7,12 +7,19 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from elastocal.cell import Cell
+from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.importing.assemble import Assembled, assemble, table_text, validated
+from elastocal.importing.assemble import (
+    Assembled,
+    NominalFit,
+    against_cell,
+    assemble,
+    plausibility,
+    table_text,
+    validated,
+)
 from elastocal.importing.joining import Joined, join, pooled, with_joints
-from elastocal.importing.mapping import Mapping
-from elastocal.importing.plausible import NominalFit, against_cell, plausibility
+from elastocal.importing.mapping_file import Mapping, SourceTable, UnitsTable
 from elastocal.importing.records import (
     Records,
     Understood,
@@ -21,7 +28,6 @@ from elastocal.importing.records import (
     with_labels,
     with_positions,
 )
-from elastocal.importing.schema import SourceTable, UnitsTable
 from elastocal.measurements import Measurements
 from elastocal.text import listed, quoted
 
@@ -56,7 +62,7 @@ def import_files(
     where, table = mapping.path, mapping.table
     names: tuple[str, ...] = ()
     if cell is not None:
-        from elastocal.manipulator.choice import load_chain
+        from elastocal.model.choice import load_chain
 
         names = tuple(joint.name for joint in load_chain(cell).joints)
     units = table.units or UnitsTable()
@@ -108,11 +114,11 @@ def _assigned(
     """
     if not files:
         raise InputError("no files to import; name the tracker's export and the joint log")
-    seen: set[Path] = set()
+    observed: set[Path] = set()
     for path in files:
-        if path in seen:
+        if path in observed:
             raise InputError(f"{path}: named twice; name each file once")
-        seen.add(path)
+        observed.add(path)
     chosen: dict[int, SourceTable] = {}
     for i, path in enumerate(files):
         for source in sources:

@@ -1,4 +1,4 @@
-"""The records of all files as one list of rows, and which joint values belong to which point."""
+"""Which joint values belong to which point: by order, name, time or dwell."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError, require
+from elastocal.importing.mapping_file import JoinTable, JointsTable
 from elastocal.importing.records import Records
-from elastocal.importing.schema import JoinTable, JointsTable
-from elastocal.tables import Array, IntArray
 from elastocal.text import listed
-from elastocal.units import convert, quantities
+from elastocal.units import Array, IntArray, convert, quantities
 
 
 def with_joints(
@@ -112,13 +111,13 @@ def _order(
                 'joint# = "name_#0" to [source.columns], or use order'
             )
         return None
-    seen = list(zip(*columns, strict=True))
-    wanted = joints.names or (model_names if set(model_names) <= set(seen[0]) else None)
+    observed = list(zip(*columns, strict=True))
+    wanted = joints.names or (model_names if set(model_names) <= set(observed[0]) else None)
     if not wanted:
         return None
     orders: dict[tuple[str, ...], list[int]] = {}
     rows = []
-    for i, names in enumerate(seen):
+    for i, names in enumerate(observed):
         if names not in orders:
             absent = [name for name in wanted if name not in names]
             if absent:
@@ -447,11 +446,11 @@ def _visits(points: PooledRecords, chosen: IntArray, per_pose: int | None) -> In
     markers = [points.labels["marker"][i] for i in chosen] if "marker" in points.labels else []
     if len(set(markers)) < 2:
         return np.arange(n)
-    visit, seen, codes = 0, set[str](), []
+    visit, observed, codes = 0, set[str](), []
     for k, marker in enumerate(markers):
-        if marker in seen and marker != markers[k - 1]:
-            visit, seen = visit + 1, set()
-        seen.add(marker)
+        if marker in observed and marker != markers[k - 1]:
+            visit, observed = visit + 1, set()
+        observed.add(marker)
         codes.append(visit)
     return np.array(codes)
 

@@ -1,4 +1,4 @@
-"""One file as the mapping reads it: numbers with units, texts, times, and what was left out."""
+"""One exported file as the mapping reads it: columns, numbers with units, texts, times."""
 
 from __future__ import annotations
 
@@ -30,10 +30,9 @@ from elastocal.importing.foreign_text import (
     table_rows,
     unit_in_comments,
 )
-from elastocal.importing.schema import NamesTable, SourceTable, TextTable, UnitsTable
-from elastocal.tables import Array, IntArray
+from elastocal.importing.mapping_file import NamesTable, SourceTable, TextSourceKeys, UnitsTable
 from elastocal.text import is_label, listed, quoted
-from elastocal.units import convert
+from elastocal.units import Array, IntArray, convert
 
 MAX_ROWS = 2_000_000
 DECIMAL_SAMPLE = 2000
@@ -88,7 +87,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     A row with an empty cell where a number belongs is passed over and listed.
     Raises InputError that names file, line, column, what was found and what to do.
     """
-    settings = source.text or TextTable()
+    settings = source.text or TextSourceKeys()
     asked = wanted(where, source.columns or {}, source.optional or {})
     text = read_lines(path, settings.encoding or "auto")
     table = _table(text, settings, asked)
@@ -132,7 +131,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     return reader.records(understood, source)
 
 
-def _table(text: Text, settings: TextTable, asked: Wanted) -> Rows:
+def _table(text: Text, settings: TextSourceKeys, asked: Wanted) -> Rows:
     kind = settings.format or "table"
     if kind != "table":
         return (krl_rows if kind == "krl" else rapid_rows)(text)
@@ -410,13 +409,13 @@ def _labels_of_names(
 
 def _taken(records: Records, keep: np.ndarray, reasons: tuple[tuple[int, str], ...]) -> Records:
     """The rows `keep`; the others are listed as passed over."""
-    seen = records.understood
-    ignored = tuple(sorted([*seen.ignored, *reasons]))
+    observed = records.understood
+    ignored = tuple(sorted([*observed.ignored, *reasons]))
     return replace(
         records,
         line=records.line[keep],
         numbers={stem: values[keep] for stem, values in records.numbers.items()},
         texts={stem: [texts[i] for i in keep] for stem, texts in records.texts.items()},
         time=None if records.time is None else records.time[keep],
-        understood=replace(seen, rows=len(keep), ignored=ignored),
+        understood=replace(observed, rows=len(keep), ignored=ignored),
     )

@@ -1,7 +1,43 @@
-"""The measurement plan: which poses make the parameters, or what they predict, most certain.
+"""Measurement plans: criteria, certified relaxation, exchange, polish, feasibility, order."""
 
-A plan is judged by a criterion Φ of its information matrix M = M₀ + Σ_i B_iᵀ Σ_i⁻¹ B_i
-(`criterion` says what that is, `criteria` lists those that there are).  The relaxation gives the
-best weights over all candidates and with them a bound that no plan falls below; exchange makes a
-plan of whole poses, and polish moves these off the candidates.
-"""
+from elastocal import loaded_on_demand
+
+ROOMS = {
+    "bodies": (
+        "Body Pair capsule_between cell_bodies coal_shape data_base few_points hull mesh_hull "
+        "rotation_to support touches"
+    ),
+    "candidates": "Candidates JointSpace draw feasible joint_space sobol",
+    "collision": "Collisions Kinematics MotionBound StaticTorque arm_configuration arm_model",
+    "continuum": "estimate",
+    "criteria": (
+        "DeterminantCriterion GCriterion SpectralCriterion TraceCriterion criterion_named "
+        "make_criterion register"
+    ),
+    "criterion": "Criterion CriterionInputs ScenarioCriterion",
+    "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
+    "exchange": (
+        "Exchanged best_addition fitted greedy_plan information_without random_plan "
+        "regular_plan values_without"
+    ),
+    "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",
+    "feasibility": "Feasibility PoseFeasibility",
+    "information": "Estimable LoadStates PoseInformation load_states measured next_number rows_of",
+    "information_matrices": "candidate_sums",
+    "interior_point": "pieces_of",
+    "moves": "Blockers Unreachable",
+    "plan": (
+        "Certificate Chance Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
+        "write_plan_json"
+    ),
+    "polish": "Goal LocalSearch PlanValue Searches Sensitivity search_all symbolic_blocks",
+    "pose_margins": "excess margins signed_distance smooth_min sphere_cover",
+    "programs": "krl_program load_name number plain urscript_program",
+    "relaxation": "CandidatePool relax",
+    "search": "Checkpoint DesignOptions DesignSearch Effort Selection Stage key_of ordered",
+    "selection_problem": "DesignProblem efficiency largest_sum lower_bound tangent_bound",
+    "setup": "FeasiblePool Known Setup set_up shares_of",
+    "test_poses": "TargetPoses check_cell prediction_rows",
+}
+__all__ = [name for names in ROOMS.values() for name in names.split()]
+__getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

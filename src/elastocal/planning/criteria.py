@@ -38,15 +38,9 @@ from elastocal.planning.criterion import (
     power_mean,
     power_mean_slope,
 )
-from elastocal.planning.information_matrices import (
-    Array,
-    IntArray,
-    Interest,
-    Variances,
-    trustworthy,
-    whitened_rows,
-)
+from elastocal.planning.information_matrices import Interest, Variances, trustworthy, whitened_rows
 from elastocal.text import did_you_mean, is_label, listed, quoted
+from elastocal.units import Array, IntArray
 
 Registered = TypeVar("Registered", bound=type[ScenarioCriterion])
 

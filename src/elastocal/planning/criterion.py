@@ -17,8 +17,9 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.planning.information_matrices import Array, IntArray, Interest, candidate_sums
+from elastocal.planning.information_matrices import Interest, candidate_sums
 from elastocal.text import did_you_mean, listed, quoted
+from elastocal.units import Array, IntArray
 
 Robust = Literal["none", "average", "worst"]
 Need = Literal["test_poses", "combination"]

@@ -1,22 +1,15 @@
-"""Exchange: a plan of whole poses that none of the pool betters in another's place.
-
-Plans are sorted indices (n_poses,) into the candidates.  Here is what an exchange starts from
-(random, greedy, regular plans), the exchange of single poses itself, and the iterated search that
-leaves its local optima; `exact_plan` runs it from many starts.
-"""
+"""Exact plans by exchange: from weights to whole poses, and no single pose betters the plan."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from elastocal.design.problem import DesignProblem
 from elastocal.errors import InsufficientDataError
-from elastocal.planning.information_matrices import SINGULAR, Array, IntArray, factorise
-
-Mask = NDArray[np.bool_]
+from elastocal.planning.information_matrices import SINGULAR, factorise
+from elastocal.planning.selection_problem import DesignProblem
+from elastocal.units import Array, BoolArray, IntArray
 
 # Relative gain in Φ below which an exchange is not made: rounding must not decide.
 IMPROVEMENT = 1e-9
@@ -53,7 +46,7 @@ class _State:
     chosen: IntArray
     value: float
     d: Array
-    free: Mask
+    free: BoolArray
 
     @classmethod
     def of(cls, problem: DesignProblem, chosen: IntArray) -> _State:

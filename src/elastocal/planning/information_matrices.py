@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InsufficientDataError, require
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from elastocal.units import Array, IntArray
 
 # Matrices (..., S, p, p) that a batched evaluation holds at once, as numbers.
 BATCH_NUMBERS = 2_000_000

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from elastocal.design.certificate import largest_sum
 from elastocal.planning.criterion import Criterion, Gradient, ScenarioCriterion, Term, Worst
-from elastocal.planning.information_matrices import Array, IntArray
+from elastocal.planning.selection_problem import largest_sum
+from elastocal.units import Array, IntArray
 
 MOST_STEPS = 100
 TO_BOUNDARY = 0.99

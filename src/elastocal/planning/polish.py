@@ -1,14 +1,9 @@
-"""Polish: the poses of an exact plan moved off the pool by local search, one after the other.
-
-IPOPT moves one pose at a time: joint limits are its bounds, the cell's margins its constraints, and
-the slope of its goal comes through the symbolic B.  What it finds counts only where the exact
-criterion improves and the cell's own rules hold.
-"""
+"""Polish: poses of a plan moved off the pool within joint limits and clearances."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -16,20 +11,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.design.candidates import Checker, feasible
-from elastocal.design.feasibility.pairs import Pair
-from elastocal.design.information import PoseInformation
-from elastocal.design.joint_space import JointSpace
-from elastocal.design.problem import DesignProblem
 from elastocal.errors import require
-from elastocal.manipulator.symbolic import SymbolicArm
-from elastocal.manipulator.symbolic_rows import configuration_rows
+from elastocal.model.symbolic import SymbolicArm, configuration_rows
+from elastocal.planning.bodies import Pair
+from elastocal.planning.candidates import Checker, JointSpace, feasible
 from elastocal.planning.criterion import Criterion
-from elastocal.planning.information_matrices import Array, IntArray
+from elastocal.planning.information import PoseInformation
 from elastocal.planning.pose_margins import margins
-
-Progress = Callable[[str], None]
-
+from elastocal.planning.selection_problem import DesignProblem
+from elastocal.units import Array, IntArray, Progress
 
 ORDER = 20.0  # of the power means that stand for a criterion's kinks while IPOPT searches
 SHORTLIST = 200  # candidates by sensitivity among which a pose's further starts are sought

@@ -17,16 +17,14 @@ from itertools import product
 import casadi as ca
 import numpy as np
 
-from elastocal.cell import Cell, HalfSpace, Solid
-from elastocal.design.feasibility.bodies import Body, data_base
-from elastocal.design.feasibility.carriers import HANGING, WORLD
-from elastocal.design.feasibility.contact_rules import POSE_SLACK
-from elastocal.design.feasibility.pairs import Pair
-from elastocal.design.feasibility.shapes import few_points, mesh_hull
-from elastocal.manipulator import rigid
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.effects.loads import STANDARD_GRAVITY
-from elastocal.planning.information_matrices import Array
+from elastocal.cell.work_cell import Cell
+from elastocal.cell.workspace_rules import HalfSpace, Solid
+from elastocal.model import rigid
+from elastocal.model.chain import Chain
+from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base, few_points, mesh_hull
+from elastocal.planning.feasibility import POSE_SLACK
+from elastocal.units import Array
 
 SMOOTHING = 1e-3  # m over which several distances blend into one
 MOST_SPHERES = 6  # spheres along an edge of a box

@@ -16,12 +16,12 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from elastocal.design.certificate import tangent_bound
-from elastocal.design.problem import DesignProblem
 from elastocal.errors import InsufficientDataError, require
 from elastocal.planning.criterion import Cone, Criterion, Gradient, ScenarioCriterion, Worst
-from elastocal.planning.information_matrices import BATCH_NUMBERS, Array, IntArray
+from elastocal.planning.information_matrices import BATCH_NUMBERS
 from elastocal.planning.interior_point import NewtonMaster, Restricted, pieces_of
+from elastocal.planning.selection_problem import DesignProblem, tangent_bound
+from elastocal.units import Array, IntArray
 
 Method = Literal["auto", "first-order", "conic"]
 

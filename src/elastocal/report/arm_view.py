@@ -8,32 +8,36 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from elastocal.cell import Cell
+from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Solid
-from elastocal.design.feasibility.bodies import Body, cell_bodies, skeleton
-from elastocal.design.feasibility.carriers import WORLD
-from elastocal.design.feasibility.frames import Kinematics
-from elastocal.design.feasibility.shapes import hull, mesh_hull
-from elastocal.design.feasibility.urdf_bodies import urdf_bodies
-from elastocal.design.plan import Plan
 from elastocal.errors import ElastocalError
-from elastocal.manipulator.chain import Chain
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import Observations
+from elastocal.model.chain import Chain
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
+from elastocal.planning.bodies import (
+    WORLD,
+    Body,
+    cell_bodies,
+    hull,
+    mesh_hull,
+    skeleton,
+    urdf_bodies,
+)
+from elastocal.planning.collision import Kinematics
+from elastocal.planning.plan import Plan
 from elastocal.report.figures import ARM, FAINT, SERIES, drawn
 from elastocal.report.formatting import length, printable, short_name
 from elastocal.report.plan_picture import INK
 from elastocal.report.plan_view import first_stops, joint_text
+from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
     from markupsafe import Markup
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+
 MOST_TRIANGLES = 8000  # of all bodies together; more make the page slow and large
 MERIDIANS, PARALLELS = 14, 3  # of a cap
 # Radii of the first and the last link over the arm's length, where none are stated.
@@ -314,31 +318,31 @@ MOST_POSES = 80  # in the page; of more, those with the largest residuals and a 
 WORST = 30
 
 
-def residual_space(model: Model, seen: Observations, x: Array, residual: Array) -> Space:
+def residual_space(model: Model, observed: Observations, x: Array, residual: Array) -> Space:
     """One pose per configuration and load, its arrows the mean residual of each marker.
 
     `residual` (rows,) is observed minus predicted at parameter values x (parameters,); of a pose
     the position counts, a distance's residual lies along the line from its anchor.
     """
-    table = seen.table
-    force = np.round(table.force[seen.lead], 3)
-    key = np.column_stack([seen.configuration, force])
+    table = observed.table
+    force = np.round(table.force[observed.lead], 3)
+    key = np.column_stack([observed.configuration, force])
     _, first, entry = np.unique(key, axis=0, return_index=True, return_inverse=True)
     entry = entry.ravel()
-    vectors = residual_vectors(model, seen, x, residual)
+    vectors = residual_vectors(model, observed, x, residual)
     rms = np.sqrt(np.bincount(entry, (vectors**2).sum(axis=1)) / np.bincount(entry))
     chosen = _chosen(rms, np.argsort(first))
-    rows = seen.lead[first[chosen]]
+    rows = observed.lead[first[chosen]]
     frames, flange = frames_at(
         model.cell, model.chain, table.q[rows], model.flange_poses(table.take(rows), x)
     )
-    at = marker_positions(model, seen, x)
+    at = marker_positions(model, observed, x)
     several = len(np.unique(force, axis=0)) > 1
     poses = []
     for k, code in enumerate(chosen):
         own = np.flatnonzero(entry == code)
-        markers = np.unique(table.marker[seen.lead[own]])
-        groups = [own[table.marker[seen.lead[own]] == m] for m in markers]
+        markers = np.unique(table.marker[observed.lead[own]])
+        groups = [own[table.marker[observed.lead[own]] == m] for m in markers]
         name = table.configuration_labels[table.configuration[rows[k]]]
         poses.append(
             Posed(
@@ -369,13 +373,13 @@ def view_caption(space: Space, configurations: int) -> str:
     return text
 
 
-def time_caption(seen: Observations) -> str:
+def time_caption(observed: Observations) -> str:
     """What the figure over time shows, and what it would mean."""
     text = (
         "{}; lines are means with twice their standard error. A slope is a drift, a step something "
         "that moved."
     )
-    if seen.table.time is None:
+    if observed.table.time is None:
         return text.format("In the order of the table, which has no column time_s or time_min")
     return text.format("Over time")
 
@@ -390,22 +394,22 @@ def _chosen(rms: Array, order: IntArray) -> IntArray:
     return order[np.isin(order, np.concatenate([worst, drawn]))]
 
 
-def residual_vectors(model: Model, seen: Observations, x: Array, residual: Array) -> Array:
+def residual_vectors(model: Model, observed: Observations, x: Array, residual: Array) -> Array:
     """Residuals (N, 3) in m as vectors in the data's frame."""
-    parts = residual.reshape(-1, seen.size)
-    if seen.kind != "distance":
+    parts = residual.reshape(-1, observed.size)
+    if observed.kind != "distance":
         return np.asarray(parts[:, :3])
     anchor = model.cell.tracker.anchor
-    line = marker_positions(model, seen, x) - (np.zeros(3) if anchor is None else anchor)
+    line = marker_positions(model, observed, x) - (np.zeros(3) if anchor is None else anchor)
     return np.asarray(parts * line / np.linalg.norm(line, axis=1, keepdims=True))
 
 
-def marker_positions(model: Model, seen: Observations, x: Array) -> Array:
+def marker_positions(model: Model, observed: Observations, x: Array) -> Array:
     """Where the markers (N, 3) were seen, or where the model puts them if only a distance was."""
-    table = seen.table
+    table = observed.table
     if table.position is not None:
-        return np.asarray(table.position[seen.lead])
-    return model.target_poses(table, x)[1][seen.lead]
+        return np.asarray(table.position[observed.lead])
+    return model.target_poses(table, x)[1][observed.lead]
 
 
 def _load(force: Array) -> str:

@@ -246,12 +246,12 @@ def error_line(result: Calibration) -> str:
 
 
 def readings(result: Calibration) -> str:
-    seen = result.observations
-    poses = len(np.unique(seen.configuration))
-    markers = len(np.unique(seen.table.marker[seen.lead]))
+    observed = result.observations
+    poses = len(np.unique(observed.configuration))
+    markers = len(np.unique(observed.table.marker[observed.lead]))
     return (
-        f"{len(seen.lead)} {READINGS[seen.kind]} in {counted(poses, 'configuration')}, "
-        f"{counted(markers, 'marker')} ({printable(seen.table.source)})"
+        f"{len(observed.lead)} {READINGS[observed.kind]} in {counted(poses, 'configuration')}, "
+        f"{counted(markers, 'marker')} ({printable(observed.table.source)})"
     )
 
 

@@ -7,14 +7,13 @@ from statistics import median
 
 import numpy as np
 
-from elastocal.identification.constrained.minimise import ActiveConstraint
+from elastocal.identification.constrained import ActiveConstraint
+from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.findings import shape_of
+from elastocal.identification.noise_structure import REGISTERED, SHARED
 from elastocal.identification.noise_summary import Noise, NoiseSize
-from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
+from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
-from elastocal.identification.robust.report import FaultyGroup
-from elastocal.identification.variance.choose import SHARED
-from elastocal.identification.variance.structure import REGISTERED
 from elastocal.report.formatting import display, length, plain, printable, significant
 from elastocal.tracker_noise import available_noise
 
@@ -265,12 +264,12 @@ def _is_estimated(result: Calibration) -> bool:
 
 def _why_not_judged(result: Calibration) -> str:
     """What is missing for a comparison of the residual with stated noise."""
-    seen, tracker = result.observations, result.model.cell.tracker
-    stated = available_noise(seen.table, tracker) != "none"
-    if seen.kind == "distance":
+    observed, tracker = result.observations, result.model.cell.tracker
+    stated = available_noise(observed.table, tracker) != "none"
+    if observed.kind == "distance":
         stated = tracker.distance_sigma is not None
     nothing_says = "so nothing says how small the residual should be"
-    if seen.kind == "pose" and stated != (tracker.rotation_sigma is not None):
+    if observed.kind == "pose" and stated != (tracker.rotation_sigma is not None):
         which = "positions" if stated else "rotations"
         return f"Noise was stated for {which} only, {nothing_says}"
     if stated or result.noise.kind == "covariance":

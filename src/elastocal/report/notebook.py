@@ -11,14 +11,12 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from elastocal.compensation.commands_file import commands_csv, joint_columns, summary
-from elastocal.compensation.compensate import Compensation
-from elastocal.design.plan import Plan
-from elastocal.diagnosis.result import Diagnosis
+from elastocal.compensation.compensate import Compensation, commands_csv, joint_columns, summary
+from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import InputError
 from elastocal.identification.result import Calibration
+from elastocal.planning.plan import Plan
 from elastocal.report.diagnosis_view import (
     BUDGET_HEADS,
     CANDIDATE_HEADS,
@@ -47,11 +45,11 @@ from elastocal.report.terminal import (
     plan_text,
 )
 from elastocal.text import did_you_mean, listed, quoted
+from elastocal.units import Array
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
 MOST_BARS = 40
 
 

@@ -1,4 +1,4 @@
-"""The reports: each one HTML page that needs no network and no other file."""
+"""Results as one HTML page each: identification, plan, diagnosis, compensation."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import hashlib
 import math
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata, resources
@@ -14,13 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from elastocal import __version__
-from elastocal.design.plan import Plan
-from elastocal.diagnosis.result import Diagnosis
+from elastocal.compensation.compensate import Compensation
+from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.files import atomic_write_text, open_input
 from elastocal.identification.error_budget import ErrorBudget, gap_budget
-from elastocal.identification.residual_summary import ResidualSummary
-from elastocal.identification.result import Calibration, Outlier
-from elastocal.manipulator.model import Model
+from elastocal.identification.outliers import Outlier
+from elastocal.identification.residuals import ResidualSummary
+from elastocal.identification.result import Calibration
+from elastocal.model.manipulator import Model
+from elastocal.planning.plan import Plan
 from elastocal.report.arm_view import (
     Space,
     marker_positions,
@@ -94,6 +96,7 @@ from elastocal.report.method_and_noise import (
     shape_line,
     size_rows,
 )
+from elastocal.report.notebook import view_of
 from elastocal.report.plan_view import (
     curve_rows,
     interval_rows,
@@ -118,6 +121,8 @@ from elastocal.report.residual_view import (
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+
+# The reports: each one HTML page that needs no network and no other file.
 
 LIBRARIES = ("numpy", "scipy", "casadi")
 Inputs = Mapping[str, str] | Iterable[str | Path] | None
@@ -548,13 +553,13 @@ def _residuals(d: Diagnosis) -> dict[str, Any]:
     base = d.calibrated
     if base is None:
         return {"view": None, "residual_table": None, "view_caption": "", "time_caption": ""}
-    residuals = residuals_by(base.seen, base.residual)
-    space = residual_space(base.model, base.seen, base.x, base.residual)
+    residuals = residuals_by(base.observed, base.residual)
+    space = residual_space(base.model, base.observed, base.x, base.residual)
     return {
         "view": space_json(space),
         "view_caption": view_caption(space, len(residuals.labels)),
-        "time_caption": time_caption(base.seen),
-        "residual_table": residual_table(base.seen, residuals),
+        "time_caption": time_caption(base.observed),
+        "residual_table": residual_table(base.observed, residuals),
     }
 
 
@@ -577,12 +582,93 @@ def _residual_figures(d: Diagnosis) -> dict[str, str]:
     base = d.calibrated
     if base is None:
         return {}
-    residuals = residuals_by(base.seen, base.residual)
-    positions = marker_positions(base.model, base.seen, base.x)
-    space = residual_space(base.model, base.seen, base.x, base.residual)
+    residuals = residuals_by(base.observed, base.residual)
+    positions = marker_positions(base.model, base.observed, base.x)
+    space = residual_space(base.model, base.observed, base.x, base.residual)
     return {
         "against_joints": against_joints(base.model.chain.kinds, residuals),
-        "over_time": over_time(base.seen, residuals),
+        "over_time": over_time(base.observed, residuals),
         "by_region": by_region(positions, residuals.value[:, : residuals.positions]),
         "space": space_picture(space, "Residuals of the calibrated arm as arrows"),
     }
+
+
+# The report of any result, as `Result.report` asks for it: one HTML page.
+
+
+def write_page(
+    result: object, path: Path, inputs: Inputs, command: str | None, seed: int | None
+) -> None:
+    """Write the result's page, whole or not at all; `inputs` None are the files it came from.
+
+    Raises InputError where an input cannot be read or `path` cannot be written.
+    """
+    write = next(write for kind, write in PAGES.items() if isinstance(result, kind))
+    write(result, path, inputs, command, seed)
+
+
+def _calibration(
+    fit: Calibration, path: Path, inputs: Inputs, command: str | None, seed: int | None
+) -> None:
+    files = _files(fit.model, fit.observations.table.source) if inputs is None else inputs
+    write_identification_report(fit, path, command=command, inputs=files, seed=seed)
+
+
+def _plan(plan: Plan, path: Path, inputs: Inputs, command: str | None, seed: int | None) -> None:
+    write_plan_report(plan, path, command, _files(plan.model) if inputs is None else inputs)
+
+
+def _diagnosis(
+    found: Diagnosis, path: Path, inputs: Inputs, command: str | None, seed: int | None
+) -> None:
+    assert found.model is not None  # `diagnose` states it
+    files = _files(found.model, found.data) if inputs is None else inputs
+    write_diagnosis_report(
+        found, found.model, path, found.data, command=command, inputs=files, seed=seed
+    )
+
+
+def _compensation(
+    found: Compensation, path: Path, inputs: Inputs, command: str | None, seed: int | None
+) -> None:
+    from markupsafe import Markup
+
+    view = view_of(found)
+    table = Path(found.targets.table.source)
+    files = [table] if inputs is None and table.is_file() else inputs
+    figures = [
+        Markup('<img alt="{}" src="data:image/png;base64,{}">').format(
+            kind, _png(view, found, kind)
+        )
+        for kind in view.figures
+    ]
+    page = render(
+        "compensation.html.j2",
+        printable(found.chain.name),
+        Repeat(command, files, seed),
+        shown=Markup(view.html(found)),
+        drawn=figures,
+    )
+    atomic_write_text(path, page)
+
+
+def _png(view: Any, found: Compensation, kind: str) -> str:
+    import io
+
+    picture = io.BytesIO()
+    view.plot(found, kind, False).savefig(picture, format="png", dpi=110)
+    return base64.b64encode(picture.getvalue()).decode()
+
+
+def _files(model: Model, *tables: str) -> list[Path]:
+    """The cell and the tables, as far as they are files."""
+    named = [model.cell.path, *map(Path, tables)]
+    return [path for path in named if path is not None and Path(path).is_file()]
+
+
+PAGES: dict[type, Callable[[Any, Path, Inputs, str | None, int | None], None]] = {
+    Calibration: _calibration,
+    Plan: _plan,
+    Diagnosis: _diagnosis,
+    Compensation: _compensation,
+}

@@ -8,21 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from elastocal.cell import Cell
+from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Solid
-from elastocal.design.feasibility.frames import Kinematics
-from elastocal.design.feasibility.shapes import CORNERS, mesh_hull
 from elastocal.errors import require
 from elastocal.files import atomic_writer
-from elastocal.manipulator.chain import Chain
+from elastocal.model.chain import Chain
+from elastocal.planning.bodies import CORNERS, mesh_hull
+from elastocal.planning.collision import Kinematics
+from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 ROUND = 49  # points of a full circle; a multiple of 4, and the first again
 LENGTHWISE = 4  # lines along a cylinder or capsule
 
@@ -31,7 +30,7 @@ def wireframe(solid: Solid) -> list[Array]:
     """Polylines (k, 3) in m in the carrier's frame that show the solid's edges or outline."""
     if solid.shape == "mesh":
         points, triangles = mesh_hull(solid)
-        lines = [points[[*triangle, triangle[0]]] for triangle in triangles]
+        lines = [points[[*r_factor, r_factor[0]]] for r_factor in triangles]
     else:
         lines = {"box": _box, "sphere": _sphere, "cylinder": _cylinder, "capsule": _capsule}[
             solid.shape
@@ -73,7 +72,6 @@ def _capsule(size: Array) -> list[Array]:
     return [*_cylinder(size), *up, *down]
 
 
-IntArray = NDArray[np.int64]
 SUFFIXES = (".png", ".svg")
 # Okabe and Ito's colours: told apart by colour-blind readers; each group has its own sign too.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")

@@ -6,10 +6,9 @@ import math
 
 import numpy as np
 
-from elastocal.design.plan import Plan
-from elastocal.design.reasons import Predicted, Reason
 from elastocal.errors import option
 from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.plan import Plan, Predicted, Reason
 from elastocal.report.formatting import TextTable, Tone, counted, display, printable, significant
 
 TOLD = 2  # parameters that a pose serves, in the table

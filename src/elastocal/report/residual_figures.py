@@ -6,20 +6,20 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.estimates import CORRELATED
-from elastocal.identification.residual_summary import GroupSummary, ResidualSummary
+from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
-from elastocal.manipulator.observation import Observations
+from elastocal.model.observations import Observations
 from elastocal.report.arm_view import Space
 from elastocal.report.figures import FAINT, SERIES, dots, drawn
 from elastocal.report.formatting import length, short_name, significant
 from elastocal.report.identification_view import rms_by_kind
 from elastocal.report.plan_picture import INK
 from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
+from elastocal.units import Array
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -282,16 +282,15 @@ def _histogram_bars(axes: Axes, group: GroupSummary, edges: np.ndarray, label: s
     axes.set_xlabel("; ".join(text for text in (label, beyond) if text))
 
 
-Array = NDArray[np.float64]
 CELLS = 6  # of the work space's longest side
 FEWEST = 3  # readings from which on a cell is told
 MOST_IN_MATRIX = 48  # of the correlation matrix
 MOST_WRITTEN = 16  # parameters up to which the numbers are written into it
 
 
-def over_time(seen: Observations, residuals: Residuals) -> str:
+def over_time(observed: Observations, residuals: Residuals) -> str:
     """Residual of every reading over time, or over the table's order where no time was recorded."""
-    table, lead = seen.table, seen.lead
+    table, lead = observed.table, observed.lead
     n = residuals.positions
     if table.time is None:
         at, label = np.arange(len(lead), dtype=float), "reading, in the order of the table"

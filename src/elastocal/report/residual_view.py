@@ -8,14 +8,13 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.noise import WeightKind, weights_for
-from elastocal.identification.residual_groups import groupings
-from elastocal.identification.residual_summary import ResidualSummary, summarise_residuals
+from elastocal.identification.residuals import ResidualSummary, groupings, summarise_residuals
 from elastocal.identification.result import Calibration
-from elastocal.manipulator.observation import COMPONENTS, Observations
+from elastocal.identification.weighted_problem import WeightKind, weights_for
+from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.report.formatting import TextTable, printable, significant
+from elastocal.units import Array
 
-Array = NDArray[np.float64]
 MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice of them
 
 
@@ -48,15 +47,15 @@ def residuals_of(result: Calibration) -> Residuals:
     return residuals_by(result.observations, result.residual)
 
 
-def residuals_by(seen: Observations, residual: Array) -> Residuals:
+def residuals_by(observed: Observations, residual: Array) -> Residuals:
     """Residuals (rows,) in m (rad) by observation."""
-    table = seen.table
-    value = residual.reshape(-1, seen.size) * 1e6
-    names = COMPONENTS[seen.kind]
-    codes, first, pose = np.unique(seen.configuration, return_index=True, return_inverse=True)
+    table = observed.table
+    value = residual.reshape(-1, observed.size) * 1e6
+    names = COMPONENTS[observed.kind]
+    codes, first, pose = np.unique(observed.configuration, return_index=True, return_inverse=True)
     order = np.argsort(first)
     place = np.argsort(order)
-    used, marker = np.unique(table.marker[seen.lead], return_inverse=True)
+    used, marker = np.unique(table.marker[observed.lead], return_inverse=True)
     n = len(value)
     shown = np.arange(n)
     if n > MOST_DRAWN:
@@ -69,7 +68,7 @@ def residuals_by(seen: Observations, residual: Array) -> Residuals:
         labels=tuple(table.configuration_labels[codes[k]] for k in order),
         marker=marker,
         markers=tuple(table.marker_names[k] for k in used),
-        q=table.q[seen.lead],
+        q=table.q[observed.lead],
         shown=shown,
     )
 
@@ -84,15 +83,15 @@ def summary_of(result: Calibration) -> ResidualSummary | None:
 def standardised(result: Calibration) -> Array:
     """Weighted residuals (rows,) over their standard deviation; unweighted where the result does
     not hold the weights: those of a given matrix or of an estimated noise."""
-    seen, kind = result.observations, result.noise.kind
+    observed, kind = result.observations, result.noise.kind
     if result.method == "wls" and kind in ("rows", "axis", "polar"):
-        weights = weights_for(seen, result.model.cell.tracker, cast(WeightKind, kind))
+        weights = weights_for(observed, result.model.cell.tracker, cast(WeightKind, kind))
         whitened = weights.apply(result.residual)
         return np.asarray(whitened) / result.sigma
-    parts = result.residual.reshape(-1, seen.size)
+    parts = result.residual.reshape(-1, observed.size)
     spread = np.sqrt((parts**2).mean(axis=0))
     if kind == "none":
-        spread = np.full(seen.size, result.sigma)
+        spread = np.full(observed.size, result.sigma)
     return (parts / np.where(spread > 0, spread, 1.0)).ravel()
 
 
@@ -140,7 +139,7 @@ MOST_CONFIGURATIONS = 200
 Rows = list[tuple[str, ...]]
 
 
-def residual_table(seen: Observations, residuals: Residuals) -> TextTable:
+def residual_table(observed: Observations, residuals: Residuals) -> TextTable:
     """Mean, rms and largest residual of every direction, marker, load state and configuration.
 
     Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
@@ -154,11 +153,11 @@ def residual_table(seen: Observations, residuals: Residuals) -> TextTable:
         rows.append((name, str(len(value)), _signed(value.mean()), _size(value), _signed(largest),
                      unit))  # fmt: skip
     part = residuals.value[:, : residuals.positions]
-    every = np.ones(len(seen.value), dtype=bool)
-    for labels in groupings(seen, every):
+    every = np.ones(len(observed.value), dtype=bool)
+    for labels in groupings(observed, every):
         if labels.by == "component":
             continue
-        code = labels.code[:: seen.size]
+        code = labels.code[:: observed.size]
         groups[len(rows)] = labels.by
         rows += _group_rows(part, code, labels.names[:MOST_CONFIGURATIONS])
     return TextTable(HEADS, rows, words=(0, 5), groups=groups)

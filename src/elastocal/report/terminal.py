@@ -11,12 +11,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from elastocal.compensation.commands_file import summary
-from elastocal.compensation.compensate import Compensation
-from elastocal.design.plan import Plan
-from elastocal.diagnosis.result import Diagnosis
+from elastocal.compensation.compensate import Compensation, summary
+from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.identification.findings import ALONE
 from elastocal.identification.result import Calibration, Combination, Estimate
+from elastocal.planning.plan import Plan
 from elastocal.report.diagnosis_view import (
     BUDGET_HEADS,
     CANDIDATE_HEADS,

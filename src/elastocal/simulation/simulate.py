@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option
-from elastocal.manipulator.effects.compliances import JointCompliance
-from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
+from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed
 from elastocal.tracker_noise import available_noise, position_covariance
-
-Array = NDArray[np.float64]
+from elastocal.units import Array
 
 
 def values_from(model: Model, chosen: dict[str, float]) -> Array:

@@ -9,23 +9,35 @@ import pytest
 from scipy import stats
 from support.cells import choices, kr270_cell, kr270_chain, random_poses, table_of
 
-from elastocal.cell import Array, CartesianNoise
-from elastocal.diagnosis.baseline import Baseline, fit_baseline
-from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.model_set import Item
-from elastocal.diagnosis.noise import NoiseValues
-from elastocal.diagnosis.result import NoiseFloor
-from elastocal.diagnosis.scene import widths
-from elastocal.diagnosis.separate.contest import DRAWS, Contest
-from elastocal.diagnosis.separate.pool import Pool, joined, pool_of
-from elastocal.diagnosis.separate.rivals import RivalSet
-from elastocal.diagnosis.separate.rows import campaign_of, rows_of
-from elastocal.diagnosis.separate.search import expected, expected_of_random, fewest
-from elastocal.diagnosis.separate.settings import SETTINGS, imitations
+from elastocal.cell.arm_description import CartesianNoise
+from elastocal.diagnosis import (
+    Baseline,
+    Discrimination,
+    Item,
+    NoiseFloor,
+    NoiseValues,
+    RivalSet,
+    VisitPool,
+    campaign_of,
+    expected,
+    expected_of_random,
+    fewest,
+    fit_baseline,
+    imitations,
+    joined,
+    possible,
+    rows_of,
+    visit_pool_of,
+    widths,
+)
+from elastocal.diagnosis.discrimination import DRAWS
+from elastocal.diagnosis.rivals import SETTINGS
 from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
-from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements
-from elastocal.simulation.simulate import simulate, values_from
+from elastocal.model import Model
+from elastocal.simulation import values_from
+from elastocal.simulation.simulate import simulate
+from elastocal.units import Array
 
 FITTED = ("base_frame", "joint_offset", "marker_position")
 RIVALS = (("gear_eccentricity", "joint3"), ("encoder_scale", "joint3"), ("joint_drift", "joint2"))
@@ -49,29 +61,29 @@ def base() -> Baseline:
     spec = replace(
         cell.model, effects=(*cell.model.effects, *choices(["gear_eccentricity:joint3"]))
     )
-    truth = Model.assembled(chain, replace(cell, model=spec))
+    posterior_draw = Model.assembled(chain, replace(cell, model=spec))
     sizes = {"joint3.eccentricity_sin": 2e-4, "joint3.eccentricity_cos": -1e-4}
-    read = simulate(truth, table, values_from(truth, sizes), 3)
+    read = simulate(posterior_draw, table, values_from(posterior_draw, sizes), 3)
     return fit_baseline(Model.assembled(chain, cell), read)
 
 
 @pytest.fixture(scope="module")
-def pool(base: Baseline) -> Pool:
+def pool(base: Baseline) -> VisitPool:
     q = random_poses(base.model.chain, 10, 5)
     late = np.linspace(9000.0, 12000.0, 10)
-    return pool_of(base.model, base.x, base.seen.table, q, None, late, np.zeros((1, 3)))
+    return visit_pool_of(base.model, base.x, base.observed.table, q, None, late, np.zeros((1, 3)))
 
 
 @pytest.fixture(scope="module")
-def contest(base: Baseline, pool: Pool) -> Contest:
-    known = {(h.name, h.where): h for h in possible(base.model, base.seen.table)[0]}
+def discrimination(base: Baseline, pool: VisitPool) -> Discrimination:
+    known = {(h.name, h.where): h for h in possible(base.model, base.observed.table)[0]}
     settings = [[], [], [TIME_CONSTANT]]
     items = [Item(known[k], np.array(s), 0.0) for k, s in zip(RIVALS, settings, strict=True)]
     found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
     diagnosis = type("Found", (), {"noise": found})
     whole = campaign_of(base, pool, [known[k] for k in RIVALS], diagnosis)  # type: ignore
     rivals = RivalSet.of(items, list(PROBABILITY), [])
-    return Contest.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
+    return Discrimination.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
 
 
 def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Array) -> float:
@@ -112,53 +124,56 @@ def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Ar
 
 @pytest.mark.parametrize("chosen", [(), CHOSEN])
 @pytest.mark.parametrize(("a", "b"), [(0, 1), (1, 0), (2, 0)])
-def test_distance_is_that_of_dense_least_squares(base, pool, contest, chosen, a, b) -> None:
-    squared = contest.squared(contest.gram(chosen))[a, b]
+def test_distance_is_that_of_dense_least_squares(base, pool, discrimination, chosen, a, b) -> None:
+    squared = discrimination.squared(discrimination.gram(chosen))[a, b]
     rows = np.flatnonzero(np.isin(pool.table.configuration - 14, chosen))
-    table = joined(base.seen.table, pool.table.take(rows))
+    table = joined(base.observed.table, pool.table.take(rows))
     for k in (0, DRAWS, 2 * DRAWS - 1):
-        expected_square = dense_distance(base, table, a, b, contest.draws[a][k])
+        expected_square = dense_distance(base, table, a, b, discrimination.draws[a][k])
         assert squared[k] == pytest.approx(expected_square, rel=1e-3)
 
 
-def test_adding_each_candidate_is_as_adding_it_by_hand(contest) -> None:
-    each = contest.squared_with_each(contest.gram(CHOSEN))
+def test_adding_each_candidate_is_as_adding_it_by_hand(discrimination) -> None:
+    each = discrimination.squared_with_each(discrimination.gram(CHOSEN))
     for k in range(10):
-        direct = contest.squared(contest.gram((*CHOSEN, k)))
+        direct = discrimination.squared(discrimination.gram((*CHOSEN, k)))
         np.testing.assert_allclose(each[k], direct, rtol=1e-6, atol=1e-6)
 
 
-def test_more_visits_never_bring_rivals_nearer(contest) -> None:
-    before = contest.before
+def test_more_visits_never_bring_rivals_nearer(discrimination) -> None:
+    before = discrimination.before
     for n in range(1, 11):
-        after = contest.squared(contest.gram(range(n)))
+        after = discrimination.squared(discrimination.gram(range(n)))
         assert (after >= before - 1e-6 * (1 + before)).all()
         before = after
 
 
-def test_draws_have_the_mean_of_the_ridge_estimate(base, contest) -> None:
+def test_draws_have_the_mean_of_the_ridge_estimate(base, discrimination) -> None:
     """Antithetic draws average to the estimate, which is nearer the truth than nothing is."""
-    truth = np.array([2e-4, -1e-4]) / 1e-4
-    estimate = contest.draws[0].mean(axis=0)
-    spread = contest.draws[0].std(axis=0)
-    assert (np.abs(estimate - truth) < 4 * spread).all()
-    opposite = contest.draws[0][:DRAWS] + contest.draws[0][DRAWS:]
+    posterior_draw = np.array([2e-4, -1e-4]) / 1e-4
+    estimate = discrimination.draws[0].mean(axis=0)
+    spread = discrimination.draws[0].std(axis=0)
+    assert (np.abs(estimate - posterior_draw) < 4 * spread).all()
+    opposite = discrimination.draws[0][:DRAWS] + discrimination.draws[0][DRAWS:]
     np.testing.assert_allclose(opposite, np.tile(2 * estimate, (DRAWS, 1)))
 
 
-def test_without_visits_the_likeliest_is_named(contest) -> None:
-    assert expected([contest], ()) == pytest.approx(0.5, abs=1e-4)
-    merged = contest.in_classes(np.array([0, 1, 0]))
+def test_without_visits_the_likeliest_is_named(discrimination) -> None:
+    assert expected([discrimination], ()) == pytest.approx(0.5, abs=1e-4)
+    merged = discrimination.in_classes(np.array([0, 1, 0]))
     assert expected([merged], ()) == pytest.approx(0.7, abs=1e-4)
-    assert not contest.in_classes(np.zeros(3, dtype=np.int64)).open and merged.open
+    assert not discrimination.in_classes(np.zeros(3, dtype=np.int64)).open and merged.open
 
 
-def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(contest) -> None:
+def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(discrimination) -> None:
     """P = Σ p_a P(log odds > 0) with log odds ~ N(±(L + δ²/2), δ²), by drawing them."""
     p = np.array([0.7, 0.3])
     two = replace(
-        contest, rivals=replace(contest.rivals, rivals=contest.rivals.rivals[:2], probability=p),
-        draws=contest.draws[:2], before=np.zeros((2, 2, 1)), classes=np.arange(2),
+        discrimination,
+        rivals=replace(
+            discrimination.rivals, rivals=discrimination.rivals.rivals[:2], probability=p
+        ),
+        draws=discrimination.draws[:2], before=np.zeros((2, 2, 1)), classes=np.arange(2),
     )  # fmt: skip
     delta = 2.3
     squared = delta**2 * (1 - np.eye(2))[:, :, None]
@@ -172,38 +187,44 @@ def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(contest) -> N
     assert even.probability(squared) == pytest.approx(stats.norm.cdf(delta / 2))
 
 
-def test_what_the_verdict_calls_alike_is_named_with_no_more_than_it_allows(contest) -> None:
+def test_what_the_verdict_calls_alike_is_named_with_no_more_than_it_allows(discrimination) -> None:
     """However the odds stand: a promise that the verdict cannot keep is none."""
     p = np.array([0.5, 0.5])
     two = replace(
-        contest, rivals=replace(contest.rivals, rivals=contest.rivals.rivals[:2], probability=p),
-        draws=contest.draws[:2], before=np.full((2, 2, 1), -40.0), classes=np.arange(2),
+        discrimination,
+        rivals=replace(
+            discrimination.rivals, rivals=discrimination.rivals.rivals[:2], probability=p
+        ),
+        draws=discrimination.draws[:2], before=np.full((2, 2, 1), -40.0), classes=np.arange(2),
     )  # fmt: skip
     apart = 1 - np.eye(2)[:, :, None]
     assert two.probability(0.99 * ALIKE**2 * apart) == pytest.approx(ALIKE_PROBABILITY)
     assert two.probability(1.01 * ALIKE**2 * apart) > 0.99
 
 
-def test_the_search_finds_the_best_pair_of_visits(contest) -> None:
+def test_the_search_finds_the_best_pair_of_visits(discrimination) -> None:
     """Addition and exchange against all pairs."""
     pairs = [(i, j) for i in range(10) for j in range(i)]
     errors = {
-        pair: float(contest.error_bound(contest.squared(contest.gram(pair)))) for pair in pairs
+        pair: float(discrimination.error_bound(discrimination.squared(discrimination.gram(pair))))
+        for pair in pairs
     }
-    chosen = fewest([contest], 2)
+    chosen = fewest([discrimination], 2)
     assert len(chosen) == 2
     assert errors[max(chosen), min(chosen)] <= min(errors.values()) * (1 + 1e-3)
 
 
-def test_the_plan_beats_random_visits(contest) -> None:
-    chosen = fewest([contest], 2)
+def test_the_plan_beats_random_visits(discrimination) -> None:
+    chosen = fewest([discrimination], 2)
     rng = np.random.default_rng(1)
-    assert expected([contest], chosen) > expected_of_random([contest], len(chosen), rng)
+    assert expected([discrimination], chosen) > expected_of_random(
+        [discrimination], len(chosen), rng
+    )
 
 
-def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, contest) -> None:
+def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, discrimination) -> None:
     """A drift of 1800 s is imitated by the same drift, whatever constant was found for it."""
-    drift = contest.rivals.rivals[2]
+    drift = discrimination.rivals.rivals[2]
     quick = replace(drift, settings=np.array([700.0]))
     found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
     whole = campaign_of(base, pool, [drift.what], type("Found", (), {"noise": found}))
@@ -211,5 +232,5 @@ def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, contest) ->
     drifts = imitations(whole.so_far, NOISE, rivals)[1]
     assert drifts[0].settings[0] == pytest.approx(TIME_CONSTANT)
     assert 1 < len({float(item.settings[0]) for item in drifts}) == len(drifts) <= SETTINGS
-    d = Contest.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
+    d = Discrimination.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
     assert d.distances(d.before)[0, 1] < 0.1

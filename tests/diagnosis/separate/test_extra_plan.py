@@ -10,19 +10,22 @@ import pytest
 from support.cells import DOWN, table_of
 from support.rivals import ECCENTRIC, JUMP_TIME, SCALE, campaign, diagnosis_of, measured
 
-from elastocal.cell import Workspace
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.result import Location
-from elastocal.diagnosis.separate.neighbours import with_neighbours
-from elastocal.diagnosis.separate.order import measuring_order
-from elastocal.diagnosis.separate.plan import plan_extra
-from elastocal.diagnosis.separate.pool import Pool, load_forces
-from elastocal.diagnosis.separate.rivals import Suspects
+from elastocal.cell.workspace_rules import Workspace
+from elastocal.diagnosis import (
+    Location,
+    Suspects,
+    VisitPool,
+    fit_baseline,
+    load_forces,
+    measuring_order,
+    plan_extra,
+    with_neighbours,
+)
 from elastocal.errors import InputError
-from elastocal.manipulator.limits import finite_ranges, joint_limits
-from elastocal.manipulator.model import Model
 from elastocal.measurements import Measurements, read_plan
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.model import Model, finite_ranges, joint_limits
+from elastocal.simulation import expand_plan
+from elastocal.simulation.simulate import simulate
 
 NARROW = {"joint3.eccentricity_sin": 1.5e-4, "joint3.eccentricity_cos": -1e-4}
 
@@ -258,7 +261,7 @@ def test_visits_that_are_due_later_come_later(narrow) -> None:
     rows = table_of(q, DOWN, both=True)
     due = np.array([5000.0, 9000.0, 5000.0])
     rows = replace(rows, time=due[rows.configuration])
-    pool = Pool(q, None, due, np.array([np.zeros(3), DOWN]), rows)
+    pool = VisitPool(q, None, due, np.array([np.zeros(3), DOWN]), rows)
     last = replace(table, q=np.zeros_like(table.q))
     plan = measuring_order(pool, [0, 1, 2], last)
     np.testing.assert_array_equal(plan.q[::2, 0], [0.2, 0.3, 0.1])

@@ -9,18 +9,20 @@ import pytest
 from scipy.special import softmax
 from support.rivals import ECCENTRIC, REPEATABILITY, SCALE, Key, campaign, diagnosis_of, measured
 
-from elastocal.cell import Array
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.noise import NoiseValues
-from elastocal.diagnosis.projection import project
-from elastocal.diagnosis.scene import scene_of
-from elastocal.diagnosis.separate.plan import plan_extra
-from elastocal.diagnosis.separate.pool import joined
-from elastocal.diagnosis.sums import direct
-from elastocal.manipulator.model import Model
+from elastocal.diagnosis import (
+    NoiseValues,
+    diagnosis_data_of,
+    direct,
+    fit_baseline,
+    joined,
+    plan_extra,
+    possible,
+    project,
+)
 from elastocal.measurements import Measurements
-from elastocal.simulation.simulate import expand_plan
+from elastocal.model import Model
+from elastocal.simulation import expand_plan
+from elastocal.units import Array
 
 RIVALS: tuple[Key, ...] = (ECCENTRIC, SCALE)
 RUNS = 60
@@ -31,9 +33,9 @@ def log_evidence(model: Model, table: Measurements, x0: Array, key: Key) -> floa
     """Log marginal likelihood of one effect beside the fitted ones, by the diagnosis' own means."""
     h = next(h for h in possible(model, table)[0] if (h.name, h.where) == key)
     base = fit_baseline(model, table, x0=x0)
-    scene = scene_of(base, [h])
-    at = project(scene.data, NoiseValues(1.0, np.full(6, REPEATABILITY), 1e-3))
-    return float(direct(scene.data.masked(scene.packed(h, np.zeros(0))), at).evidence()[0])
+    dataset = diagnosis_data_of(base, [h])
+    at = project(dataset.data, NoiseValues(1.0, np.full(6, REPEATABILITY), 1e-3))
+    return float(direct(dataset.data.masked(dataset.packed(h, np.zeros(0))), at).evidence()[0])
 
 
 @pytest.mark.long
@@ -43,9 +45,9 @@ def test_the_right_rival_is_named_as_often_as_promised() -> None:
     promised, right = [], []
     rng = np.random.default_rng(11)
     for k in range(RUNS):
-        truth = RIVALS[k % 2]
+        posterior_draw = RIVALS[k % 2]
         values = {SIN: rng.normal(0, 6e-5), COS: rng.normal(0, 6e-5)}
-        if truth == SCALE:
+        if posterior_draw == SCALE:
             values = {"joint3.encoder_scale": rng.normal(0, 1.5e-4)}
         model, table = campaign(values, 1.0, seed=k, n=20)
         x0 = fit_baseline(model, table).x
@@ -65,7 +67,7 @@ def test_the_right_rival_is_named_as_often_as_promised() -> None:
             )
             whole = joined(table, measured(shifted, values, 1000 + k))
         after = {key: log_evidence(model, whole, x0, key) for key in RIVALS}
-        right.append(max(after, key=lambda key: after[key]) == truth)
+        right.append(max(after, key=lambda key: after[key]) == posterior_draw)
     spread = np.sqrt(np.mean(promised) * (1 - np.mean(promised)) / len(right))
     assert 0.75 < np.mean(promised) < 0.97  # else the test could not fail
     assert abs(np.mean(right) - np.mean(promised)) < 2.5 * spread

@@ -8,16 +8,17 @@ import statsmodels.api as sm
 from scipy import optimize
 
 from elastocal.errors import InputError
-from elastocal.identification.constrained.constraints import (
+from elastocal.identification import (
     Bounds,
+    ConstrainedObjective,
     Constraints,
     LinearEquality,
+    ResidualLoss,
     SemidefiniteMatrix,
+    huber,
     non_negative,
+    solve_constrained,
 )
-from elastocal.identification.constrained.objective import Loss, Objective
-from elastocal.identification.constrained.solve import solve_constrained
-from elastocal.identification.robust.tuning import huber
 
 NAMES = tuple("abcdef")
 UNIT = np.array([1e-7, 1e-7, 1e-7, 1e-3, 1e-3, 1e-3])
@@ -115,7 +116,9 @@ def test_huber_resists_what_squares_do_not():
 @pytest.mark.parametrize("size", [1, 3])
 def test_half_the_hessian_is_the_derivative_of_half_the_gradient(size):
     B, y = problem(5, outliers=5)
-    objective = Objective(B * UNIT, y, np.eye(6)[:2], np.ones(2), Loss(1.5, size))
+    objective = ConstrainedObjective(
+        B * UNIT, y, np.eye(6)[:2], np.ones(2), ResidualLoss(1.5, size)
+    )
     x = np.full(6, 0.3)
     K = objective.root(x)
     step = 1e-6

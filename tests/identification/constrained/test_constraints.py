@@ -7,17 +7,17 @@ from hypothesis import strategies as st
 from support.cells import kr270_cell
 
 from elastocal.errors import InputError
-from elastocal.identification.constrained.constraints import (
+from elastocal.identification import (
     Bounds,
     Constraints,
     LinearEquality,
     SemidefiniteMatrix,
     equal,
     non_negative,
+    passivity,
+    physical_constraints,
 )
-from elastocal.identification.constrained.physical import passivity, physical_constraints
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.parameter import Parameter
+from elastocal.model import Model, Parameter
 
 NAMES = ("joint1.compliance", "joint2.compliance", "joint3.offset")
 

@@ -6,18 +6,18 @@ from scipy import stats
 from support.calibration import binomial_band
 
 from elastocal.errors import InputError
-from elastocal.identification.constrained.bootstrap import constrained_bootstrap
-from elastocal.identification.constrained.constraints import (
+from elastocal.identification import (
     Bounds,
     Constraints,
+    GaussianPrior,
     LinearEquality,
     SemidefiniteMatrix,
+    constrained_bootstrap,
     non_negative,
+    profile_intervals,
+    solve_constrained,
+    solve_weighted,
 )
-from elastocal.identification.constrained.intervals import profile_intervals
-from elastocal.identification.constrained.prior import GaussianPrior
-from elastocal.identification.constrained.solve import solve_constrained
-from elastocal.identification.linear import solve_weighted
 
 NAMES = ("a", "b", "c")
 SIZES = np.array([1e-7, 1e-6, 1e-3])

@@ -10,21 +10,21 @@ from support.calibration import measured, with_values
 from support.cells import SLANTED, TABLE_2, kr270_cell, table_of
 
 from elastocal.errors import ElastocalError, InputError
-from elastocal.identification.constrained.constraints import (
+from elastocal.identification import (
     Bounds,
     Constraints,
+    FitProblem,
+    GaussianPrior,
     SemidefiniteMatrix,
+    Weights,
+    constrained_fit,
     equal,
+    fit,
     non_negative,
+    physical_constraints,
+    profile_fit_interval,
 )
-from elastocal.identification.constrained.intervals import profile_fit_interval
-from elastocal.identification.constrained.nonlinear import constrained_fit
-from elastocal.identification.constrained.physical import physical_constraints
-from elastocal.identification.constrained.prior import GaussianPrior
-from elastocal.identification.fit import FitProblem, fit
-from elastocal.identification.noise import Weights
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.model import Model, observe
 
 SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise
 BEARING_X, BEARING_Y = "joint2.off_axis_compliance_x", "joint2.off_axis_compliance_y"
@@ -47,12 +47,12 @@ def problem(seed: int, shifted: int = 0, **values: float) -> FitProblem:
         position = table.position.copy()
         position[np.flatnonzero(table.force.any(axis=1))[:shifted]] += 2e-2
         table = replace(table, position=position)
-    seen = observe(table, "deflection")
-    whiten = sparse.csr_array(sparse.eye_array(len(seen.value)) / SIGMA)
-    sizes = model.sizes(model.regressor(table, model.nominal, None, seen).B)
+    observed = observe(table, "deflection")
+    whiten = sparse.csr_array(sparse.eye_array(len(observed.value)) / SIGMA)
+    sizes = model.sizes(model.regressor(table, model.nominal, None, observed).B)
     columns = np.arange(len(model.names))
     weights = Weights("axis", whiten, True, "")
-    return FitProblem(model, seen, weights, model.nominal, columns, sizes)
+    return FitProblem(model, observed, weights, model.nominal, columns, sizes)
 
 
 @lru_cache

@@ -6,9 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.errors import ElastocalError, InputError
-from elastocal.identification.constrained.constraints import non_negative
-from elastocal.identification.constrained.prior import GaussianPrior, share_of_prior
-from elastocal.identification.constrained.solve import solve_constrained
+from elastocal.identification import GaussianPrior, non_negative, share_of_prior, solve_constrained
 
 NAMES = ("joint1.compliance", "joint2.compliance", "link1.x")
 SIZES = np.array([1e-7, 1e-6, 1e-3])

@@ -7,15 +7,15 @@ from hypothesis import strategies as st
 from scipy import optimize
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.constrained.constraints import (
+from elastocal.identification import (
     Bounds,
     Constraints,
     LinearEquality,
     equal,
     non_negative,
+    solve_constrained,
+    solve_weighted,
 )
-from elastocal.identification.constrained.solve import solve_constrained
-from elastocal.identification.linear import solve_weighted
 
 NAMES = tuple("abcdef")
 # Parameters of the sizes that an arm has: compliances of 1e-7 beside lengths of 1e-3.

@@ -5,7 +5,7 @@ import pytest
 import statsmodels.api as sm
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.covariance.heteroscedastic import classical, hc
+from elastocal.identification import classical, hc
 
 KINDS = ("HC0", "HC1", "HC2", "HC3", "HC4")
 
@@ -158,7 +158,7 @@ def test_a_row_of_leverage_one(kind):
 def test_blocks_of_rows_make_no_difference(monkeypatch):
     B, e = problem(9)
     whole = hc(B, e, "HC2").dof
-    monkeypatch.setattr("elastocal.identification.covariance.heteroscedastic.ENTRIES", 16 * 7)
+    monkeypatch.setattr("elastocal.identification.covariance.ENTRIES", 16 * 7)
     np.testing.assert_allclose(hc(B, e, "HC2").dof, whole, rtol=1e-12)
 
 

@@ -7,10 +7,7 @@ import pytest
 from scipy import stats
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.covariance.parametric_bootstrap import (
-    ParametricBootstrap,
-    parametric_bootstrap,
-)
+from elastocal.identification import ParametricBootstrap, parametric_bootstrap
 
 B = np.random.default_rng(0).normal(size=(25, 3))
 X = np.array([1.0, -2.0, 0.5])

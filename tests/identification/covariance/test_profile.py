@@ -8,14 +8,17 @@ from scipy import stats
 from support.calibration import SPRINGS, cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell import Nominal
+from elastocal.cell.arm_description import Nominal
 from elastocal.errors import ElastocalError, InputError
-from elastocal.identification.covariance.heteroscedastic import classical
-from elastocal.identification.covariance.profile import profile_interval, profile_of
-from elastocal.identification.fit import FitProblem, fit
-from elastocal.identification.noise import weights_for
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.identification import (
+    FitProblem,
+    classical,
+    fit,
+    profile_interval,
+    profile_of,
+    weights_for,
+)
+from elastocal.model import Model, observe
 
 
 def least(B, y):
@@ -168,11 +171,11 @@ def arm(names=FITTED, sigma=5e-5):
     table = table_at(random_poses(model.chain, 8, 0), [[0, 0, 0], [0, 0, -500.0]])
     rng = np.random.default_rng(1)
     truth = true_values(model, rng, anywhere=False)
-    seen = observe(measured(model, table, truth, sigma, rng), "position")
+    observed = observe(measured(model, table, truth, sigma, rng), "position")
     columns = np.array([model.names.index(name) for name in names])
-    sizes = model.sizes(model.regressor(seen.table, truth, None, seen).B)
-    weights = weights_for(seen, model.cell.tracker, "none")
-    problem = FitProblem(model, seen, weights, truth, columns, sizes)
+    sizes = model.sizes(model.regressor(observed.table, truth, None, observed).B)
+    weights = weights_for(observed, model.cell.tracker, "none")
+    problem = FitProblem(model, observed, weights, truth, columns, sizes)
     return problem, fit(problem)
 
 
@@ -206,8 +209,8 @@ def test_refits_beat_holding_the_others():
     value = found.x[j] * 1.2
     x = found.x.copy()
     x[j] = value
-    seen = problem.observations
-    held = seen.value - problem.model.predict(seen.table, x, seen)
+    observed = problem.observations
+    held = observed.value - problem.model.predict(observed.table, x, observed)
     rss = profile_of(problem, found, j)(value)
     assert rss < 0.99 * held @ held
     start = replace(problem, x=x, columns=problem.columns[1:])

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.covariance.cluster import cluster_robust
-from elastocal.identification.covariance.wild_bootstrap import wild_cluster_bootstrap
+from elastocal.identification import cluster_robust, wild_cluster_bootstrap
 
 
 def problem(seed, clusters=6, rows=5, p=3):
@@ -108,7 +107,7 @@ def test_seed_blocks_and_weights(monkeypatch):
     one = wild_cluster_bootstrap(B, y, cluster, draws=99, seed=5)
     other = wild_cluster_bootstrap(B, y, cluster, draws=99, seed=6)
     assert one.weights == "webb" and not np.array_equal(one.top, other.top)
-    monkeypatch.setattr("elastocal.identification.covariance.wild_bootstrap.ENTRIES", 11 * 7)
+    monkeypatch.setattr("elastocal.identification.bootstrap.ENTRIES", 11 * 7)
     again = wild_cluster_bootstrap(B, y, cluster, draws=99, seed=5)
     np.testing.assert_allclose(again.top, one.top, rtol=1e-12)
     B, y, cluster = problem(6, clusters=12)

@@ -6,13 +6,16 @@ from scipy import stats
 from support.calibration import binomial_band
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.robust.asymptotic import asymptotic_covariance
-from elastocal.identification.robust.clustered import clustered_covariance
-from elastocal.identification.robust.loss import Absolute, Huber
-from elastocal.identification.robust.m_estimate import m_estimate
-from elastocal.identification.robust.mm_estimate import mm_estimate
-from elastocal.identification.robust.student_t import student_t
-from elastocal.identification.robust.tuning import huber
+from elastocal.identification import (
+    Absolute,
+    Huber,
+    asymptotic_covariance,
+    clustered_covariance,
+    huber,
+    m_estimate,
+    mm_estimate,
+    student_t,
+)
 
 FITS = {
     "huber": lambda B, y: m_estimate(B, y, huber(3), size=3),

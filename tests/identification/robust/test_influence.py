@@ -8,7 +8,7 @@ from scipy import stats
 from statsmodels.api import OLS
 
 from elastocal.errors import InputError
-from elastocal.identification.robust.influence import influence
+from elastocal.identification import influence
 
 
 def refits(B, y, labels, size):

@@ -7,8 +7,11 @@ from hypothesis import strategies as st
 from statsmodels.robust import norms
 
 from elastocal.errors import InputError
-from elastocal.identification.robust.loss import Absolute, Bisquare, Huber, StudentT
-from elastocal.identification.robust.tuning import (
+from elastocal.identification import (
+    Absolute,
+    Bisquare,
+    Huber,
+    StudentT,
     bisquare,
     breakdown_bisquare,
     efficiency,

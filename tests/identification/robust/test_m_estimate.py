@@ -10,12 +10,16 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError
-from elastocal.identification.robust.asymptotic import asymptotic_covariance
-from elastocal.identification.robust.loss import Absolute, Bisquare, Huber
-from elastocal.identification.robust.m_estimate import m_estimate
-from elastocal.identification.robust.mm_estimate import mm_estimate
-from elastocal.identification.robust.student_t import student_t
-from elastocal.identification.robust.tuning import huber
+from elastocal.identification import (
+    Absolute,
+    Bisquare,
+    Huber,
+    asymptotic_covariance,
+    huber,
+    m_estimate,
+    mm_estimate,
+    student_t,
+)
 
 
 def regression(seed, n=120, p=4):

@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.robust.design import design
-from elastocal.identification.robust.mm_estimate import mm_estimate
-from elastocal.identification.robust.s_estimate import DETERMINED, _products, _subset_fits
-from elastocal.identification.robust.tuning import bisquare, breakdown_bisquare
-from elastocal.identification.trimmed import least_trimmed_squares
+from elastocal.identification import (
+    bisquare,
+    breakdown_bisquare,
+    design,
+    least_trimmed_squares,
+    mm_estimate,
+)
+from elastocal.identification.robust_fits import DETERMINED, _products, _subset_fits
 
 
 def least_squares(B, y):

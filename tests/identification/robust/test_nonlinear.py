@@ -4,22 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.calibration import (
-    PLACED,
-    cell_of,
-    measured,
-    planar_chain,
-    table_at,
-    true_values,
-)
+from support.calibration import PLACED, cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
 from elastocal.errors import InputError
-from elastocal.identification.fit import FitProblem, fit
-from elastocal.identification.noise import weights_for
-from elastocal.identification.robust.nonlinear import robust_fit
-from elastocal.manipulator.model import Model
-from elastocal.manipulator.observation import observe
+from elastocal.identification import FitProblem, fit, robust_fit, weights_for
+from elastocal.model import Model, observe
 
 SIGMA = 5e-5
 NAMES = ("huber", "tukey", "l1", "student-t")
@@ -35,13 +25,13 @@ def arm_problem(seed, share=0.0, sigma=SIGMA, poses=40):
     bad = rng.permutation(poses)[: round(share * poses)]
     position = table.position.copy()
     position[bad] += rng.choice([-1.0, 1.0], (len(bad), 3)) * rng.uniform(1e-3, 1e-2, (len(bad), 3))
-    seen = observe(replace(table, position=position), model.observe)
+    observed = observe(replace(table, position=position), model.observe)
     columns = np.arange(len(truth))
     start = truth + 5e-3 * rng.choice([-1.0, 1.0], len(truth))
-    weights = weights_for(seen, model.cell.tracker, "none")
-    problem = FitProblem(model, seen, weights, start, columns, np.full(len(truth), 1e-2))
+    weights = weights_for(observed, model.cell.tracker, "none")
+    problem = FitProblem(model, observed, weights, start, columns, np.full(len(truth), 1e-2))
     # Base and marker share a direction with the first joint: those are held at the truth.
-    B = model.regressor(seen.table, truth, columns, seen).B
+    B = model.regressor(observed.table, truth, columns, observed).B
     _, sizes, directions = np.linalg.svd(B, full_matrices=False)
     if sizes[-1] < 1e-9 * sizes[0]:
         held = int(np.argmax(np.abs(directions[-1])))
@@ -58,8 +48,8 @@ def test_settles_where_the_estimating_equation_holds(name):
     assert found.converged and found.steps < 15
     step = (found.linear.x * np.linalg.norm(found.linear.design.B, axis=0)) / found.scale
     assert np.abs(step).max() < 1e-5
-    seen = problem.observations
-    residual = seen.value - problem.model.predict(seen.table, found.x, seen)
+    observed = problem.observations
+    residual = observed.value - problem.model.predict(observed.table, found.x, observed)
     np.testing.assert_allclose(found.residual, residual, atol=1e-14)
     assert found.weights.shape == (40,)
 

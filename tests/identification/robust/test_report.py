@@ -8,7 +8,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError
-from elastocal.identification.robust.report import FALSE_ALARM, outlier_report
+from elastocal.identification import outlier_report
+from elastocal.identification.outliers import FALSE_ALARM
 
 
 def report(arm, noise, **more):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from statsmodels.robust import HuberScale, scale
 
-from elastocal.identification.robust.scale import m_scale, median_scale, proposal_2
-from elastocal.identification.robust.tuning import breakdown_bisquare
+from elastocal.identification import breakdown_bisquare, m_scale, proposal_2
+from elastocal.identification.robust_core import median_scale
 
 ESTIMATORS = {
     "median": median_scale,

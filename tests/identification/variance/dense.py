@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from elastocal.identification.variance.readings import Readings
+from elastocal.identification import Readings
 
 BY = {
     "configuration": ("configuration",),

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from elastocal.identification.variance.readings import Readings
-from elastocal.identification.variance.search import settle
+from elastocal.identification import Readings
+from elastocal.identification.noise_choice import settle
 
 
 @dataclass(frozen=True)

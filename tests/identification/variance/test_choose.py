@@ -8,8 +8,7 @@ import pytest
 from identification.variance.dense import Table, readings
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.variance.choose import estimate_noise
-from elastocal.identification.variance.structure import noise_models
+from elastocal.identification import estimate_noise, noise_models
 
 BASE = Table(configurations=12, markers=3, repeats=4, unbalanced=False)
 
@@ -169,7 +168,7 @@ def test_few_rows_to_spare_leave_one_variance():
 def test_groups_are_left_out_where_their_matrices_would_be_too_large(monkeypatch):
     r = readings(BASE, 9)
     assert any(t.kind.startswith("groups") for t in estimate_noise(r).trials)
-    monkeypatch.setattr("elastocal.identification.variance.choose.MOST_GROUPS", 11)
+    monkeypatch.setattr("elastocal.identification.noise_choice.MOST_GROUPS", 11)
     assert not any(t.kind.startswith("groups") for t in estimate_noise(r).trials)
 
 

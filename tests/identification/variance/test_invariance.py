@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from identification.variance.dense import Table, readings
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.variance.search import settle
+from elastocal.identification.noise_choice import settle
 
 BASE = Table(configurations=9, markers=3, repeats=4)
 KINDS = [

@@ -7,16 +7,9 @@ import pytest
 from identification.variance.dense import Table, own_parts, readings, shared_part
 from scipy import stats
 
-from elastocal.identification.variance.choose import estimate_noise
-from elastocal.identification.variance.judge import (
-    _fitted,
-    _not_fitted,
-    beyond_noise,
-    own_noise,
-)
-from elastocal.identification.variance.readings import Readings
-from elastocal.identification.variance.screen import screen
-from elastocal.identification.variance.search import FALSE_ALARM, settle
+from elastocal.identification import Readings, beyond_noise, estimate_noise, own_noise, screen
+from elastocal.identification.noise_choice import _deletion_fit, _not_fitted, settle
+from elastocal.identification.outliers import FALSE_ALARM
 
 KINDS = [
     "independent",
@@ -66,7 +59,7 @@ def table(seed=0, **changes):
 def test_fitted_readings_are_judged_as_if_each_were_deleted(kind):
     r = table()
     found = estimate_noise(r, kind)
-    t = _fitted(found, r, own_noise(found.fit, r)[0])
+    t = _deletion_fit(found, r, own_noise(found.fit, r)[0])
     V = dense_covariance(found, r)
     for i in range(len(r)):
         others = np.delete(np.arange(len(r)), i)
@@ -77,7 +70,7 @@ def test_fitted_readings_are_judged_as_if_each_were_deleted(kind):
 def test_other_sizes_are_judged_the_same(size):
     r = table(size=size, markers=1, repeats=4)
     found = estimate_noise(r, "axis+configuration" if size > 1 else "independent+configuration")
-    t = _fitted(found, r, own_noise(found.fit, r)[0])
+    t = _deletion_fit(found, r, own_noise(found.fit, r)[0])
     V = dense_covariance(found, r)
     for i in range(len(r)):
         others = np.delete(np.arange(len(r)), i)
@@ -227,7 +220,7 @@ def test_a_search_that_goes_in_circles_ends_and_keeps_what_was_good_in_between(m
         faulty[[0, 1] if good[0] else [1, 2]] = True
         return faulty
 
-    monkeypatch.setattr("elastocal.identification.variance.search.beyond_noise", undecided)
+    monkeypatch.setattr("elastocal.identification.noise_choice.beyond_noise", undecided)
     verdict = settle(r, "independent")
     assert len(rounds) < 6
     assert set(np.flatnonzero(~verdict.good)) == {1}  # 0 and 2 come and go
@@ -240,6 +233,6 @@ def test_more_than_half_are_never_excluded(monkeypatch, share, kept):
     """Where most readings would have to go, the model is at fault, and all stay."""
     r = table(4, configurations=10)
     faulty = np.arange(len(r)) < share * len(r)
-    judge = "elastocal.identification.variance.search.beyond_noise"
+    judge = "elastocal.identification.noise_choice.beyond_noise"
     monkeypatch.setattr(judge, lambda *_: faulty)
     assert settle(r, "independent").good.all() == kept

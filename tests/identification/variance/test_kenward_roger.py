@@ -4,13 +4,16 @@ import numpy as np
 import pytest
 from identification.variance.dense import Table, dense, readings
 
-from elastocal.identification.covariance.estimate import Covariance
-from elastocal.identification.variance.choose import estimate_noise
-from elastocal.identification.variance.kenward_roger import kenward_roger
-from elastocal.identification.variance.readings import Readings
-from elastocal.identification.variance.reml import reml
-from elastocal.identification.variance.shared import shared_effects
-from elastocal.identification.variance.structure import STRUCTURES, independent
+from elastocal.identification import (
+    Covariance,
+    Readings,
+    estimate_noise,
+    independent,
+    kenward_roger,
+    shared_effects,
+)
+from elastocal.identification.noise_structure import STRUCTURES
+from elastocal.identification.reml import reml
 
 # Yates 1935, as nlme::Oats of R orders it: blocks I to VI; Victory, Golden Rain, Marvellous;
 # nitrogen 0, 0.2, 0.4, 0.6.

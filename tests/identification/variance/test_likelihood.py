@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from identification.variance.dense import Table, dense, readings
 
-from elastocal.identification.variance.blocks import stacks
-from elastocal.identification.variance.likelihood import evaluate, slope
-from elastocal.identification.variance.shared import shared_effects
-from elastocal.identification.variance.structure import STRUCTURES
+from elastocal.identification import evaluate, shared_effects, slope, stacks
+from elastocal.identification.noise_structure import STRUCTURES
 
 TABLES = {
     "size 1": Table(size=1, configurations=5, markers=3, repeats=3, p=3),
@@ -98,7 +96,7 @@ def test_information_is_the_mean_outer_product_of_scores():
 def test_the_stacks_are_cut_small_enough_without_changing_anything(monkeypatch):
     structure, stacked, theta, _ = at_random("loads", "groups", True)
     whole = slope(structure, evaluate(structure, stacked, theta))
-    monkeypatch.setattr("elastocal.identification.variance.blocks.MOST_NUMBERS", 1)
+    monkeypatch.setattr("elastocal.identification.reml.MOST_NUMBERS", 1)
     effects = shared_effects(structure.cells, 3)
     cut = stacks(structure, effects)
     assert len(cut) > len(stacked)

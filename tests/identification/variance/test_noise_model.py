@@ -11,10 +11,7 @@ from identification.variance.dense import Table, readings
 from support.registered import forgotten
 
 from elastocal.errors import InputError
-from elastocal.identification.variance.choose import estimate_noise
-from elastocal.identification.variance.judge import own_noise
-from elastocal.identification.variance.readings import Readings
-from elastocal.identification.variance.structure import NoiseModel, noise_models
+from elastocal.identification import NoiseModel, Readings, estimate_noise, noise_models, own_noise
 from elastocal.plugins import register_noise_model
 
 UNBALANCED = readings(Table(configurations=10, markers=3, repeats=3), 4)

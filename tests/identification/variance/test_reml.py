@@ -10,12 +10,10 @@ from identification.variance.dense import Table, readings
 from scipy import optimize
 from statsmodels.regression.mixed_linear_model import MixedLMParams
 
-from elastocal.identification.variance import reml as module
-from elastocal.identification.variance.blocks import stacks
-from elastocal.identification.variance.likelihood import evaluate
-from elastocal.identification.variance.reml import reml
-from elastocal.identification.variance.shared import shared_effects
-from elastocal.identification.variance.structure import STRUCTURES, by_axis, independent
+from elastocal.identification import by_axis, evaluate, independent, shared_effects, stacks
+from elastocal.identification import reml as module
+from elastocal.identification.noise_structure import STRUCTURES
+from elastocal.identification.reml import reml
 
 
 def mixed_lm(r, **effects):

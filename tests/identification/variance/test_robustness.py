@@ -8,10 +8,8 @@ import pytest
 from identification.variance.dense import Table, readings
 
 from elastocal.errors import InputError
-from elastocal.identification.variance.choose import estimate_noise
-from elastocal.identification.variance.readings import Readings
-from elastocal.identification.variance.search import settle
-from elastocal.identification.variance.structure import noise_models
+from elastocal.identification import Readings, estimate_noise, noise_models
+from elastocal.identification.noise_choice import settle
 
 BASE = Table(configurations=9, markers=3, repeats=4, unbalanced=False)
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from elastocal.identification.variance.readings import Readings
-from elastocal.identification.variance.screen import screen
+from elastocal.identification import Readings, screen
 
 
 def table(configurations=10, each=12):

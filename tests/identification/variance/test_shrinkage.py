@@ -6,13 +6,16 @@ from identification.variance.dense import Table, readings
 from scipy import stats
 
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.variance.blocks import stacks
-from elastocal.identification.variance.likelihood import evaluate
-from elastocal.identification.variance.readings import Readings
-from elastocal.identification.variance.reml import LogPrior, reml
-from elastocal.identification.variance.shared import shared_effects
-from elastocal.identification.variance.shrinkage import NARROWEST, prior_of_groups
-from elastocal.identification.variance.structure import by_group
+from elastocal.identification import (
+    LogPrior,
+    Readings,
+    by_group,
+    evaluate,
+    prior_of_groups,
+    shared_effects,
+    stacks,
+)
+from elastocal.identification.reml import NARROWEST, reml
 
 MEAN = 2 * np.log([1e-5, 2e-5, 6e-5])
 

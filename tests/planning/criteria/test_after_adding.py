@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from planning.criteria.cases import ROBUST, P, blocks, criterion, information, random_information
 
-from elastocal.planning.criteria import CRITERIA, make_criterion
-from elastocal.planning.information_matrices import candidate_sums
+from elastocal.planning import candidate_sums, make_criterion
+from elastocal.planning.criteria import CRITERIA
 
 every_criterion = pytest.mark.parametrize("name", CRITERIA)
 LOW_RANK = ("test_pose", "A", "I", "c", "G", "D", "O1")

@@ -5,13 +5,8 @@ import pytest
 from planning.criteria.cases import INTEREST, P
 
 from elastocal.errors import InputError
-from elastocal.planning.criteria import (
-    CRITERIA,
-    DeterminantCriterion,
-    GCriterion,
-    TraceCriterion,
-    make_criterion,
-)
+from elastocal.planning import DeterminantCriterion, GCriterion, TraceCriterion, make_criterion
+from elastocal.planning.criteria import CRITERIA
 
 A = np.ones((1, 2, 3, P))
 GIVEN = {

@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.planning.criteria import (
-    CRITERIA,
+from elastocal.planning import (
+    CriterionInputs,
+    ScenarioCriterion,
     SpectralCriterion,
     TraceCriterion,
     criterion_named,
     make_criterion,
     register,
 )
-from elastocal.planning.criterion import CriterionInputs, ScenarioCriterion
+from elastocal.planning.criteria import CRITERIA
 
 
 @pytest.fixture(autouse=True)

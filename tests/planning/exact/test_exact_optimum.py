@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.design.problem import DesignProblem
-from elastocal.planning.criteria import make_criterion
+from elastocal.planning import DesignProblem, make_criterion, relax
 from elastocal.planning.exact_plan import exact_plan
 from elastocal.planning.exchange import exchange
-from elastocal.planning.relaxation import relax
 
 
 def is_optimal(problem: DesignProblem, seed: int, **options) -> bool:

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.planning.exact_plan import Prices
-from elastocal.planning.exchange import (
+from elastocal.planning import (
+    Prices,
     best_addition,
     fitted,
     greedy_plan,
     information_without,
+    relax,
     values_without,
 )
-from elastocal.planning.relaxation import relax
 
 
 @settings(max_examples=25, deadline=None)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_pools import random_problem
 
-from elastocal.planning.exact_plan import efficient_rounding, round_weights
+from elastocal.planning import efficient_rounding, round_weights
 
 WEIGHTS = st.lists(st.floats(1e-3, 1.0), min_size=1, max_size=5).map(np.array)
 

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from small_pools import all_plans, all_values, random_problem
 
-from elastocal.design.problem import DesignProblem
 from elastocal.errors import InputError, InsufficientDataError
+from elastocal.planning import (
+    DesignProblem,
+    DeterminantCriterion,
+    Exchanged,
+    make_criterion,
+    size_curve,
+)
 from elastocal.planning import exact_plan as module
-from elastocal.planning.criteria import DeterminantCriterion, make_criterion
-from elastocal.planning.exact_plan import size_curve
-from elastocal.planning.exchange import Exchanged
 
 
 def problem_of(name="test_pose", levels=2, p=5, N=14, seed=0):

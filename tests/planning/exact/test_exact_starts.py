@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from small_pools import random_problem
 
-from elastocal.design.problem import DesignProblem
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.planning.criteria import make_criterion
+from elastocal.planning import DesignProblem, make_criterion, regular_plan
 from elastocal.planning.exact_plan import exact_plan
-from elastocal.planning.exchange import regular_plan
 
 
 class Memory:

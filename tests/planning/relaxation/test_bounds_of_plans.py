@@ -16,9 +16,8 @@ from planning.relaxation.pools import (
     random_problem,
 )
 
-from elastocal.design.certificate import efficiency, largest_sum, lower_bound
 from elastocal.errors import InputError
-from elastocal.planning.relaxation import relax
+from elastocal.planning import efficiency, largest_sum, lower_bound, relax
 
 
 def tiny(name, **changes):

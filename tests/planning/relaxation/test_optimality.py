@@ -15,10 +15,8 @@ from planning.relaxation.pools import (
     repeated,
 )
 
-from elastocal.design.problem import DesignProblem
+from elastocal.planning import DesignProblem, make_criterion, relax
 from elastocal.planning import relaxation as relaxation_module
-from elastocal.planning.criteria import make_criterion
-from elastocal.planning.relaxation import relax
 
 
 def sums_of(problem, weights):

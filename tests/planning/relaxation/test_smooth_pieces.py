@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from planning.relaxation.pools import ROBUST, criterion_of, random_problem
 
-from elastocal.planning.interior_point import pieces_of
-from elastocal.planning.relaxation import CandidatePool
+from elastocal.planning import CandidatePool, pieces_of
 
 SMOOTH = ("test_pose", "D", "A", "c", "O5")
 CASES = [

@@ -12,17 +12,25 @@ import pytest
 from numpy.typing import NDArray
 from support.calibration import cell_of, planar_chain
 
-from elastocal.cell import Array, CartesianNoise, DesignSpec, Nominal, Tracker, Workspace
-from elastocal.design.candidates import Candidates, draw
-from elastocal.design.feasibility.feasibility import Feasibility
-from elastocal.design.information import PoseInformation
-from elastocal.design.joint_space import JointSpace, joint_space
-from elastocal.design.problem import DesignProblem
-from elastocal.design.readings import LoadStates, load_states
-from elastocal.manipulator.model import Model
-from elastocal.planning.criteria import make_criterion
-from elastocal.planning.criterion import Criterion
-from elastocal.planning.polish import Searches
+from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell.workspace_rules import Workspace
+from elastocal.model import Model
+from elastocal.planning import (
+    Candidates,
+    Criterion,
+    DesignProblem,
+    Feasibility,
+    JointSpace,
+    LoadStates,
+    PoseInformation,
+    Searches,
+    draw,
+    joint_space,
+    load_states,
+    make_criterion,
+)
+from elastocal.units import Array
 
 EFFECTS = tuple(f"joint_compliance:joint{i}" for i in (2, 3, 4))
 LOAD = np.array([[0.0, 0.0, -200.0]])

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from elastocal.cell import HalfSpace, Solid, Workspace
-from elastocal.design import candidates as module
-from elastocal.design.candidates import CHUNK, feasible
-from elastocal.design.joint_space import joint_space
+from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
 from elastocal.errors import InputError, InsufficientDataError
+from elastocal.planning import candidates as module
+from elastocal.planning import feasible, joint_space
+from elastocal.planning.candidates import CHUNK
 
 Build = Callable[..., Any]
 FLOOR = HalfSpace("floor", np.zeros(3), np.array([0.0, 0.0, 1.0]))

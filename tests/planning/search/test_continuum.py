@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.cell import Array, HalfSpace, Workspace
-from elastocal.design.candidates import CHUNK
-from elastocal.design.certificate import tangent_bound
-from elastocal.design.continuum import estimate
-from elastocal.design.problem import DesignProblem
+from elastocal.cell.workspace_rules import HalfSpace, Workspace
 from elastocal.errors import InputError
+from elastocal.planning import DesignProblem, estimate, tangent_bound
+from elastocal.planning.candidates import CHUNK
+from elastocal.units import Array
 
 Build = Callable[..., Any]
 RULES = Workspace(

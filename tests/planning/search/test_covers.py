@@ -10,16 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Array, Solid
-from elastocal.design.feasibility.shapes import coal_shape
-from elastocal.planning.pose_margins import (
-    MOST_SPHERES,
-    ROUNDING,
-    excess,
-    signed_distance,
-    smooth_min,
-    sphere_cover,
-)
+from elastocal.cell.workspace_rules import Solid
+from elastocal.planning import coal_shape, excess, signed_distance, smooth_min, sphere_cover
+from elastocal.planning.pose_margins import MOST_SPHERES, ROUNDING
+from elastocal.units import Array
 
 PLACED = np.eye(4)
 PLACED[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()

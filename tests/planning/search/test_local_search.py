@@ -11,16 +11,17 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from elastocal.cell import Array, PolarNoise, Tracker
-from elastocal.design.candidates import sobol
-from elastocal.planning.polish import (
+from elastocal.cell.arm_description import PolarNoise, Tracker
+from elastocal.planning import (
     Goal,
     LocalSearch,
     PlanValue,
     Sensitivity,
     search_all,
+    sobol,
     symbolic_blocks,
 )
+from elastocal.units import Array
 
 Build = Callable[..., Any]
 SEEN = Tracker(position=np.array([3.0, -1.0, 0.5]), noise=PolarNoise(1e-5, 3e-7, 1.5e-5, 6e-6))

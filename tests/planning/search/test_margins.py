@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.cell import (
-    Array,
+from elastocal.cell.arm_description import Tracker
+from elastocal.cell.workspace_rules import (
     CarriedBody,
     HalfSpace,
     HangingLoad,
     Solid,
-    Tracker,
     Visibility,
     Workspace,
 )
-from elastocal.design.candidates import sobol
-from elastocal.planning.pose_margins import margins
+from elastocal.planning import margins, sobol
+from elastocal.units import Array
 
 Build = Callable[..., Any]
 DOWN = np.array([0.0, 0.0, -200.0])

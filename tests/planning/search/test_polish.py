@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.cell import Array, HalfSpace, PolarNoise, Solid, Tracker, Workspace
-from elastocal.design.candidates import sobol
+from elastocal.cell.arm_description import PolarNoise, Tracker
+from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
 from elastocal.errors import InputError
+from elastocal.planning import sobol
 from elastocal.planning.polish import polish
+from elastocal.units import Array
 
 Build = Callable[..., Any]
 POST = np.eye(4)

@@ -1,0 +1,181 @@
+"""elastocal export: the calibrated arm for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from elastocal.cli.app import (
+    CellFile,
+    Json,
+    Seed,
+    app,
+    check_outputs,
+    console,
+    progress_line,
+    reporting_errors,
+)
+from elastocal.cli.design_command import check_apart, files_of
+from elastocal.text import json_text
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from elastocal.export.export import Exported
+    from elastocal.export.exportable import Cost
+
+
+WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
+
+
+@app.command(short_help="How do others get the calibrated arm: URDF, MuJoCo, DH table?")
+@reporting_errors
+def export(
+    cell: CellFile,
+    result: Annotated[Path, typer.Argument(help="Result of identify (JSON).")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", help="File to write: .urdf, .xml or .mjcf, .csv (DH), .yaml, .json."
+        ),
+    ],
+    format: Annotated[
+        str | None,
+        typer.Option(help="urdf, mjcf, dh, mdh (modified DH), yaml, json; default: by the ending."),
+    ] = None,
+    load: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z",
+            help="Force in N at the load point (tracker's axes) to state costs under.",
+        ),
+    ] = None,
+    frames: Annotated[
+        bool,
+        typer.Option("--frames/--no-frames", help="URDF: links for markers and load point."),
+    ] = True,
+    base_frame: Annotated[
+        bool,
+        typer.Option("--base-frame", help="Put the tracker's frame above the robot's base."),
+    ] = False,
+    temperature_c: Annotated[
+        float | None, typer.Option("--temperature-c", help="Temperature in °C to export at.")
+    ] = None,
+    time_s: Annotated[
+        float | None, typer.Option("--time-s", help="Time in s, as in the data, to export at.")
+    ] = None,
+    poses: Annotated[
+        int, typer.Option(min=2, max=1_000_000, help="Random poses to find costs at.")
+    ] = 500,
+    seed: Seed = 0,
+    as_json: Json = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Write the calibrated arm as URDF, MJCF, DH table or parameters, and say what that loses.
+
+    Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
+    """
+    from elastocal.export.export import export as run
+    from elastocal.export.export import format_of
+    from elastocal.files import atomic_write_text
+    from elastocal.model.calibrated import read_calibrated
+    from elastocal.saving import wish_of
+
+    chosen = format_of(output, format)
+    check_outputs(output)
+    wish = wish_of(output, chosen, load, frames, base_frame, temperature_c, time_s, poses, seed)
+    with progress_line(quiet) as progress:
+        progress("reading")
+        calibrated = read_calibrated(cell, result)
+        check_apart([output], [cell, result, *files_of(calibrated.model.cell)])
+        done = run(calibrated, wish, progress)
+    atomic_write_text(output, done.text)
+    if as_json:
+        typer.echo(json_text({"output": str(output)} | done.to_json()))
+        return
+    _tell(done)
+    typer.echo(f"wrote {output}")
+
+
+def _tell(done: Exported) -> None:
+    """What the file holds and what not, for people."""
+    from elastocal.report.formatting import printable
+
+    screen = console()
+    cost, (name, in_title) = done.cost, NAMES[done.format]
+    if cost.effects:
+        screen.print(_cost_table(f"What {in_title} cannot hold", cost))
+    force = ", ".join(f"{v:g}" for v in cost.force)
+    held = list(done.held)
+    more = f" and {len(held) - 8} more" if len(held) > 8 else ""
+    for wanted, sentence in (
+        (not cost.effects, f"{name} holds all of the calibrated model."),
+        (
+            cost.effects,
+            f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
+            f"joint limits under a load of ({force}) N, each effect left out alone.",
+        ),
+        (
+            done.checked is not None,
+            f"Read back with {done.checked_with}: {_rounding(done.checked)} at most.",
+        ),
+        (
+            done.without_beta is not None,
+            f"Without the column beta_rad: {_rounding(done.without_beta)} at most.",
+        ),
+        (
+            held,
+            "Held, as the data do not determine them on their own, at the values that the "
+            f"identification predicts with: {', '.join(held[:8])}{more}.",
+        ),
+        (
+            done.of_the_measurement,
+            f"Of the measurement, not of the arm, and left out: "
+            f"{', '.join(done.of_the_measurement)}.",
+        ),
+        *((True, f"Note: {warning}.") for warning in done.warnings),
+        (
+            cost.total is not None and cost.total.marker_rms > WORTH_TELLING,
+            "Next: where that much matters, elastocal compensate corrects it with the same cell "
+            "and result.",
+        ),
+    ):
+        if wanted:
+            screen.print(printable(sentence), markup=False)
+
+
+def _rounding(metres: float | None) -> str:
+    """A length; what is below a nanometre is rounding and no number to read."""
+    from elastocal.report.formatting import length
+
+    return "< 0.001 µm" if not metres or metres < 1e-9 else length(metres)
+
+
+def _cost_table(title: str, cost: Cost) -> Table:
+    from elastocal.report.formatting import length, printable
+    from elastocal.report.terminal import titled
+
+    table = titled(title)
+    for head in ("effect", "markers rms", "max", "flange rms", "max", ""):
+        table.add_column(head, justify="left" if head in ("effect", "") else "right")
+    rows = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
+    for name, d, note in [*rows, ("all of it", cost.total, "")]:
+        cells = [""] * 4
+        if d is not None:
+            sizes = (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
+            cells = [length(size) for size in sizes]
+        table.add_row(printable(name), *cells, printable(note))
+    return table
+
+
+# At the start of a sentence and in a title.
+NAMES = {
+    "urdf": ("The URDF", "a URDF"),
+    "mjcf": ("The MJCF", "this MJCF"),
+    "dh": ("The DH table", "a DH table"),
+    "mdh": ("The DH table", "a DH table"),
+    "yaml": ("Geometry alone", "geometry alone"),
+    "json": ("Geometry alone", "geometry alone"),
+}

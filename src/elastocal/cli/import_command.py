@@ -1,0 +1,118 @@
+"""elastocal import: tracker exports and joint logs → the measurement table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from elastocal.cli.app import Json, app, check_outputs, console, reporting_errors
+from elastocal.cli.design_command import check_apart, files_of
+from elastocal.errors import InputError, require
+from elastocal.text import json_text
+
+if TYPE_CHECKING:
+    from elastocal.importing.import_files import Imported
+
+PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, kuka, abb, ros"
+
+
+@app.command("import", short_help="How do tracker exports and joint logs become the table?")
+@reporting_errors
+def import_(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Exports of the tracker and logs of the joints, in any order."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Measurements to write (CSV).")
+    ] = None,
+    mapping: Annotated[
+        Path | None, typer.Option("--map", help="Mapping file (TOML): what the columns mean.")
+    ] = None,
+    preset: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help=f"One for all files, or one per file: {PRESET_NAMES}."),
+    ] = None,
+    show_preset: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Print a preset to copy from, and stop."),
+    ] = None,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="Show what was understood; needs no --output.")
+    ] = False,
+    cell: Annotated[
+        Path | None,
+        typer.Option(help="Cell file: check joints, limits, markers and the fit to its robot."),
+    ] = None,
+    length_unit: Annotated[
+        str | None, typer.Option(help="Unit of lengths where a file does not say: mm, m, um, in.")
+    ] = None,
+    angle_unit: Annotated[
+        str | None, typer.Option(help="Unit of angles where a file does not say: deg, rad, gon.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """The measurement table from exports of a laser tracker and logs of the joint values.
+
+    Example: elastocal import points.txt poses.dat --preset spatialanalyzer --preset kuka
+    --cell cell.toml --preview -o data.csv
+    """
+    from elastocal.cli.outputs import left_out, summary
+    from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
+
+    if show_preset is not None:
+        typer.echo(preset_text(show_preset), nl=False)
+        return
+    paths = list(files or ())
+    require(bool(paths), "import needs files: the tracker's export, and the log of the joints")
+    require(
+        output is not None or preview or as_json,
+        "import needs -o data.csv to write to, or --preview to only look",
+    )
+    require(
+        mapping is not None or bool(preset),
+        f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}",
+    )
+    check_outputs(output)
+    check_apart([output], [*paths, mapping, cell])
+    read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
+    found = _import(paths, read, cell, output)
+    if as_json:
+        typer.echo(json_text(summary(found, output)))
+    elif preview:
+        from elastocal.cli.outputs import print_preview
+
+        print_preview(console(), found)
+    else:
+        for warning in found.warnings:
+            typer.echo(f"Warning: {warning}", err=True)
+        for line in left_out(found):
+            typer.echo(line, err=True)
+    if found.refused:
+        raise InputError(found.refused)
+    if output is None:
+        return
+    from elastocal.files import atomic_write_text
+
+    atomic_write_text(output, found.text)
+    if not as_json:
+        table = found.table
+        typer.echo(
+            f"wrote {len(table)} readings of {len(table.configuration_labels)} configurations to "
+            f"{output}"
+        )
+
+
+def _import(paths: list[Path], read: Any, cell: Path | None, output: Path | None) -> Imported:
+    from elastocal.importing.import_files import import_files
+
+    known = None
+    if cell is not None:
+        from elastocal.cell.work_cell import read_cell
+        from elastocal.model.effects import CATALOGUE
+
+        known = read_cell(cell, known_effects=CATALOGUE)
+        check_apart([output], files_of(known))
+    return import_files(paths, read, known, str(output or "the table"))

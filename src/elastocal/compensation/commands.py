@@ -1,0 +1,474 @@
+"""Commanded joints near nominal ones that reach the targets, with uncertainty and notices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.cell.work_cell import Cell
+from elastocal.compensation.tool import CalibratedTool
+from elastocal.compensation.tool_targets import Targets
+from elastocal.errors import option
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.chain import Chain, finite_ranges, joint_limits
+from elastocal.model.effects import effect_of
+from elastocal.model.inverse_kinematics import (
+    ARM_LENGTH,
+    BoundedSearch,
+    Postures,
+    Reaching,
+    inverse_kinematics,
+    unwound,
+)
+from elastocal.model.inverse_kinematics import TOLERANCE as NOMINAL_TOLERANCE
+from elastocal.text import listed
+from elastocal.units import Array, IntArray
+
+# What the robot would be commanded without calibration: nominal joints along a path.
+
+STEP = 0.1  # rad or m between neighbours that count as one smooth piece
+LARGE = np.radians(20.0)  # a step beyond which another posture may be nearer
+LONGEST_PIECE = 256  # rows solved at once
+
+
+@dataclass(frozen=True)
+class NominalPath:
+    """`q` (n, joints) and whether the nominal arm `reached` (n,) each place; where it did not,
+    q is the posture that comes nearest."""
+
+    q: Array
+    reached: NDArray[np.bool_]
+
+
+def nominal_path(
+    chain: Chain,
+    position: Array,
+    rotation: Array | None,
+    point: Array,
+    limits: tuple[Array, Array],
+    near: Array | None,
+    seed: int = 0,
+) -> NominalPath:
+    """Nominal joints that bring `point` (3,) of the flange to places along a path.
+
+    `position` (n, 3) m and `rotation` (n, 3, 3) of the flange, or None for any, in the base
+    frame.  The first place is reached in the posture nearest to `near` (default: the middle of
+    the joint ranges), every other from the one before it, so that neighbouring places have
+    neighbouring joints.  Where that fails, or takes a large step, the nearest of many postures
+    is taken.
+    """
+    walk = _Walk(chain, position, rotation, point, limits, seed)
+    walk.leap(0, near)
+    first, length = 1, 1
+    while first < len(position):
+        taken = walk.piece(first, min(length, len(position) - first))
+        length = min(2 * length, LONGEST_PIECE) if taken == length else max(taken, 1)
+        if not taken:
+            walk.leap(first, walk.last)
+        first += max(taken, 1)
+    return NominalPath(walk.q, walk.reached)
+
+
+class _Walk:
+    def __init__(
+        self,
+        chain: Chain,
+        position: Array,
+        rotation: Array | None,
+        point: Array,
+        limits: tuple[Array, Array],
+        seed: int,
+    ) -> None:
+        self.chain, self.position, self.rotation = chain, position, rotation
+        self.point, self.limits, self.seed = point, limits, seed
+        self.q = np.zeros((len(position), chain.n_joints))
+        self.reached = np.zeros(len(position), dtype=bool)
+        self.last: Array | None = None
+        self._ahead: Postures | None = None
+        self._ahead_from, self._leaps = 0, 1
+        self._task = Reaching(chain, position, rotation, point, None, *limits)
+
+    def piece(self, first: int, length: int) -> int:
+        """How many of the next places are reached smoothly from the last posture; kept if so."""
+        if self.last is None:
+            return 0
+        target = np.arange(first, first + length)
+        q, _ = self._task.solve(np.tile(self.last, (length, 1)), target)
+        miss, turn = self._task.errors(q, target)
+        good = (miss <= NOMINAL_TOLERANCE) & (turn <= NOMINAL_TOLERANCE)
+        steps = np.abs(np.diff(np.vstack([self.last, q]), axis=0)).max(axis=1)
+        good &= np.append(steps[:1] <= LARGE, steps[1:] <= STEP)
+        taken = int(np.argmin(good)) if not good.all() else length
+        self._keep(first, q[:taken], np.ones(taken, dtype=bool))
+        return taken
+
+    def leap(self, i: int, near: Array | None) -> None:
+        """Place i from anywhere: the posture nearest to `near`, or what comes nearest to it."""
+        found = self._many(i, near)
+        k = i - self._ahead_from
+        q, good = found.q[k], found.reached[k]
+        if near is not None and good.any():
+            q = unwound(self.chain, q[good], near, *self.limits)
+            q = q[np.argmin(np.linalg.norm(q - near, axis=1))][None]
+            if self.chain.n_joints > self._task.equations:
+                q = self._task.nearest(q, np.array([i]), near)
+            self._keep(i, q, np.ones(1, dtype=bool))
+            return
+        self._keep(i, q[:1], good[:1])
+
+    def _many(self, i: int, near: Array | None) -> Postures:
+        """Postures of place i and of some that follow: who leaps once will leap again."""
+        if self._ahead is None or not 0 <= i - self._ahead_from < len(self._ahead.q):
+            self._leaps = min(2 * self._leaps, LONGEST_PIECE) if self._ahead is not None else 1
+            rows = slice(i, i + self._leaps)
+            rotation = None if self.rotation is None else self.rotation[rows]
+            self._ahead_from = i
+            self._ahead = inverse_kinematics(
+                self.chain, self.position[rows], self.limits, rotation=rotation,
+                point=self.point, near=near, seed=self.seed,
+            )  # fmt: skip
+        return self._ahead
+
+    def _keep(self, first: int, q: Array, reached: NDArray[np.bool_]) -> None:
+        rows = slice(first, first + len(q))
+        self.q[rows], self.reached[rows] = q, reached
+        if len(q) and reached[-1]:
+            self.last = q[-1]
+
+
+def jumps(task: Reaching, q: Array, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Rows i whose joints leave those of row i − 1 by much more than the tool's motion asks for.
+
+    q (n, joints); rows that are not `usable` are passed over.  The measure is the step of least
+    norm that the tool's motion asks for, J⁺r, at either end; steps below 20° never count.
+    """
+    rows = np.flatnonzero(usable)
+    if len(rows) < 2:
+        return np.zeros(0, dtype=np.int64)
+    before, after = rows[:-1], rows[1:]
+    step = q[after] - q[before]
+    asked = np.zeros(len(step))
+    for ends, target in ((before, after), (after, before)):
+        r, J = task.residual(q[ends], target)
+        least = (np.linalg.pinv(J, rcond=1e-6) @ r[..., None])[..., 0]
+        asked = np.maximum(asked, np.linalg.norm(least, axis=1))
+    large = np.abs(step).max(axis=1) > LARGE
+    return np.asarray(after[large & (np.linalg.norm(step, axis=1) > 3 * asked)])
+
+
+# Commanded joints that put the calibrated tool at its targets, near nominal commands.
+
+TOLERANCE = 1e-8  # m and rad within which a target counts as reached
+POLISHES = 20
+SETTLED = 1e-13  # rad or m
+
+
+@dataclass(frozen=True)
+class Goals:
+    """`position` (n, 3) m and `rotation` (n, 3, 3), or None for any, in the data's frame."""
+
+    position: Array
+    rotation: Array | None
+
+
+@dataclass(frozen=True)
+class Solved:
+    """`q` (n, joints); `miss` (n,) m and `turn` (n,) rad that are left (NaN: no equilibrium)."""
+
+    q: Array
+    miss: Array
+    turn: Array
+
+    def replaced(self, rows: IntArray, other: Solved) -> Solved:
+        """The same with `other` in the rows named."""
+        q, miss, turn = self.q.copy(), self.miss.copy(), self.turn.copy()
+        q[rows], miss[rows], turn[rows] = other.q, other.miss, other.turn
+        return Solved(q, miss, turn)
+
+    @property
+    def reached(self) -> NDArray[np.bool_]:
+        return (self.miss <= TOLERANCE) & (self.turn <= TOLERANCE)
+
+
+class Commanding(BoundedSearch):
+    """r(q) of the calibrated tool against its goals, searched within the joint limits.
+
+    Levenberg–Marquardt of `BoundedSearch` with the derivative through the equilibrium; where the
+    arm has more joints than the task has equations, followed by `least_correction`.
+    """
+
+    def __init__(
+        self, tool: CalibratedTool, rows: list[NDArray], goals: Goals, lower: Array, upper: Array
+    ) -> None:
+        super().__init__(lower, upper)
+        self.tool, self.rows, self.goals = tool, rows, goals
+
+    def residual(self, q: Array, target: IntArray) -> tuple[Array, Array]:
+        rotation = None if self.goals.rotation is None else self.goals.rotation[target]
+        rows = [values[target] for values in self.rows]
+        return self.tool.errors(rows, q, self.goals.position[target], rotation)
+
+    def misses(self, q: Array, target: IntArray) -> tuple[Array, Array]:
+        """Distance in m and angle in rad (R,) from the goals; NaN without an equilibrium."""
+        r = self.residual(q, target)[0]
+        return np.linalg.norm(r[:, :3], axis=1), np.linalg.norm(r[:, 3:], axis=1) / ARM_LENGTH
+
+    def commands(self, nominal: Array, target: IntArray) -> Solved:
+        """Commands for the targets (R,) near nominal ones (R, joints) within the limits."""
+        q, _ = self.solve(nominal, target)
+        equations = 3 if self.goals.rotation is None else 6
+        if self.tool.chain.n_joints > equations:
+            q = self.least_correction(q, nominal, target)
+        return Solved(q, *self.misses(q, target))
+
+    def least_correction(self, q: Array, nominal: Array, target: IntArray) -> Array:
+        """The least ‖q − q₀‖ with r(q) = 0 and limits kept, from commands q that reach.
+
+        Newton's method on the conditions of Karush, Kuhn and Tucker with the curvature of r left
+        out (corrections are of the size of the errors, so that it converges in few steps):
+        δ = Jᵀλ on free joints with J δ = J (q − q₀) − r; a joint is held at its limit while Jᵀλ
+        would take it beyond.  Commands that do not reach, and those that no step improves, stay.
+        """
+        started = q.copy()
+        q = q.copy()
+        free = np.ones_like(q, dtype=bool)
+        active = np.flatnonzero(np.isfinite(self.misses(q, target)[0]))
+        for _ in range(POLISHES):
+            r, J = self.residual(q[active], target[active])
+            reachable = np.isfinite(r).all(axis=1)
+            active, r, J = active[reachable], r[reachable], J[reachable]
+            if not len(active):
+                break
+            delta = q[active] - nominal[active]
+            J_free = J * free[active][:, None, :]
+            # J δ over the free joints alone: the held ones stay where they are.
+            wanted = (J_free @ delta[..., None])[..., 0] - r
+            multiplier = np.linalg.pinv(J_free @ J_free.transpose(0, 2, 1), rcond=1e-12)
+            wish = (J.transpose(0, 2, 1) @ (multiplier @ wanted[..., None]))[..., 0]
+            goal = nominal[active] + wish
+            free[active] = (goal >= self.lower) & (goal <= self.upper)
+            trial = np.clip(goal, self.lower, self.upper)
+            moved = np.abs(trial - q[active]).max(axis=1)
+            q[active] = trial
+            active = active[moved > SETTLED]
+            if not len(active):
+                break
+        return self._better(q, started, nominal, target)
+
+    def _better(self, q: Array, started: Array, nominal: Array, target: IntArray) -> Array:
+        """Of two sets of commands, row by row those that reach with the smaller correction."""
+        now, before = (Solved(v, *self.misses(v, target)) for v in (q, started))
+        shorter = np.linalg.norm(q - nominal, axis=1) <= np.linalg.norm(started - nominal, axis=1)
+        take = now.reached & (shorter | ~before.reached)
+        return np.where(take[:, None], q, started)
+
+
+# What the identification knows of where the tool will be, and what it does not.
+
+OUTSIDE = 1e-6  # share of the tool's motion that may lie outside what is known: rounding
+SPARE = 4  # readings for every parameter, at random poses
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """`covariance` (n, 3, 3) m² of the position in the data's frame.
+
+    `unknown` (n,) m: what typical deviations of the parameters that the data do not determine
+    would move the tool by, which the covariance does not hold; `blamed` names those parameters,
+    the most harmful first.
+    """
+
+    covariance: Array
+    unknown: Array
+    blamed: tuple[str, ...]
+
+    @property
+    def std(self) -> Array:
+        """(n,) m: root of the sum of the variances along the three axes."""
+        return np.asarray(np.sqrt(np.trace(self.covariance, axis1=1, axis2=2)))
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """The parameters D that the data left open, and what the determined ones K do in their place.
+
+    `mixing` (K, D) with ∂(markers)/∂X_D ≈ ∂(markers)/∂X_K · mixing at any pose: a deviation of
+    X_D went into the estimates of X_K as mixing · X_D.  `sizes` (D,): typical deviations.
+    """
+
+    kept: NDArray[np.int64]
+    open: NDArray[np.int64]
+    mixing: Array
+    sizes: Array
+
+
+def undetermined(tool: CalibratedTool, rows: list[NDArray], seed: int) -> Undetermined:
+    """By least squares on the markers' places at random poses, in the targets' circumstances.
+
+    What the identification left out as indistinguishable leaves no residual there; what it left
+    out although it moves markers by itself does, and is then unknown at the targets as well.
+    """
+    arm = tool.calibrated
+    names = {name: i for i, name in enumerate(arm.model.names)}
+    kept = np.array([names[name] for name in arm.determined], dtype=np.int64)
+    left = np.setdiff1d(np.arange(len(names)), kept)
+    sizes = _sizes(arm, kept)
+    if not len(left) or not len(kept):
+        return Undetermined(kept, left, np.zeros((len(kept), len(left))), sizes[left])
+    low, high = finite_ranges(tool.chain, *joint_limits(tool.cell, tool.chain))
+    n = max(SPARE * len(names) // 3, 1)
+    q = np.random.default_rng(seed).uniform(low, high, (n, tool.chain.n_joints))
+    some = [values[np.arange(n) % len(values)] for values in rows]
+    B = tool.marker_sensitivity(some, q)
+    B = B[np.isfinite(B).all(axis=(1, 2))].reshape(-1, len(names)) * sizes
+    mixing = np.asarray(np.linalg.lstsq(B[:, kept], B[:, left], rcond=1e-10)[0], dtype=float)
+    known = sizes[left] > 0
+    mixing[:, known] *= sizes[kept][:, None] / sizes[left][known]
+    return Undetermined(kept, left, mixing, sizes[left])
+
+
+def _sizes(arm: CalibratedArm, kept: NDArray[np.int64]) -> Array:
+    """Typical deviation (parameters,) of each parameter; where none is known beforehand, the
+    smallest value that was determined of its kind (the stiffest joint's compliance)."""
+    parameters = arm.model.parameters
+    found: dict[tuple[str, str], float] = {}
+    for k in kept:
+        p, size = parameters[k], abs(float(arm.x[k]))
+        if size > 0:
+            found[p.effect, p.unit] = min(size, found.get((p.effect, p.unit), np.inf))
+    return np.array(
+        [
+            p.typical or abs(p.nominal) or found.get((p.effect, p.unit), 1.0 if k in kept else 0.0)
+            for k, p in enumerate(parameters)
+        ]
+    )
+
+
+def position_uncertainty(arm: CalibratedArm, A: Array, left: Undetermined) -> Uncertainty:
+    """Σ_p = A_K Σ A_Kᵀ for A (n, 3, parameters) in m per unit, Σ of the determined parameters K.
+
+    NaN where the result determined nothing.  A typical deviation of an open parameter moves the
+    tool in an unknown way by A_D − A_K · mixing, which vanishes where the tool's point moves as
+    the measured ones do.
+    """
+    known = A[..., left.kept]
+    covariance = known @ arm.covariance @ known.transpose(0, 2, 1)
+    if not len(left.kept):  # nothing known is no certainty
+        covariance = np.full((len(A), 3, 3), np.nan)
+    move = A[..., left.open] * left.sizes
+    off = move - known @ (left.mixing * left.sizes)
+    off[np.abs(off) <= OUTSIDE * np.abs(move).max(initial=0.0)] = 0.0
+    harm = np.sqrt((off**2).sum(axis=1).mean(axis=0)) if len(A) else np.zeros(len(left.open))
+    order = [int(i) for i in np.argsort(-harm) if harm[i] > 0]
+    return Uncertainty(
+        (covariance + covariance.transpose(0, 2, 1)) / 2,
+        np.sqrt((off**2).sum(axis=(1, 2))),
+        tuple(arm.model.names[left.open[i]] for i in order),
+    )
+
+
+# Sentences about commands that are right but that somebody should look at.
+
+AT_LIMIT = 1e-9  # rad or m
+FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
+LARGE_CORRECTION = np.radians(2.0)
+LEVEL_SLACK = 0.01  # rad or m
+WORTH_TELLING = 10e-6  # m
+
+
+def notices_of(
+    cell: Cell,
+    chain: Chain,
+    targets: Targets,
+    limits: tuple[Array, Array],
+    q: Array,
+    nominal: Array,
+    before: Array,
+    reached: NDArray[np.bool_],
+    jumps: NDArray[np.int64],
+    uncertainty: Uncertainty,
+) -> tuple[str, ...]:
+    """What the rows that are reached give reason to say; each sentence names rows and remedy."""
+    told = []
+    lower, upper = limits
+    held = ((q <= lower + AT_LIMIT) | (q >= upper - AT_LIMIT)) & reached[:, None]
+    for limited in np.flatnonzero(held.any(axis=0)):
+        told.append(
+            f"{_rows(targets, held[:, limited])}: joint {limited + 1} stands at its limit; the "
+            "target is reached by the other joints"
+        )
+    if len(jumps):
+        i = int(jumps[0])
+        j = int(np.abs(q[i] - q[i - 1]).argmax())
+        revolute = chain.kinds[j] == "revolute"
+        size = np.abs(q[i, j] - q[i - 1, j])
+        by = f"{np.degrees(size):.0f}°" if revolute else f"{size * 1e3:.0f} mm"
+        told.append(
+            f"{_rows(targets, jumps)}: the solution branch changes (joint {j + 1} moves by {by} to "
+            f"line {targets.table.row[i]}, much more than the tool's motion asks for); where the "
+            "rows are a path, move it away from limits and singular postures, or give q1_deg … of "
+            "the posture wanted"
+        )
+    change = np.where([kind == "revolute" for kind in chain.kinds], np.abs(q - nominal), 0.0)
+    large = reached & (change.max(axis=1) > LARGE_CORRECTION)
+    if large.any():
+        told.append(
+            f"{_rows(targets, large)}: a joint is corrected by up to "
+            f"{np.degrees(change[large].max()):.1f}°, as beside a singular posture; check that the "
+            "path may be moved there"
+        )
+    if targets.q is not None and targets.position is not None:
+        far = before > FAR
+        if far.any():
+            told.append(
+                f"{_rows(targets, far)}: the nominal command q1_deg … puts the tool up to "
+                f"{before[far].max() * 1e3:.0f} mm from its target; check {option('frame')}, "
+                f"{option('point')} and units"
+            )
+    told += _without_load(cell, targets)
+    told += _beyond_levels(cell, targets, q, reached)
+    unknown = uncertainty.unknown[reached]
+    rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
+    stated = float(np.sqrt(np.mean(uncertainty.std[reached] ** 2))) if len(unknown) else 0.0
+    if rms > max(WORTH_TELLING, stated):
+        told.append(
+            f"The data do not determine {listed(uncertainty.blamed, 4)}, on which the place of "
+            f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm "
+            "rms, which the stated uncertainty leaves out; choose a marker that was fitted "
+            f"({option('point')}), or measure what is missing"
+        )
+    return tuple(told)
+
+
+def _without_load(cell: Cell, targets: Targets) -> list[str]:
+    """A load that was forgotten: the commands are then those of the arm without it."""
+    spec = cell.model
+    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
+    if not elastic or targets.table.force.any() or spec.link_gravity or spec.torque != "computed":
+        return []
+    return [
+        f"{targets.table.source}: no load is stated, so no compliance is compensated; where the "
+        f"tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
+    ]
+
+
+def _beyond_levels(cell: Cell, targets: Targets, q: Array, reached: NDArray[np.bool_]) -> list[str]:
+    told = []
+    for name, values in cell.model.compliance_levels.items():
+        angle = q[:, int(name.removeprefix("joint")) - 1]
+        off = (angle < min(values) - LEVEL_SLACK) | (angle > max(values) + LEVEL_SLACK)
+        if (off & reached).any():
+            told.append(
+                f"{_rows(targets, off & reached)}: {name} stands beyond its levels in "
+                "[model.compliance_levels], where the compliance of the nearest level is assumed"
+            )
+    return told
+
+
+def _rows(targets: Targets, which: NDArray) -> str:
+    """ "targets.csv, line 7 and 3 more" of a mask or of row indices."""
+    rows = np.flatnonzero(which) if which.dtype == bool else which
+    more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+    return f"{targets.place(int(rows[0]))}{more}"

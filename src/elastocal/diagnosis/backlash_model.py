@@ -1,0 +1,88 @@
+"""On which law the play of an arm's gears follows: load alone, or load and last motion.
+
+A gear whose friction is small swings into the middle of its play, or onto the flank that any
+load pushes it to; one that is stiff in its bearings stays where the last motion left it until the
+load exceeds the friction.  Both are met, and the wrong one leaves most of the effect standing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import expit
+from scipy.stats import norm
+
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.evidence import Grams, scales_of
+from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
+from elastocal.model.effects.play import Backlash
+from elastocal.model.manipulator import Model
+from elastocal.units import Array
+
+EFFECT, BY_LOAD, BY_BOTH = Backlash.name, "load", "load_and_approach"
+LAWS = {BY_LOAD: BY_BOTH, BY_BOTH: BY_LOAD}
+
+
+def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
+    """The scene under the law of play that its readings make likelier.
+
+    Where no side of approach is recorded, or the cell has play already, it stays as it is.
+    """
+    spec = dataset.base.model.cell.model
+    play = [h for h in dataset.hypotheses if h.name == EFFECT]
+    if spec.play_side != BY_BOTH or not play:
+        return dataset
+    noise = dataset.noise
+    other = replace(dataset.base, model=under_other_law(dataset.base.model))
+    under_other = diagnosis_data_of(other, play)
+    under_other = replace(
+        under_other, data=replace(under_other.data, left_out=dataset.data.left_out)
+    )
+    here, there = _likeliest(dataset, noise), _likeliest(under_other, noise)
+    if there.score <= here.score:
+        return dataset.changed(other_play=doubt(here, there))
+    rows = dataset.columns.rows.copy()
+    for h in play:
+        rows[:, :, dataset.columns.places[h.name, h.where]] = under_other.columns.of(h)
+    return dataset.changed(
+        base=other, columns=replace(dataset.columns, base=other, rows=rows),
+        other_play=doubt(there, here),
+    )  # fmt: skip
+
+
+def under_other_law(model: Model) -> Model:
+    """The model with play under the law that it does not have."""
+    spec = model.cell.model
+    spec = replace(spec, play_side=LAWS[spec.play_side])  # type: ignore[arg-type]
+    return Model.assembled(model.chain, replace(model.cell, model=spec))
+
+
+def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
+    """Play in the joint where it is likeliest, the noise fitted beside it."""
+    play = [h for h in dataset.hypotheses if h.name == EFFECT]
+    grams = Grams(dataset, dataset.data, project(dataset.data, noise))
+    evidence = [float(grams.of_hypothesis(h).evidence(scales_of(h)).max()) for h in play]
+    likeliest = play[int(np.argmax(evidence))]
+    return fit_set(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
+
+
+def doubt(better: ModelSet, other: ModelSet) -> float:
+    """Probability of the less likely law: the larger of 1/(1 + exp Σ d) and Φ(−Σ d / √Σ d²).
+
+    d (configurations,) is what each adds to the log likelihood ratio under the noise of `better`.
+    Both laws idealise what happens in the dead zone, so that one or two configurations there may
+    speak loudly for the wrong one; by the test of Vuong (1989, Econometrica 57) for laws of which
+    none is quite true, their ratio counts against its own scatter.
+    """
+    others = _squares(other.data, project(other.data, better.noise))
+    d = (others - _squares(better.data, better.at)) / 2
+    odds, scatter = max(float(d.sum()), 0.0), max(float(np.linalg.norm(d)), 1e-300)
+    return float(max(expit(-odds), norm.cdf(-odds / scatter)))
+
+
+def _squares(data: NoisyData, at: Projection) -> Array:
+    """eᵀV⁻¹e of each configuration (C,) with what the fit leaves, e = r − Xβ."""
+    left = data.masked(data.r - data.X @ at.beta)
+    return np.asarray((left * at.u).sum(axis=1))

@@ -1,0 +1,542 @@
+"""What a diagnosis says: verdict, effects, candidates, location, budget; also as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from elastocal.above import Result
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.errors import option
+from elastocal.identification.error_budget import BudgetStep
+from elastocal.identification.result import Finding, Number
+from elastocal.measurements import Measurements
+from elastocal.model.effects.base import Stage
+from elastocal.model.manipulator import Model
+from elastocal.text import plain
+
+# What the design of extra poses promises.
+
+
+@dataclass(frozen=True)
+class RivalPair:
+    """Two hypotheses and how far apart they are: d in standard deviations of the noise, in the
+    data so far and with the extra poses, each the smaller of the two ways round.
+
+    The best possible test between two known alternatives is right with probability Φ(d/2).
+    """
+
+    first: str
+    second: str
+    distance_before: float
+    distance_after: float
+
+
+@dataclass(frozen=True)
+class ExtraPlan:
+    """Extra poses that tell the rivals apart, or why none would.
+
+    `plan` holds one row per visit (pose and load state) in the order of measuring, None where
+    poses cannot separate them; `probability_before` and `probability_after` of naming the right
+    one of the rivals; `probability_random` the same after as many random poses.  Rivals that no
+    pose separates count as one: `inseparable`, groups of their names.  `advice` in words (load,
+    approach direction, time, monuments).
+    """
+
+    rivals: tuple[str, ...]
+    pairs: tuple[RivalPair, ...]
+    plan: Measurements | None
+    n_poses: int
+    probability_before: float
+    probability_after: float
+    probability_random: float
+    separable: bool
+    inseparable: tuple[tuple[str, ...], ...]
+    advice: tuple[str, ...]
+
+
+# What a diagnosis says: verdict, effects, candidates, location, noise floor, budget.
+
+Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
+Interval = tuple[float, float]
+
+# A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
+# Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
+SEEN, FAINTEST = 5.0, 3.0
+STRUCTURE = 0.05  # family-wise p-value from which on a driver is told
+
+
+@dataclass(frozen=True)
+class EffectAt:
+    """An effect at a place, e.g. gear_eccentricity at joint2."""
+
+    effect: str
+    where: str
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A parameter of an added effect after the nonlinear refit, in `unit` (SI)."""
+
+    name: str
+    value: float
+    unit: str
+    std: float
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect held to be real (or, where the verdict is ambiguous, the likeliest of a set).
+
+    `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
+    the 3-D error of noise-free fresh poses falls when the effect joins the model, with 90 and 95 %
+    intervals.  `settings` are its searched constants (orders, times) by their keys.
+    """
+
+    effect: str
+    where: str
+    probability: float
+    gap_reduction: float
+    gap_reduction_ci90: Interval
+    gap_reduction_ci95: Interval
+    parameters: tuple[FittedParameter, ...]
+    settings: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis that was tried.
+
+    `score` is the log of its marginal likelihood over that of no further effect (nats);
+    `detectable` the distance d, in standard deviations, that its typical size moves the data
+    once the fitted parameters have followed: below about 3 these data could not show it.
+    """
+
+    effect: str
+    where: str
+    stage: Stage
+    probability: float
+    score: float
+    detectable: float
+    settings: dict[str, float]
+
+    @property
+    def seen_from(self) -> float:
+        """The size, in typical sizes, from which it would have been seen."""
+        return SEEN / self.detectable if self.detectable > 0 else math.inf
+
+    @property
+    def visible(self) -> bool:
+        """Whether it would have shown at its typical size."""
+        return self.detectable >= SEEN
+
+    @property
+    def hidden(self) -> bool:
+        """Whether it hides in the noise at its typical size."""
+        return self.detectable < FAINTEST
+
+
+@dataclass(frozen=True)
+class Untested:
+    """An effect the data cannot test, why, and what to record or measure so that they can."""
+
+    effect: str
+    where: str
+    reason: str
+    advice: str
+
+
+@dataclass(frozen=True)
+class Gap:
+    """3-D rms marker errors in m on held-out poses; the noise floor is what noise alone gives."""
+
+    nominal: float
+    calibrated: float
+    explained: float
+    noise_floor: float
+
+
+@dataclass(frozen=True)
+class StructureTest:
+    """Does the residual depend on `driver` at all?  Names no effect.
+
+    `driver` is "joint2 angle", "joint3 torque", "time", "load", "approach of joint1", ….
+    `p_value` by sign flips of whole configurations, for the largest statistic of the driver's
+    tests; `p_family` the same against the largest over all drivers.
+    """
+
+    covariate: str
+    p_value: float
+    p_family: float
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The shape of an unknown dependence: motion of `entry` as a smooth function of `driver`.
+
+    `x` in `x_unit` over the measured range, `y` and its standard deviation `sd` in `y_unit`.
+    One curve per component of the entry that moves.
+    """
+
+    covariate: str
+    x_unit: str
+    entry: str
+    y_unit: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    sd: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where the gap lies.  `evidence`: probability of each stage and of each place, and p-values
+    that name no effect."""
+
+    stage: Stage
+    where: str
+    probability: float
+    stages: dict[str, float]
+    places: dict[str, float]
+    covariates: dict[str, float]
+
+
+@dataclass(frozen=True)
+class FaultyReading:
+    """A reading left out: line of the table, configuration, marker, error in m and in sigmas."""
+
+    line: int
+    configuration: str
+    marker: str
+    error: float
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """The noise that the data themselves show.
+
+    `stated_factor`: tracker noise in units of what is stated (`stated` says whether anything
+    was).  `reading_sigma` (m): rms per axis of a single reading.  `repeatability` (joints,) in rad
+    or m: scatter of each joint from visit to visit.  `shared`: scatter common to all visits of
+    a configuration, as a multiple of it.  `pure_error` (m): rms per axis within repeats, None
+    without repeats.
+    """
+
+    stated: bool
+    stated_factor: float
+    reading_sigma: float
+    repeatability: tuple[float, ...]
+    shared: float
+    pure_error: float | None
+    faulty: tuple[FaultyReading, ...] = ()
+
+
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Result):
+    """Why the real arm still differs from the model.
+
+    Attributes:
+        verdict: "explained", "nothing_significant", "unknown_effect" or "ambiguous".
+        gap: 3-D rms marker errors on held-out poses, in m: nominal, calibrated, explained, floor.
+        budget: The waterfall from the nominal arm to the noise floor, `Step` by step.
+        effects: What is held to be real, each a `Finding`.
+        candidates: Every hypothesis that was tried, best first.
+        indistinguishable: Sets that these data cannot tell apart.
+        location: Where the gap lies.
+        noise: The noise that the data themselves show.
+        structure: What the residual depends on, without naming an effect.
+        probability_nothing: That no effect is missing.
+        probability_unknown: That something without a name is at work.
+        p_value: Of what was found, against the whole family of hypotheses.
+        curves: The shape of an unknown dependence.
+        untested: Effects that the data cannot test, and what to record so that they can.
+        findings: The judgements about it, the verdict first, each with its numbers and what to do.
+        warnings: What to know before one relies on it, in sentences.
+        n_readings: Number of readings; `n_configurations` that of configurations.
+        extra: Poses that tell rivals apart, where they were asked for.
+        model_keys: Keys of [model] that the effects found rest on.
+        model: The model that was diagnosed; `data` names its measurements.
+        calibrated: The arm as it was fitted before any effect was added.
+
+    Examples:
+        >>> why = ec.diagnose("cell.toml", "data.csv")
+        >>> why.verdict, why.effects[0].effect, why.location.where
+        ('explained', 'link_bending', 'link4')
+        >>> why.gap.calibrated > why.gap.noise_floor
+        True
+        >>> why.save("diagnosis.json")
+    """
+
+    verdict: Verdict
+    gap: Gap
+    budget: tuple[BudgetStep, ...]
+    effects: tuple[FoundEffect, ...]
+    candidates: tuple[Candidate, ...]
+    indistinguishable: tuple[tuple[EffectAt, ...], ...]
+    location: Location | None
+    noise: NoiseFloor
+    structure: tuple[StructureTest, ...]
+    probability_nothing: float
+    probability_unknown: float
+    p_value: float
+    curves: tuple[Curve, ...] = ()
+    untested: tuple[Untested, ...] = ()
+    warnings: tuple[str, ...] = ()
+    n_readings: int = 0
+    n_configurations: int = 0
+    extra: ExtraPlan | None = field(default=None)
+    # Keys of [model] that the effects found rest on, beyond their own names.
+    model_keys: dict[str, str] = field(default_factory=dict)
+    # What was diagnosed: the model as it was given, and the name of its measurements.
+    model: Model | None = field(default=None, repr=False, compare=False)
+    data: str = ""
+    # The arm as it was fitted before any effect was added, and its residuals.
+    calibrated: Baseline | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def open(self) -> bool:
+        """Whether rivals are left that more poses may tell apart."""
+        return self.verdict in ("ambiguous", "unknown_effect")
+
+    @property
+    def dependences(self) -> tuple[StructureTest, ...]:
+        """Drivers that the residual depends on, the most conspicuous first."""
+        found = [t for t in self.structure if t.p_family <= STRUCTURE]
+        return tuple(sorted(found, key=lambda t: t.p_family))
+
+    @property
+    def smallest_seen(self) -> float:
+        """The rms motion of the markers (m) from which an effect would have been seen; NaN where
+        there are no configurations.
+
+        d² = Σ |δ|² / σ² per axis, with a configuration as one reading of the noise floor: more
+        readings and loads per configuration only make smaller effects visible.
+        """
+        independent = 3 * self.n_configurations
+        return SEEN * self.gap.noise_floor / math.sqrt(independent) if independent else math.nan
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        return tuple(_findings(self))
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{f.effect} at {f.where}" for f in self.effects)
+        robot = "" if self.model is None else f" {self.model.chain.name}"
+        return f"<Diagnosis{robot}: {self.verdict}{', ' + found if found else ''}>"
+
+
+def _findings(d: Diagnosis) -> Iterator[Finding]:
+    numbers: dict[str, Number] = {
+        "effects": tuple(f"{f.effect}:{f.where}" for f in d.effects),
+        "p_value": d.p_value,
+        "probability_nothing": d.probability_nothing,
+        "probability_unknown": d.probability_unknown,
+    }
+    settled = d.verdict in ("explained", "nothing_significant")
+    yield Finding(d.verdict, "good" if settled else "care", numbers, _remedy(d.verdict))
+    if d.verdict == "unknown_effect" and d.effects:
+        names = {"effects": numbers["effects"]}
+        yield Finding(
+            "named_beside_unknown", "care", names,
+            f"The cell of {option('cell_out')} has the effects named added, and nothing for what "
+            "has no name: keep it only where it does better on poses kept back (identify with "
+            f"{option('test')}).",
+        )  # fmt: skip
+    if d.open and d.extra is None:
+        remedy = f"Plan the poses that tell the rivals apart ({option('plan')}), and measure them."
+        yield Finding("rivals_open", "note", {}, remedy)
+    if d.dependences:
+        yield Finding(
+            "depends_on", "note",
+            {
+                "drivers": tuple(t.covariate for t in d.dependences),
+                "p_family": tuple(t.p_family for t in d.dependences),
+            },
+        )  # fmt: skip
+    yield Finding(
+        "sensitivity", "note",
+        {
+            "smallest_seen_um": d.smallest_seen * 1e6, "candidates": len(d.candidates),
+            "visible": sum(c.visible for c in d.candidates),
+            "hidden": sum(c.hidden for c in d.candidates),
+        },
+    )  # fmt: skip
+    if d.noise.faulty:
+        worst = max(f.error for f in d.noise.faulty)
+        yield Finding(
+            "faulty_readings", "note", {"left_out": len(d.noise.faulty), "worst_um": worst * 1e6}
+        )
+
+
+def _remedy(verdict: Verdict) -> str:
+    """What to do after a verdict."""
+    if verdict == "explained":
+        return (
+            f"Identify with the cell of {option('cell_out')}, which has these effects added, and "
+            f"check the promise on poses that were never fitted (identify with {option('test')})."
+        )
+    if verdict == "ambiguous":
+        return (
+            "Compensating with the likeliest of the set serves poses and loads like those "
+            "measured; beyond them the rivals may predict differently."
+        )
+    if verdict == "unknown_effect":
+        return (
+            "Look for a physical cause where the evidence points, and measure more where the curve "
+            "is steep; compensate nothing by a name that the data do not support."
+        )
+    return "Nothing calls for another effect in the model."
+
+
+# A diagnosis as JSON: schema elastocal/diagnosis/1.
+
+SCHEMA = "elastocal/diagnosis/1"
+MICRO = 1e6
+NORMAL_95 = 1.959964
+
+
+def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
+    """The diagnosis as a JSON-ready dictionary (DESIGN: diagnose → JSON).
+
+    `model` is the arm that was diagnosed, `data` names its measurements.  Lengths are in µm where
+    the key says _um, everything else in the SI unit that stands beside it.  A number that is not
+    known or not finite is null, as JSON has none.
+    """
+    d = diagnosis
+    content = {
+        "schema": SCHEMA,
+        "robot": model.chain.name,
+        "cell": model.cell.name,
+        "data": data,
+        "verdict": d.verdict,
+        "p_value": d.p_value,
+        "probability_nothing": d.probability_nothing,
+        "probability_unknown": d.probability_unknown,
+        "gap": {
+            "nominal_um": d.gap.nominal * MICRO,
+            "calibrated_um": d.gap.calibrated * MICRO,
+            "explained_um": d.gap.explained * MICRO,
+            "noise_floor_um": d.gap.noise_floor * MICRO,
+        },
+        "budget": [_step(step) for step in d.budget],
+        "effects": [_finding(finding) for finding in d.effects],
+        "candidates": [_candidate(candidate) for candidate in d.candidates],
+        "indistinguishable": [[_place(e) for e in rivals] for rivals in d.indistinguishable],
+        "location": None if d.location is None else _location(d.location),
+        "structure": [vars(test) for test in d.structure],
+        "curves": [_curve(curve) for curve in d.curves],
+        "noise": _noise(d.noise, model.chain.kinds),
+        "untested": [vars(u) for u in d.untested],
+        "extra_plan": None if d.extra is None else _extra(d.extra),
+        "model_keys": d.model_keys,
+        "warnings": list(d.warnings),
+        "findings": [f.to_json() for f in d.findings],
+        "backend": model.backend_report(),
+        "n_readings": d.n_readings,
+        "n_configurations": d.n_configurations,
+    }
+    return {key: plain(value) for key, value in content.items()}
+
+
+def _step(step: BudgetStep) -> dict[str, Any]:
+    return {
+        "step": step.step,
+        "heldout_rms_um": step.heldout_rms * MICRO,
+        "ci95": [end * MICRO for end in step.ci95],
+    }
+
+
+def _place(e: EffectAt | FoundEffect | Candidate) -> dict[str, Any]:
+    return {"effect": e.effect, "where": e.where}
+
+
+def _finding(f: FoundEffect) -> dict[str, Any]:
+    return _place(f) | {
+        "probability": f.probability,
+        "gap_reduction": f.gap_reduction,
+        "gap_reduction_ci90": f.gap_reduction_ci90,
+        "gap_reduction_ci95": f.gap_reduction_ci95,
+        "parameters": [
+            {
+                "name": p.name,
+                "value": p.value,
+                "unit": p.unit,
+                "std": p.std,
+                "ci95": [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std],
+            }
+            for p in f.parameters
+        ],
+        "settings": f.settings,
+    }
+
+
+def _candidate(c: Candidate) -> dict[str, Any]:
+    return _place(c) | {
+        "stage": c.stage,
+        "probability": c.probability,
+        "score": c.score,
+        "detectable": c.detectable,
+        "settings": c.settings,
+    }
+
+
+def _location(location: Location) -> dict[str, Any]:
+    return {
+        "stage": location.stage,
+        "where": location.where,
+        "probability": location.probability,
+        "evidence": {
+            "stages": location.stages,
+            "places": location.places,
+            "drivers": location.covariates,
+        },
+    }
+
+
+def _curve(c: Curve) -> dict[str, Any]:
+    return vars(c) | {name: list(getattr(c, name)) for name in ("x", "y", "sd")}
+
+
+def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        "stated": noise.stated,
+        "stated_factor": noise.stated_factor,
+        "reading_sigma_um": noise.reading_sigma * MICRO,
+        "repeatability": [
+            {
+                "where": f"joint{i + 1}",
+                "value": value,
+                "unit": "rad" if kind == "revolute" else "m",
+            }
+            for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
+        ],
+        "shared": noise.shared,
+        "pure_error_um": None if noise.pure_error is None else noise.pure_error * MICRO,
+        "faulty": [_faulty(reading) for reading in noise.faulty],
+    }
+
+
+def _faulty(reading: FaultyReading) -> dict[str, Any]:
+    return {
+        "line": reading.line,
+        "configuration": reading.configuration,
+        "marker": reading.marker,
+        "error_um": reading.error * MICRO,
+        "sigmas": reading.sigmas,
+    }
+
+
+def _extra(extra: ExtraPlan) -> dict[str, Any]:
+    return {
+        "separable": extra.separable,
+        "inseparable": [list(group) for group in extra.inseparable],
+        "n_poses": extra.n_poses,
+        "rivals": list(extra.rivals),
+        "pairs": [vars(pair) for pair in extra.pairs],
+        "probability_before": extra.probability_before,
+        "probability_after": extra.probability_after,
+        "probability_random": extra.probability_random,
+        "advice": list(extra.advice),
+    }

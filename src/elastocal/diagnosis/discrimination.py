@@ -1,0 +1,491 @@
+"""How far apart rivals are after any set of visits, and which of them poses can tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain, islice, pairwise, permutations
+from typing import Any
+
+import numpy as np
+from scipy import linalg
+from scipy.sparse.csgraph import connected_components
+from scipy.stats import norm
+
+from elastocal.diagnosis.baseline import Baseline, visits
+from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.evidence import evidence_of
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.model_set import PLAUSIBLE, Item, packed_columns
+from elastocal.diagnosis.noise_floor import NoiseValues, covariance
+from elastocal.diagnosis.rivals import (
+    RivalSet,
+    Suspects,
+    columns_of_starts,
+    imitations,
+    left_out,
+    noise_found,
+)
+from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
+from elastocal.measurements import Measurements
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
+from elastocal.planning.candidates import draw
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import LoadStates
+from elastocal.simulation.simulate import simulate
+from elastocal.units import Array, IntArray
+
+# The visits that could still be made: feasible poses after the campaign, in its load states.
+
+CANDIDATES, FEWEST_POSES = 256, 64
+NEWTON = 1.0  # forces are told apart to this
+RARE = 0.1  # share of the visits below which a load state is not asked for again
+
+
+@dataclass(frozen=True)
+class VisitPool:
+    """N candidates, each one pose with its side of approach and moment, in all load states.
+
+    `q` (N, n); `approach` (N, n) of ±1 and `time` (N,) s where the table has them; `forces`
+    (L, 3) N.  `table` holds their rows: candidate by candidate, load by load, marker by marker,
+    with the readings that the fitted model expects.
+    """
+
+    q: Array
+    approach: Array | None
+    time: Array | None
+    forces: Array
+    table: Measurements
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+def draw_pool(
+    model: Model, x: Array, table: Measurements, *, sides: bool, waits: bool, most: int, seed: int
+) -> VisitPool:
+    """Candidates that the cell's rules allow, after the campaign of `table`.
+
+    Some CANDIDATES, or `most` where memory is short, of FEWEST_POSES poses at least.  With
+    `sides` every pose comes twice, each joint from either side; with `waits` twice too: at once
+    and after as long as the campaign took.  Both only where the table has such a column.
+
+    Raises InsufficientDataError where no pose is feasible.
+    """
+    sides, waits = sides and table.approach is not None, waits and table.time is not None
+    rng = np.random.default_rng(seed)
+    forces = load_forces(table)
+    states = LoadStates(forces, False, np.ones(len(forces), dtype=bool))
+    n = max(min(CANDIDATES, most) // (1 + sides) // (1 + waits), FEWEST_POSES)
+    cell, chain = model.cell, model.chain
+    if cell.model.compliance_levels and not cell.design.levels:
+        # A joint whose compliance is known at its levels only can be nowhere else.
+        spec = replace(cell.design, levels=cell.model.compliance_levels)
+        cell = replace(cell, design=spec)
+    q = draw(cell, chain, states, Feasibility(cell, chain), n, seed).q
+    approach = time = None
+    if table.approach is not None:
+        approach = rng.choice([-1.0, 1.0], q.shape)
+        if sides:
+            q, approach = np.concatenate([q, q]), np.concatenate([approach, -approach])
+    if table.time is not None:
+        begin, step = table.time.max() + time_step(table), np.ptp(table.time)
+        time = np.full(len(q), begin)
+        if waits:
+            q, time = np.concatenate([q, q]), np.concatenate([time, time + step])
+            approach = None if approach is None else np.tile(approach, (2, 1))
+    return visit_pool_of(model, x, table, q, approach, time, forces)
+
+
+def visit_pool_of(
+    model: Model, x: Array, table: Measurements, q: Array, approach: Array | None,
+    time: Array | None, forces: Array,
+) -> VisitPool:  # fmt: skip
+    """The pool of these candidates, read as the model at `x` would be."""
+    n, L, M = len(q), len(forces), len(table.marker_names)
+    candidate = np.repeat(np.arange(n), L * M)
+    known = len(table.configuration_labels)
+    rows = replace(
+        table.take(np.zeros(len(candidate), dtype=np.int64)),
+        row=np.zeros(len(candidate), dtype=np.int64),  # no line of any file
+        q=q[candidate],
+        configuration=known + candidate,
+        configuration_labels=table.configuration_labels + tuple(f"candidate {i}" for i in range(n)),
+        repeat=np.zeros(len(candidate), dtype=np.int64),
+        marker=np.tile(np.arange(M), n * L),
+        force=forces[np.tile(np.repeat(np.arange(L), M), n)],
+        approach=None if approach is None else approach[candidate],
+        time=None if time is None else time[candidate],
+    )
+    if table.temperature is not None:
+        rows = replace(rows, temperature=np.full(len(rows), np.median(table.temperature)))
+    return VisitPool(q, approach, time, forces, simulate(model, rows, x, 0, noise=False))
+
+
+def load_forces(table: Measurements) -> Array:
+    """The table's usual load states (L, 3) N; the mean load where every visit has its own."""
+    _, first = np.unique(visits(table), return_index=True)
+    force = table.force[first]
+    _, group, count = np.unique(
+        np.round(force / NEWTON), axis=0, return_inverse=True, return_counts=True
+    )
+    usual = [k for k in range(len(count)) if count[k] >= RARE * len(force)]
+    loaded = np.any(force != 0, axis=1)
+    if not usual or (loaded.any() and not loaded[np.isin(group.ravel(), usual)].any()):
+        means = [force[part].mean(axis=0) for part in (~loaded, loaded) if part.any()]
+        return np.array(means)
+    means = [force[group.ravel() == k].mean(axis=0) for k in usual]
+    return np.array(sorted(means, key=lambda f: float(np.linalg.norm(f))))
+
+
+def time_step(table: Measurements) -> float:
+    """How long a visit usually takes, in s."""
+    assert table.time is not None
+    moments = np.unique(table.time)
+    return float(np.median(np.diff(moments))) if len(moments) > 1 else 0.0
+
+
+def joined(first: Measurements, second: Measurements) -> Measurements:
+    """Both tables' rows; the second's labels hold for both, its columns are the first's."""
+    arrays: dict[str, Any] = {
+        f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
+        for f in fields(first)
+        if isinstance(getattr(first, f.name), np.ndarray)
+    }
+    return replace(second, source=first.source, **arrays)
+
+
+# Whitened columns of the campaign so far and of every candidate, for one set of rivals.
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Data so far and pool in one scene, whose first `measured` configurations are the data.
+
+    `noise` is what the diagnosis found.
+    """
+
+    dataset: DiagnosisData
+    measured: int
+    noise: NoiseValues
+
+    @property
+    def so_far(self) -> DiagnosisData:
+        """The scene in which only the data so far count."""
+        blocks = self.dataset.blocks
+        later = np.zeros(blocks.n, dtype=bool)
+        members = blocks.member[self.measured :]
+        later[members[members < blocks.n]] = True
+        return replace(
+            self.dataset, data=self.dataset.data.without(later | self.dataset.data.faulty)
+        )
+
+
+def campaign_of(
+    base: Baseline, pool: VisitPool, hypotheses: list[Hypothesis], diagnosis: Diagnosis
+) -> Campaign:
+    """Columns of the data so far and of the pool at the fit, faulty readings left out.
+
+    Candidates are read as precisely as the same marker was on average.
+    """
+    table = base.observed.table
+    observed = observe(joined(table, pool.table), base.model.observe)
+    n, size = len(base.observed.lead), observed.size
+    stated = base.stated
+    if stated is None:
+        spread = base.residual.reshape(n, size).var(axis=0)
+        stated = np.tile(np.diag(np.maximum(spread, 1e-18)), (n, 1, 1))
+    marker = table.marker[base.observed.lead]
+    usual = np.zeros((len(table.marker_names), size, size))
+    usual[:] = stated.mean(axis=0)
+    for k in np.unique(marker):
+        usual[k] = stated[marker == k].mean(axis=0)
+    later = observed.table.marker[observed.lead[n:]]
+    whole = replace(
+        base, observed=observed, stated=np.concatenate([stated, usual[later]]),
+        residual=np.concatenate([base.residual, np.zeros(size * len(later))]), planned=len(later),
+    )  # fmt: skip
+    measured = len(np.unique(table.configuration[base.observed.lead]))
+    dataset = diagnosis_data_of(whole, hypotheses).without(left_out(whole, diagnosis))
+    return Campaign(dataset, measured, noise_found(diagnosis))
+
+
+@dataclass(frozen=True)
+class WhitenedRows:
+    """Whitened rows of one set of rivals.
+
+    `gram` (w, w) = Wᵀ V⁻¹ W of the data so far, with the nuisance's prior precision; `pool`
+    (N, m, w) = V^−½ W of each candidate; `response` (w,) = Wᵀ V⁻¹ r.  Columns W: the `nuisance`
+    first ones are those of the fitted parameters and of the effects beside the rivals, then each
+    rival's own, at `groups`, and at `imitations` those with which it may imitate others instead:
+    at other settings or about other starts, each by itself.
+    """
+
+    gram: Array
+    pool: Array
+    response: Array
+    nuisance: int
+    groups: tuple[slice, ...]
+    imitations: tuple[tuple[slice, ...], ...]
+
+
+def rows_of(campaign: Campaign, discrimination: RivalSet) -> WhitenedRows:
+    """Whiten the columns of `contest` by V = covariance of each configuration."""
+    dataset, data = campaign.dataset, campaign.dataset.data
+    searched = imitations(campaign.so_far, campaign.noise, discrimination)
+    beside = [_scaled(dataset, item) for item in discrimination.beside]
+    others = [
+        [*(packed_columns(dataset, i) for i in items), *columns_of_starts(dataset, rival)]
+        for rival, items in zip(discrimination.rivals, searched, strict=True)
+    ]
+    own = [packed_columns(dataset, rival) for rival in discrimination.rivals]
+    own = [data.masked(C) for C in [*own, *chain.from_iterable(others)]]
+    nuisance = data.X.shape[2] + sum(C.shape[2] for C in beside)
+    ends = nuisance + np.cumsum([0, *(C.shape[2] for C in own)])
+    spans = [slice(int(a), int(b)) for a, b in pairwise(ends)]
+    W = np.concatenate(
+        [data.masked(data.X), *beside, *own, data.masked(data.r)[:, :, None]], axis=2
+    )
+    white = np.linalg.solve(np.linalg.cholesky(covariance(data, campaign.noise)), W)
+    so_far = white[: campaign.measured].reshape(-1, W.shape[2])
+    gram = so_far.T @ so_far
+    fitted = data.X.shape[2]
+    gram[:fitted, :fitted] += np.diag(data.precision)
+    gram[fitted:nuisance, fitted:nuisance] += np.eye(nuisance - fitted)
+    n = len(discrimination.rivals)
+    rest = iter(spans[n:])
+    by = [tuple(islice(rest, len(each))) or (spans[b],) for b, each in enumerate(others)]
+    return WhitenedRows(
+        gram[:-1, :-1], white[campaign.measured :, :, :-1], gram[:-1, -1], nuisance,
+        tuple(spans[:n]), tuple(by),
+    )  # fmt: skip
+
+
+def _scaled(dataset: DiagnosisData, item: Item) -> Array:
+    """Columns (C, m, k) of an item beside, per widest size of its prior."""
+    return dataset.data.masked(packed_columns(dataset, item)) * float(item.scales.max())
+
+
+def eliminated(gram: Array, nuisance: int) -> tuple[Array, Array]:
+    """Schur complement of the nuisance in gram (w, w), and its inverse Gram (p, p)."""
+    factor = linalg.cho_factor(gram[:nuisance, :nuisance])
+    inverse = linalg.cho_solve(factor, np.eye(nuisance))
+    cross = gram[:nuisance, nuisance:]
+    return gram[nuisance:, nuisance:] - cross.T @ inverse @ cross, inverse
+
+
+# How far apart rivals are, and how probably the right one is named, after any set of visits.
+#
+# With W's nuisance columns X (prior precision Λ) and rival b's columns C_b (as large as the verdict
+# lets a rival be, s_b) eliminated, the signal C_a γ of rival a keeps the squared length
+#
+#     d²_ab(γ) = min_{β, η} |C_a γ − X β − C_b η|²_V⁻¹ + |β|²_Λ + |η|²/s_b² = γᵀ D_ab γ,
+#     D_ab = S_aa − S_ab (S_bb + I/s_b²)⁻¹ S_ba,
+#
+# with S the Schur complement of the nuisance in the Gram matrix and the smallest over the starts
+# from which b is sought: the T-criterion (Atkinson and Fedorov 1975), and twice the
+# Kullback-Leibler distance (López-Fidalgo et al. 2007).  γ is what the data so far leave of it:
+# draws from its posterior.  If a is the truth, further visits that raise d² by δ² move the log odds
+# of a over b from where they stand, L_ab, by N(δ²/2, δ²), so that b wins with probability
+# Φ(−(L_ab + δ²/2)/δ).
+
+DRAWS = 32  # of each sign
+
+
+@dataclass(frozen=True)
+class Discrimination:
+    """One set of rivals with everything that judges a choice of candidates.
+
+    `draws`: γ (draws, k) of each rival; `before` (rivals, rivals, draws) d² in the data so far;
+    `classes` (rivals,): those with the same number are not asked to be told apart.
+    """
+
+    rivals: RivalSet
+    rows: WhitenedRows
+    draws: tuple[Array, ...]
+    before: Array
+    classes: IntArray
+
+    @classmethod
+    def of(cls, rivals: RivalSet, rows: WhitenedRows, rng: np.random.Generator) -> Discrimination:
+        draws = _posterior_draws(rivals, rows, rng)
+        n = len(draws)
+        start = cls(rivals, rows, draws, np.zeros((n, n, 2 * DRAWS)), np.arange(n))
+        S = eliminated(rows.gram, rows.nuisance)[0]
+        return replace(start, before=start._squared(S[None])[0])
+
+    def in_classes(self, classes: IntArray) -> Discrimination:
+        """The same judged by telling these classes (rivals,) apart."""
+        return replace(self, classes=classes)
+
+    @property
+    def open(self) -> bool:
+        """Whether there is anything to tell apart."""
+        return bool(np.any(self.classes != self.classes[0]))
+
+    def gram(self, chosen: Sequence[int]) -> Array:
+        """Gram matrix (w, w) of the data so far and the chosen candidates."""
+        H = self.rows.pool[list(chosen)].reshape(-1, len(self.rows.gram))
+        return self.rows.gram + H.T @ H
+
+    def squared(self, gram: Array) -> Array:
+        """d² (rivals, rivals, draws) of every ordered pair; zero of a rival with itself."""
+        return self._squared(eliminated(gram, self.rows.nuisance)[0][None])[0]
+
+    def squared_with_each(self, gram: Array) -> Array:
+        """d² (N, rivals, rivals, draws) with each candidate added to the visits behind `gram`.
+
+        A candidate's few rows H = [H_X, H_R] change S by EᵀK⁻¹E with E = H_R − H_X M⁻¹ M_XR and
+        K = I + H_X M⁻¹ H_Xᵀ (Woodbury), which spares an elimination for each.
+        """
+        p = self.rows.nuisance
+        S, inverse = eliminated(gram, p)
+        H = self.rows.pool
+        through = H[:, :, :p] @ inverse
+        E = H[:, :, p:] - through @ gram[:p, p:]
+        K = np.eye(H.shape[1]) + through @ H[:, :, :p].transpose(0, 2, 1)
+        return self._squared(S + E.transpose(0, 2, 1) @ np.linalg.solve(K, E))
+
+    def _squared(self, S: Array) -> Array:
+        n, p = len(self.draws), self.rows.nuisance
+        out = np.zeros((len(S), n, n, 2 * DRAWS))
+        for a, b in permutations(range(n), 2):
+            posterior_draw, g = self.rows.groups[a], self.draws[a]
+            of_a = slice(posterior_draw.start - p, posterior_draw.stop - p)
+            size = PLAUSIBLE * self.rivals.rivals[b].scales.max()
+            nearest = np.full((len(S), len(g)), np.inf)
+            for rival in self.rows.imitations[b]:
+                of_b = slice(rival.start - p, rival.stop - p)
+                tie = np.eye(rival.stop - rival.start) / size**2
+                taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
+                D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
+                nearest = np.minimum(nearest, ((g @ D) * g).sum(axis=2))
+            out[:, a, b] = np.maximum(nearest, 0.0)
+        return out
+
+    def gained(self, squared: Array) -> Array:
+        """δ² (…, rivals, rivals, draws): what the visits add to the data so far."""
+        return np.maximum(squared - self.before, 0.0)
+
+    def error_bound(self, squared: Array) -> Array:
+        """(…,) Σ_ab √(p_a p_b) E exp(−δ²_ab/8): Chernoff's bound of the pairs' errors, whose
+        largest term is that of the closest pair, and which is smooth where Φ is flat."""
+        p = self.rivals.probability
+        other = self.classes[:, None] != self.classes[None, :]
+        weight = np.sqrt(p[:, None] * p[None, :]) * other
+        bound = np.exp(-self.gained(squared) / 8).mean(axis=-1)
+        return np.asarray((weight * bound).sum(axis=(-2, -1)))
+
+    def probability(self, squared: Array) -> Array:
+        """(…,) probability of naming the right class, averaged over truth and its size.
+
+        By the union bound over the truth's rival classes, each as dangerous as its strongest
+        member; not below what naming the likeliest so far gives, which nobody has to give up.
+        While a pair is as near as the verdict calls alike, no odds name one of the two with more
+        than ALIKE_PROBABILITY.
+        """
+        p = self.rivals.probability
+        odds = np.log(np.bincount(self.classes, p)[self.classes])
+        L = (odds[:, None] - odds[None, :])[..., None]
+        delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
+        beaten = norm.cdf(-(L + delta**2 / 2) / delta)
+        alike = squared < ALIKE**2
+        beaten = np.where(alike, np.maximum(beaten, 1 - ALIKE_PROBABILITY), beaten)
+        lost = np.zeros(beaten.shape[:-2] + beaten.shape[-1:])
+        for k in np.unique(self.classes):
+            strongest = beaten[..., self.classes == k, :].max(axis=-2)
+            lost += strongest * (self.classes != k)[:, None]
+        named = (np.maximum(1 - lost, 0.0).mean(axis=-1) * p).sum(axis=-1)
+        return np.maximum(named, self.so_far)
+
+    @property
+    def so_far(self) -> float:
+        """Probability that the class of the likeliest rival is right."""
+        p = self.rivals.probability
+        return float(p[self.classes == self.classes[int(np.argmax(p))]].sum())
+
+    def distances(self, squared: Array) -> Array:
+        """d (rivals, rivals) of each unordered pair: the median size's, the nearer way round."""
+        d = np.sqrt(np.median(squared, axis=-1))
+        return np.minimum(d, d.T)
+
+
+def _posterior_draws(
+    rivals: RivalSet, rows: WhitenedRows, rng: np.random.Generator
+) -> tuple[Array, ...]:
+    """γ (2·DRAWS, k) of each rival as if it were the truth, antithetic about its estimate.
+
+    γ | data ~ N(mean, A⁻¹), A = S_aa + I/s², at the scale s of the size prior that explains the
+    data best.
+    """
+    p = rows.nuisance
+    whole = np.column_stack([rows.gram, rows.response])
+    whole = np.vstack([whole, np.append(rows.response, 0.0)])
+    S = eliminated(whole, p)[0]
+    out = []
+    for item, g in zip(rivals.rivals, rows.groups, strict=True):
+        of = slice(g.start - p, g.stop - p)
+        lam, U = np.linalg.eigh(S[of, of])
+        lam = np.maximum(lam, 0.0)
+        beta = U.T @ S[of, -1]
+        each = [evidence_of(lam[None], beta[None], np.array([s]))[0] for s in item.scales]
+        precision = lam + 1 / item.scales[int(np.argmax(each))] ** 2
+        z = rng.normal(size=(DRAWS, len(lam))) / np.sqrt(precision)
+        out.append((beta / precision + np.concatenate([z, -z])) @ U.T)
+    return tuple(out)
+
+
+# The contests of a diagnosis over a pool, and which of their rivals any poses can tell apart.
+
+# A pair that all candidates together would not tell apart with this probability is inseparable.
+HOPE = 0.9
+
+
+def discriminations_of(
+    base: Baseline, pool: VisitPool, suspects: Suspects, seed: int
+) -> list[Discrimination]:
+    """The contests of the diagnosis, with the candidates of a pool."""
+    campaign = campaign_of(base, pool, suspects.hypotheses, suspects.diagnosis)
+    sets = list(suspects.sets)
+    if suspects.unknown:
+        sets.append(suspects.unknown_set(campaign.so_far, campaign.noise))
+    return [Discrimination.of(s, rows_of(campaign, s), np.random.default_rng(seed)) for s in sets]
+
+
+def judged(
+    discriminations: Sequence[Discrimination],
+) -> tuple[list[Discrimination], dict[tuple[str, str], float]]:
+    """Each contest in classes that the whole pool could tell apart, and the pairs that it could
+    not, with their distance in all of it."""
+    out, hopeless = [], {}
+    for c in discriminations:
+        d = c.distances(c.squared(c.gram(range(len(c.rows.pool)))))
+        near = d < 2 * float(norm.ppf(HOPE))
+        classes = connected_components(near, directed=False)[1].astype(np.int64)
+        out.append(c.in_classes(classes))
+        names = c.rivals.names
+        for a, b in zip(*np.nonzero(np.triu(near, 1)), strict=True):
+            hopeless[names[a], names[b]] = float(d[a, b])
+    return out, hopeless
+
+
+def together(c: Discrimination) -> Iterator[tuple[str, ...]]:
+    """The rivals of each class that has several."""
+    for k in np.unique(c.classes):
+        names = [name for name, own in zip(c.rivals.names, c.classes, strict=True) if own == k]
+        if len(names) > 1:
+            yield tuple(names)
+
+
+def pairs_of(
+    discriminations: Sequence[Discrimination], chosen: Sequence[int]
+) -> tuple[RivalPair, ...]:
+    out = []
+    for c in discriminations:
+        before, after = c.distances(c.before), c.distances(c.squared(c.gram(chosen)))
+        names = c.rivals.names
+        for a, b in zip(*np.triu_indices(len(names), 1), strict=True):
+            out.append(RivalPair(names[a], names[b], float(before[a, b]), float(after[a, b])))
+    return tuple(out)

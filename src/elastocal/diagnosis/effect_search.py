@@ -1,0 +1,371 @@
+"""Forward selection of what is missing, each step re-examined, under noise fitted beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Prior, Scan, exceedance, scan
+from elastocal.diagnosis.hypotheses import Hypothesis, is_driven
+from elastocal.diagnosis.model_set import Item, ModelSet, fit_extended, fit_set, refine, signal_of
+from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
+from elastocal.diagnosis.unknown import Generic
+from elastocal.units import Array
+
+# What a search found: the set, what else could stand in each of its places, and the odds.
+
+
+@dataclass(frozen=True)
+class Slot:
+    """What could stand in one place of the set, the other items given.
+
+    `options` are candidates with log posterior scores relative to nothing in that place; they
+    hold every hypothesis and block.
+    """
+
+    items: tuple[Item, ...]
+    scores: Array
+
+    def best_of(self, other: Slot) -> Slot:
+        """The same options, each with the higher score: both are bounds from below on what it
+        would be under the noise that suits it best."""
+        higher = other.scores > self.scores
+        items = tuple(
+            b if up else a for a, b, up in zip(self.items, other.items, higher, strict=True)
+        )
+        return Slot(items, np.maximum(self.scores, other.scores))
+
+    def probabilities(self) -> tuple[Array, float]:
+        """Of each option (K,), and of nothing."""
+        total = float(logsumexp(np.append(self.scores, 0.0)))
+        return np.exp(self.scores - total), float(np.exp(-total))
+
+
+@dataclass(frozen=True)
+class SelectedEffects:
+    """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
+    p-value of every step against all that could have been found by chance.
+
+    `scene` is the one that the set was fitted on: columns about a fit with its large effects.
+    `first` is the scan beside nothing under its own noise, `alone` under the final noise.
+    """
+
+    dataset: DiagnosisData
+    chosen: ModelSet
+    slots: tuple[Slot, ...]
+    p_values: tuple[float, ...]
+    nothing: ModelSet
+    first: Scan
+    alone: Scan
+
+
+# Columns anew at the nonlinear fit with a large effect in it, before anything else is sought.
+
+# Rms signal in m beyond which the products of an effect with the fitted parameters, which it
+# moves by a tenth or so, are no longer small beside the noise.
+FAR = 2e-4
+
+
+def is_far(dataset: DiagnosisData, chosen: ModelSet) -> bool:
+    """Whether one of the set's effects that are not mere motions is large."""
+    return any(_rms(dataset, chosen, k) > FAR for k in _direct(chosen))
+
+
+def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
+    """The scene about the nonlinear fit with the set's known effects in the model.
+
+    The residual is that of the fitted parameters alone: what the effects explain is put back, so
+    that sets with and without them are judged on the same footing.
+    """
+    base = dataset.base
+    fitted = fit_extended(dataset, chosen, [chosen.items[k] for k in _direct(chosen)])
+    model = fitted.model
+    x = dict(zip(model.names, fitted.x, strict=True))
+    moved = replace(
+        base, x=np.array([x[name] for name in base.model.names]), residual=fitted.residual
+    )
+    fresh = diagnosis_data_of(moved, list(dataset.hypotheses), model, fitted.x)
+    # Put back by the scene's own columns, which will have to explain it: those of the equilibrium
+    # differ from them by a thousandth, and a large effect is a thousand deviations.
+    back = np.zeros((*fitted.residual.reshape(-1, base.observed.size).shape, 1))
+    for k in _direct(chosen):
+        what = chosen.items[k].what
+        assert isinstance(what, Hypothesis)
+        # What an effect tries from several starts has no size about any of them.
+        starts = what.effect.starts(what.where, model.chain, model.cell)
+        open_keys = {key for start in starts for key in start}
+        away = [
+            0.0 if p.key in open_keys else x[f"{what.where}.{p.key}"] - p.nominal
+            for p in what.parameters
+        ]
+        back[:, :, 0] += fresh.columns.observed(fresh.columns.of(what)) @ np.array(away)
+    return replace(
+        fresh,
+        base=replace(moved, residual=fitted.residual + back.ravel()),
+        other_play=dataset.other_play,
+        data=replace(
+            fresh.data,
+            r=fresh.data.r + fresh.blocks.pack(back)[:, :, 0],
+            left_out=dataset.data.left_out,
+        ),
+    )
+
+
+def _direct(chosen: ModelSet) -> list[int]:
+    return [
+        k
+        for k, item in enumerate(chosen.items)
+        if isinstance(item.what, Hypothesis) and not is_driven(item.what)
+    ]
+
+
+def _rms(dataset: DiagnosisData, chosen: ModelSet, k: int) -> float:
+    signal = signal_of(dataset, chosen, k)
+    return float(np.sqrt((signal[~dataset.data.left_out] ** 2).mean()))
+
+
+# Forward selection of what is missing, each step re-examined, under noise fitted beside it.
+
+FLIPS = 199
+CLOSE = 6  # candidates whose noise is fitted for themselves
+HOPELESS = -6.0  # score below which none is
+# How far behind the best one is not worth a noise of its own: under noise that an effect still
+# missing has swollen, and under the noise of a set that is complete but for the item in question.
+FAR_BEHIND, BEHIND_COMPLETE = 60.0, 20.0
+# Probability that nothing (more) is there above which nothing is claimed.  For a first effect the
+# flips keep the false alarms at their level; many weak candidates together may make it probable
+# that there is something, though none of them is probable by itself.
+DOUBT, DOUBT_MORE = 0.7, 0.05
+CLOSE_BLOCKS = 3
+CLEARLY = 10.0  # nats by which several named effects must beat fewer without a name
+PART = 0.3
+MOST_EFFECTS, MOST_BESIDE_UNKNOWN = 4, 2
+KEPT = 4  # scans that are kept, the last ones
+
+
+def base_score(dataset: DiagnosisData, current: ModelSet, seen: Scan) -> float:
+    """Log posterior of the set as it is under the scan's noise."""
+    items = sum(item.log_prior for item in current.items)
+    return seen.at.marginal + items - 0.5 * log_prior(dataset.data.stated, seen.noise)[0]
+
+
+def _rivalled(slot: Slot) -> bool:
+    """Whether some named effect alone does a good part of what a block without a name does."""
+    named = [s for item, s in zip(slot.items, slot.scores, strict=True) if item.known]
+    return max(named, default=-np.inf) > PART * slot.scores.max()
+
+
+@dataclass
+class ForwardSelection:
+    """The search's means: scene, blocks, flips of signs, and the level of a claim."""
+
+    dataset: DiagnosisData
+    generic: list[Generic]
+    noise: NoiseValues
+    level: float
+    seed: int
+    signs: Array = field(init=False)
+    _start: DiagnosisData = field(init=False)
+    _visited: set[frozenset[int]] = field(init=False, default_factory=set)
+    _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
+    _scanned: dict[tuple, Scan] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(self.seed)
+        C = len(self.dataset.blocks.member)
+        self.signs = rng.choice([-1.0, 1.0], (FLIPS, C))
+
+    def run(self) -> SelectedEffects:
+        self._start = dataset = self.dataset
+        nothing = current = fit_set(dataset, (), self.noise)
+        seen = first = alone = self._scan(current, flips=True)
+        slots: list[Slot] = []
+        p_values: list[float] = []
+        while True:
+            best, slot = self._best_addition(current, seen)
+            most = MOST_BESIDE_UNKNOWN if current.unknown else MOST_EFFECTS
+            if best is None or len(current.items) >= most:
+                break
+            # Score all again under the noise beside the winner: an effect that is still missing
+            # looks like noise, and hides others with it.
+            observed = self._scan(current, best.noise)
+            if not current.items:
+                alone = observed
+            better, again = self._best_addition(current, observed)
+            best, slot = better, slot.best_of(again)
+            doubt = DOUBT_MORE if current.items else DOUBT
+            if best is None or slot.probabilities()[1] > doubt:
+                break
+            after = self._scan(best, flips=True)
+            p = exceedance(after.flipped, observed.odds)
+            if p > self.level:
+                break
+            if self._been_at(best):
+                break
+            current, seen = best, after
+            slots.append(slot)
+            p_values.append(p)
+            if is_far(self.dataset, current):
+                self.dataset = relinearised(self.dataset, current)
+                self._forget()
+                current = fit_set(self.dataset, current.items, current.noise)
+                seen = self._scan(current)
+            if len(current.items) > 1:
+                current, slots, seen = self._reexamined(current, slots, seen)
+        if not slots:
+            slots = [slot]
+        if len(current.items) > 1:
+            alone = self._scan(nothing, current.noise)
+        return SelectedEffects(
+            self.dataset, current, tuple(slots), tuple(p_values), nothing, first, alone
+        )
+
+    def settled(self, found: SelectedEffects) -> SelectedEffects:
+        """What effects of the catalogue alone would make of it, where that is clearly better.
+
+        A block without a name fits a little of everything, and may come first where several
+        effects act at once.
+        """
+        if not found.chosen.unknown or not _rivalled(found.slots[0]):
+            return found
+        named = ForwardSelection(self._start, [], self.noise, self.level, self.seed).run()
+        if not named.chosen.items or named.chosen.score < found.chosen.score + CLEARLY:
+            return found
+        self.dataset = named.dataset
+        self._forget()
+        chosen, slots, _ = self._reexamined(named.chosen, list(named.slots), found.alone)
+        return replace(
+            found, dataset=self.dataset, chosen=chosen, slots=tuple(slots), p_values=named.p_values
+        )
+
+    def _forget(self) -> None:
+        """What was fitted and scanned about another scene is void."""
+        self._fitted.clear()
+        self._scanned.clear()
+
+    def _been_at(self, chosen: ModelSet) -> bool:
+        """Whether the search has come round to a set that it had; noted either way."""
+        key = frozenset(id(item.what) for item in chosen.items)
+        known = key in self._visited
+        self._visited.add(key)
+        return known
+
+    def _scan(
+        self, current: ModelSet, noise: NoiseValues | None = None, flips: bool = False
+    ) -> Scan:
+        noise = noise or current.noise
+        items = tuple((id(item.what), item.settings.tobytes()) for item in current.items)
+        # Sets that a step has judged come again when its items are re-examined; a scan with flips
+        # holds what one without them does.
+        key = items, current.scales, noise.logs().tobytes()
+        for known in (True, flips):
+            if (*key, known) in self._scanned:
+                return self._scanned[*key, known]
+        seen = scan(
+            self.dataset,
+            self.generic,
+            self._prior(current),
+            current.data,
+            noise,
+            self.signs if flips else self.signs[:0],
+        )
+        self._scanned[*key, flips] = seen
+        while len(self._scanned) > KEPT:
+            self._scanned.pop(next(iter(self._scanned)))
+        return seen
+
+    def _prior(self, current: ModelSet) -> Prior:
+        """Of one item more."""
+        something = ANOTHER if current.items else SOMETHING
+        return Prior.of(self.dataset.hypotheses, self.generic, something)
+
+    def _best_addition(
+        self, current: ModelSet, seen: Scan, behind: float = FAR_BEHIND
+    ) -> tuple[ModelSet | None, Slot]:
+        """The best set with one item more (None: none is worth it), and the slot it fills.
+
+        Beside other items it has to be better than the set without it.
+        """
+        options = self._options(current, seen)
+        slot = Slot(tuple(item for item, _ in options), np.array([s for _, s in options]))
+        base = current.score
+        close = self._close(slot, behind)
+        best: ModelSet | None = None
+        scores = slot.scores.copy()
+        for k in close:
+            item = slot.items[k]
+            if any(item.same_as(other) for other in current.items):
+                scores[k] = -np.inf
+                continue
+            fitted = self._with(current, item)
+            scores[k] = fitted.score - base
+            if best is None or fitted.score > best.score:
+                best = fitted
+        if best is not None and current.items and best.score <= base:
+            best = None
+        return best, Slot(slot.items, scores)
+
+    def _options(self, current: ModelSet, seen: Scan) -> list[tuple[Item, float]]:
+        prior = self._prior(current)
+        # Scores count from the set as it is, under the noise that suits it best.
+        offset = base_score(self.dataset, current, seen) - current.score
+        options = []
+        for h, s, w in zip(self.dataset.hypotheses, seen.scored, prior.hypotheses, strict=True):
+            # What the search over settings costs stays with the item.
+            item = Item(h, s.settings, float(w + s.evidence - s.best))
+            options.append((item, float(w + s.evidence + offset)))
+        for g, s, w in zip(self.generic, seen.blocks, prior.blocks, strict=True):
+            options.append((Item(g, s.settings, float(w)), float(w + s.evidence + offset)))
+        return options
+
+    def _with(self, current: ModelSet, item: Item) -> ModelSet:
+        """The set with one item more, its noise and settings fitted; kept, since it is asked for
+        again."""
+        items = (*current.items, item)
+        key = tuple((id(i.what), i.settings.tobytes(), i.log_prior) for i in items)
+        if key not in self._fitted:
+            fitted = fit_set(self.dataset, items, current.noise)
+            self._fitted[key] = refine(self.dataset, fitted, len(items) - 1)
+        return self._fitted[key]
+
+    def _close(self, slot: Slot, behind: float) -> NDArray[np.int64]:
+        known = np.array([item.known for item in slot.items])
+        order = np.argsort(-slot.scores, kind="stable")
+        order = order[slot.scores[order] > HOPELESS]
+        near = slot.scores[order] > slot.scores[order[:1]].max(initial=-np.inf) - behind
+        order = order[near]
+        hypotheses = order[known[order]][:CLOSE]
+        blocks = order[~known[order]][:CLOSE_BLOCKS]
+        return np.concatenate([hypotheses, blocks])
+
+    def _reexamined(
+        self, current: ModelSet, slots: list[Slot], seen: Scan
+    ) -> tuple[ModelSet, list[Slot], Scan]:
+        """Every item against all that could stand in its place, the others given."""
+        for _ in range(2):
+            changed = False
+            k = 0
+            while k < len(current.items):
+                others = fit_set(self.dataset, current.without(k), current.noise)
+                beside = self._scan(others, current.noise)
+                best, slot = self._best_addition(others, beside, BEHIND_COMPLETE)
+                slots[k] = slot
+                if best is None:  # no longer needed
+                    current, changed = others, True
+                    del slots[k]
+                    continue
+                if best.score > current.score + 1e-6 and not best.items[-1].same_as(
+                    current.items[k]
+                ):
+                    items = list(best.items)
+                    items.insert(k, items.pop())
+                    current = fit_set(self.dataset, tuple(items), best.noise)
+                    changed = True
+                k += 1
+            if not changed:
+                break
+        return current, slots, self._scan(current)

@@ -1,0 +1,379 @@
+"""Which further poses would tell the rivals of a diagnosis apart, and how surely."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import count, islice
+
+import numpy as np
+
+from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
+from elastocal.diagnosis.diagnosis import Diagnosis, ExtraPlan
+from elastocal.diagnosis.discrimination import (
+    Discrimination,
+    VisitPool,
+    discriminations_of,
+    draw_pool,
+    judged,
+    pairs_of,
+    time_step,
+    together,
+    visit_pool_of,
+)
+from elastocal.diagnosis.hypotheses import with_recorded_drivers
+from elastocal.diagnosis.rivals import RivalSet, Suspects, check_open, with_neighbours
+from elastocal.errors import InsufficientDataError, option, require
+from elastocal.measurements import Measurements
+from elastocal.model.effects import effect_of
+from elastocal.model.manipulator import Model
+from elastocal.units import Array, Progress
+
+# The fewest candidates that tell the rivals apart: greedy addition, then exchange.
+#
+# The design module's criteria are functions of one information matrix, convex and homogeneous of
+# degree −1, which its bounds rest on.  Distances of rivals are neither: they start from data in
+# hand, and a pair's distance is a difference of two informations.  So this search is its own: one
+# candidate more at a time until they are enough, each then exchanged for the best other until none
+# helps, and what has become needless left out.
+
+ENOUGH = 0.97  # probability of the right answer from which no further pose is asked for
+ROUNDS = 3  # of exchange, at most
+WORTH = 1e-3  # relative fall of the error that an exchange is made for
+RANDOM_DRAWS = 32
+
+
+def fewest(
+    discriminations: Sequence[Discrimination], most: int, enough: float = ENOUGH
+) -> list[int]:
+    """Candidates, at most `most`, with which the right one is named with a probability of
+    `enough`; `most` where fewer do not reach it."""
+    chosen: list[int] = []
+    while len(chosen) < min(most, len(discriminations[0].rows.pool)):
+        chosen.append(_best(discriminations, chosen)[0])
+        if expected(discriminations, chosen) >= enough:
+            break
+    _exchange(discriminations, chosen)
+    while len(chosen) > 1 and expected(discriminations, chosen) >= enough:
+        fewer = _without_least(discriminations, chosen)
+        _exchange(discriminations, fewer)
+        if expected(discriminations, fewer) < enough:
+            break
+        chosen = fewer
+    return chosen
+
+
+def expected(discriminations: Sequence[Discrimination], chosen: Sequence[int]) -> float:
+    """Probability that the right one of every set is named after the chosen visits."""
+    each = [c.probability(c.squared(c.gram(chosen))) for c in discriminations]
+    return float(np.prod(each))
+
+
+def expected_of_random(
+    discriminations: Sequence[Discrimination], n: int, rng: np.random.Generator
+) -> float:
+    """The same for as many candidates drawn at random: the mean of RANDOM_DRAWS draws."""
+    N = len(discriminations[0].rows.pool)
+    picks = [rng.choice(N, size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
+    return float(np.mean([expected(discriminations, pick) for pick in picks]))
+
+
+def _best(discriminations: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[int, float]:
+    """The candidate not chosen yet that lowers the error most, and the error with it."""
+    error = sum((c.error_bound(c.squared_with_each(c.gram(chosen))) for c in discriminations), 0.0)
+    error = np.array(error)
+    error[list(chosen)] = np.inf
+    best = int(np.argmin(error))
+    return best, float(error[best])
+
+
+def _without_least(discriminations: Sequence[Discrimination], chosen: list[int]) -> list[int]:
+    """All but the one without which the error grows least."""
+    fewer = [chosen[:k] + chosen[k + 1 :] for k in range(len(chosen))]
+    return min(fewer, key=lambda left: _error(discriminations, left))
+
+
+def _error(discriminations: Sequence[Discrimination], chosen: Sequence[int]) -> float:
+    return sum(float(c.error_bound(c.squared(c.gram(chosen)))) for c in discriminations)
+
+
+def _exchange(discriminations: Sequence[Discrimination], chosen: list[int]) -> None:
+    """Replace candidates in place while another one is better."""
+    for _ in range(ROUNDS if len(chosen) > 1 else 0):
+        changed = False
+        for k, own in enumerate(list(chosen)):
+            others = chosen[:k] + chosen[k + 1 :]
+            best, error = _best(discriminations, others)
+            if best == own:
+                continue
+            if error < (1 - WORTH) * _error(discriminations, chosen):
+                chosen[k], changed = best, True
+        if not changed:
+            break
+
+
+# The extra visits as one would make them: a short way through the poses, all loads at each.
+
+
+def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements) -> Measurements:
+    """One row per visit of the chosen candidates, after the campaign of `table`.
+
+    What is to be measured later comes later; otherwise the nearest pose in joint space is next.
+    A pose is measured in all load states before the arm moves on, so that what drifts does not
+    pass for an effect of the load.
+    """
+    order = _tour(pool, list(chosen), table.q[-1])
+    L, markers = len(pool.forces), len(table.marker_names)
+    first_rows = [(k * L + load) * markers for k in order for load in range(L)]
+    taken = set(table.configuration_labels)
+    fresh = (name for k in count(1) if (name := f"extra{k}") not in taken)
+    rows = pool.table.take(np.array(first_rows))
+    time = rows.time
+    if time is not None:
+        # Each group of visits begins when it should and takes as long as visits usually do.
+        begun = np.searchsorted(time, time, side="left")
+        time = time + (np.arange(len(rows)) - begun) * time_step(table)
+    return replace(
+        rows, source="extra poses", row=np.arange(len(rows)) + 2,
+        configuration=np.repeat(np.arange(len(order)), L),
+        configuration_labels=tuple(islice(fresh, len(order))),
+        position=None, rotation=None, distance=None, torque=None, sigma=None, temperature=None,
+        time=time,
+    )  # fmt: skip
+
+
+def _tour(pool: VisitPool, chosen: list[int], start: Array) -> list[int]:
+    """Nearest next, among those that are due first."""
+    out: list[int] = []
+    at, left = start, list(chosen)
+    while left:
+        due = left if pool.time is None else [k for k in left if pool.time[k] == _first(pool, left)]
+        nearest = min(due, key=lambda k: float(np.abs(pool.q[k] - at).max()))
+        out.append(nearest)
+        left.remove(nearest)
+        at = pool.q[nearest]
+    return out
+
+
+def _first(pool: VisitPool, left: list[int]) -> float:
+    assert pool.time is not None
+    return float(pool.time[left].min())
+
+
+# What to do besides measuring the extra poses, in words.
+
+
+def inseparable_advice(group: Sequence[str], distance: float, tried: int) -> str:
+    """That no pose separates these rivals, neighbours among which are so far apart at most."""
+    names = " and ".join([", ".join(group[:-1]), group[-1]])
+    near = f"they would be {distance:.1f} standard deviations apart"
+    if len(group) > 2:
+        near = f"each would be within {distance:.1f} standard deviations of another of them"
+    return f"no pose separates {names}: measured in all {tried} poses that were tried {near}"
+
+
+def other_means(pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """What else tells the rivals of inseparable pairs apart."""
+    effects = [name.partition(":")[0] for pair in pairs for name in pair]
+    return list(dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy)))
+
+
+def too_few_advice(n: int, probability: float, reachable: float) -> str:
+    """That the plan stays below what was aimed at."""
+    return (
+        f"{n} poses reach a probability of {probability:.2f} only; many more would reach "
+        f"{reachable:.2f}: allow more poses ({option('poses')}), or repeat each of them"
+    )
+
+
+def none_of_them(missed: float, nothing: float) -> str:
+    """That the right answer may not be among the rivals."""
+    return (
+        f"with probability {missed:.2f} none of these rivals is at work (noise alone: "
+        f"{nothing:.2f}), which the probabilities count with: measure more poses of any kind first"
+    )
+
+
+def pull_advice(n: int, newton: float, without: float, with_pull: float) -> str:
+    """That pulling sideways would help, and how much."""
+    return (
+        f"pull horizontally: {n} poses that are also measured under {newton:.3g} N along x and "
+        f"along y, e.g. by a rope over a pulley, raise the probability from {without:.2f} to "
+        f"{with_pull:.2f}"
+    )
+
+
+def pull_separates(pairs: Sequence[tuple[str, str]], newton: float) -> str:
+    """That pulling sideways tells apart what the load alone does not."""
+    apart = ", ".join(f"{first} and {second}" for first, second in pairs)
+    return (
+        f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a pulley, "
+        f"would separate {apart}: measure poses under it, too"
+    )
+
+
+def recording_advice(sets: Sequence[RivalSet]) -> list[str]:
+    """What the extra visits must keep to, because rivals depend on it."""
+    out = []
+    if any(s.depends_on("approach") for s in sets):
+        out.append("come to each extra pose with every joint from the side that the plan states")
+    if any(s.depends_on("time") for s in sets):
+        out.append(
+            "leave arm and tracker as they are until the extra poses are measured, and record "
+            "their times on the same clock"
+        )
+    return out
+
+
+# Which further poses would tell the rivals of a diagnosis apart, and how surely.
+
+# What a plan can aim at, and from which probability it goes without saying that one is at work.
+MOST_CERTAIN, MOSTLY = 0.99, 0.9
+NUMBERS = 20_000_000  # of the configurations' covariances that are held at once
+GAIN = 0.02  # of probability that a horizontal pull is worth mentioning for
+
+
+def plan_extra(
+    model: Model,
+    table: Measurements,
+    diagnosis: Diagnosis,
+    *,
+    most: int = 10,
+    seed: int = 0,
+    progress: Progress = lambda message: None,
+) -> ExtraPlan:
+    """The fewest extra poses, at most `most`, that tell the rivals of an open verdict apart.
+
+    `diagnosis` of `table` under `model`, its verdict ambiguous or unknown_effect.  The rivals are
+    the sets that it calls indistinguishable, or what the unknown effect may be.  Candidates are
+    feasible poses of the cell in the table's load states, after the campaign; their distances
+    come from the columns of the fitted arm with all fitted parameters free (see
+    `contest`).
+
+    Raises InputError for a verdict that leaves no rivals, or fewer than one pose.
+    """
+    check_open(diagnosis)
+    require(most >= 1, f"extra poses: at least one has to be allowed; found {most}")
+    notes: list[str] = []
+    if model.cell.model.torque == "measured":
+        spec = replace(model.cell.model, torque="computed")
+        model = Model.assembled(model.chain, replace(model.cell, model=spec))
+        notes.append("torques of poses not measured yet are computed from load and weights")
+    table, _ = thinned(table)
+    model = with_recorded_drivers(model, table, diagnosis)
+    suspects = Suspects(model, table, diagnosis)
+    progress("extra poses: fitting the model as it is")
+    base = fit_baseline(model, table, seed)
+    progress("extra poses: what else the rivals may be")
+    suspects = suspects.with_sets(with_neighbours(base, diagnosis, suspects.sets, suspects.known))
+    progress("extra poses: drawing candidates")
+    try:
+        pool = draw_pool(
+            model, base.x, table, sides=suspects.sides_matter, waits=suspects.waiting_matters,
+            most=_room(base), seed=seed,
+        )  # fmt: skip
+    except InsufficientDataError as error:
+        return _nothing(suspects.sets, suspects, (str(error),))
+    return _chosen(base, pool, suspects, most, seed, notes, progress)
+
+
+def _chosen(
+    base: Baseline, pool: VisitPool, suspects: Suspects, most: int, seed: int, notes: list[str],
+    progress: Progress,
+) -> ExtraPlan:  # fmt: skip
+    """The plan from this pool, `notes` and what there is to say of it as its advice."""
+    progress("extra poses: columns of the candidates")
+    drawn = discriminations_of(base, pool, suspects, seed)
+    sets = [c.rivals for c in drawn]
+    discriminations, hopeless = judged(drawn)
+    groups = tuple(group for c in discriminations for group in together(c))
+    for group in groups:
+        near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
+        notes.append(inseparable_advice(group, near, len(pool)))
+    notes += other_means(list(hopeless))
+    covered = suspects.covered
+    if covered < MOSTLY:
+        notes.append(none_of_them(1 - covered, suspects.diagnosis.probability_nothing))
+    # More poses may make up for a small doubt whether the right one is among the rivals.
+    enough = ENOUGH / covered if covered * MOST_CERTAIN >= ENOUGH else ENOUGH
+    # Where what can be told apart is told apart already, only what cannot be is left.
+    worthwhile = any(c.open for c in discriminations) and expected(discriminations, ()) < enough
+    progress("extra poses: choosing")
+    chosen = fewest(discriminations, most, enough) if worthwhile else []
+    after = expected(discriminations, chosen)
+    if after < enough or hopeless:
+        progress("extra poses: what a horizontal pull would add")
+        if after < enough:
+            reachable = covered * expected(discriminations, range(len(pool)))
+            notes.append(too_few_advice(len(chosen), covered * after, reachable))
+        pulled = _pulled(base, pool, suspects, seed)
+        n, newton = len(chosen), _newton(pool)
+        notes += _pull_notes(discriminations, hopeless, pulled, n, after, newton, covered)
+    if not worthwhile:
+        nothing = _nothing(sets, suspects, tuple(notes))
+        return replace(nothing, pairs=pairs_of(discriminations, chosen), inseparable=groups)
+    rng = np.random.default_rng(seed)
+    return ExtraPlan(
+        rivals=_names(sets),
+        pairs=pairs_of(discriminations, chosen),
+        plan=measuring_order(pool, chosen, base.observed.table),
+        n_poses=len(chosen),
+        probability_before=covered * expected(discriminations, ()),
+        probability_after=covered * after,
+        probability_random=covered * expected_of_random(discriminations, len(chosen), rng),
+        separable=True,
+        inseparable=groups,
+        advice=(*recording_advice(sets), *notes),
+    )
+
+
+def _room(base: Baseline) -> int:
+    """How many candidates fit into memory beside the data."""
+    C, M = base.blocks.member.shape
+    return max(NUMBERS // (M * base.observed.size) ** 2 - C, 0)
+
+
+def _nothing(sets: Sequence[RivalSet], suspects: Suspects, notes: tuple[str, ...]) -> ExtraPlan:
+    """No pose helps: the right one is named as often as the likeliest is right."""
+    likeliest = [float(s.probability.max()) for s in sets]
+    p = float(np.prod(likeliest)) if sets else suspects.diagnosis.probability_unknown
+    p *= suspects.covered
+    return ExtraPlan(_names(sets), (), None, 0, p, p, p, False, (), notes)
+
+
+def _names(sets: Sequence[RivalSet]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for s in sets for name in s.names))
+
+
+def _newton(pool: VisitPool) -> float:
+    return float(np.linalg.norm(pool.forces, axis=1).max())
+
+
+def _pulled(base: Baseline, pool: VisitPool, suspects: Suspects, seed: int) -> list[Discrimination]:
+    """The contests with every candidate also pulled along x and y as hard as its load pulls.
+
+    None without a load, nor for what is unknown: how it takes a pull nobody can say.
+    """
+    if _newton(pool) == 0 or suspects.unknown:
+        return []
+    forces = np.vstack([pool.forces, _newton(pool) * np.eye(3)[:2]])
+    table = base.observed.table
+    wide = visit_pool_of(base.model, base.x, table, pool.q, pool.approach, pool.time, forces)
+    return discriminations_of(base, wide, suspects, seed)
+
+
+def _pull_notes(
+    discriminations: Sequence[Discrimination], hopeless: dict[tuple[str, str], float],
+    pulled: Sequence[Discrimination], n: int, after: float, newton: float, covered: float,
+) -> list[str]:  # fmt: skip
+    """Advice to pull sideways, where that helps."""
+    still = judged(pulled)[1] if pulled else hopeless
+    helped = [pair for pair in hopeless if pair not in still]
+    notes = [pull_separates(helped, newton)] if helped else []
+    if pulled and n:
+        alike = [p.in_classes(c.classes) for p, c in zip(pulled, discriminations, strict=True)]
+        chosen = fewest(alike, n)
+        reached = expected(alike, chosen)
+        if reached > after + GAIN:
+            notes.append(pull_advice(len(chosen), newton, covered * after, covered * reached))
+    return notes

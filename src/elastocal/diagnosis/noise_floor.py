@@ -1,0 +1,432 @@
+"""The noise of a diagnosis: tracker, repeatability of each joint, scatter of a configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg, optimize
+
+from elastocal.diagnosis.baseline import Blocks
+from elastocal.units import Array, BoolArray
+
+# The noise floor: tracker noise, repeatability of each joint, scatter common to a configuration.
+#
+#     V = a² Σ_stated + Σ_j s_j² g_j g_jᵀ ∘ (same visit + c² · same configuration)
+#
+# with g_j = ∂(reading)/∂q_j.  a, s_j and c maximise the marginal likelihood of the residuals
+# (projection.py) times priors that keep what the data do not show near its usual size.
+
+# Logarithms' prior standard deviations.  Stated tracker noise is rarely wrong by more than 1.6
+# times; a joint repeats to some 5 µrad on a heavy arm and to 50 on a light one; the joints of an
+# arm differ by a factor of two.
+STATED_SPREAD, UNSTATED_SPREAD = 0.5, 3.0
+REPEATABILITY, REPEATABILITY_SPREAD = 8e-6, 1.5
+JOINT_SPREAD = 0.7
+SHARED, SHARED_SPREAD = 0.2, 1.2
+SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact
+
+
+@dataclass(frozen=True)
+class NoiseValues:
+    """`factor` a of the stated noise, `joint` s (joints,) in rad or m, `shared` c."""
+
+    factor: float
+    joint: Array
+    shared: float
+
+    @classmethod
+    def usual(cls, joints: int) -> NoiseValues:
+        """What one expects before any reading: noise as stated, joints as good as usual."""
+        return cls(1.0, np.full(joints, REPEATABILITY), SHARED)
+
+    def of_instrument(self) -> NoiseValues:
+        """The instrument's part alone: joints that repeat exactly."""
+        return NoiseValues(self.factor, np.full(len(self.joint), SMALLEST_NOISE), SHARED)
+
+    def logs(self) -> Array:
+        return np.log(np.concatenate([[self.factor, self.shared], self.joint]))
+
+    @classmethod
+    def of_logs(cls, theta: Array) -> NoiseValues:
+        v = np.exp(theta)
+        return cls(float(v[0]), v[2:], float(v[1]))
+
+
+@dataclass(frozen=True)
+class NoisyData:
+    """Packed residual r (C, m), nuisance X (C, m, p) with prior precision Λ (p,), and what noise
+    is made of: stated covariance (C, m, m), joint columns G (C, m, joints).
+
+    `stated` says whether the covariance is stated or only a shape; `left_out` (C, m) rows do not
+    count (padding, faulty readings).
+    """
+
+    blocks: Blocks
+    r: Array
+    X: Array
+    precision: Array
+    covariance: Array
+    G: Array
+    same_visit: Array
+    left_out: BoolArray
+    stated: bool
+
+    def with_columns(self, extra: Array, precision: Array) -> NoisyData:
+        """The same with further columns (C, m, k) and their prior precisions (k,)."""
+        X = np.concatenate([self.X, extra], axis=2)
+        return replace(self, X=X, precision=np.concatenate([self.precision, precision]))
+
+    def without(self, faulty: BoolArray) -> NoisyData:
+        """The same with the observations where `faulty` (N,) holds left out."""
+        padded = np.concatenate([faulty, [True]])[self.blocks.member]
+        return replace(self, left_out=np.repeat(padded, self.blocks.size, axis=1))
+
+    def every(self, step: int) -> NoisyData:
+        """The data of every `step`-th configuration alone."""
+        per_row = ("r", "X", "covariance", "G", "same_visit", "left_out")
+        blocks = replace(self.blocks, member=self.blocks.member[::step])
+        return replace(self, blocks=blocks, **{k: getattr(self, k)[::step] for k in per_row})
+
+    @property
+    def faulty(self) -> BoolArray:
+        """Observations (N,) that are left out."""
+        return self.blocks.unpack(self.left_out[..., None].astype(float))[:, 0, 0] > 0
+
+    @property
+    def n_rows(self) -> int:
+        return int((~self.left_out).sum())
+
+    def masked(self, packed: Array) -> Array:
+        """Rows that do not count set to zero (C, m, …)."""
+        if not self.left_out.any():
+            return packed
+        keep = ~self.left_out
+        return packed * keep.reshape(keep.shape + (1,) * (packed.ndim - 2))
+
+    @cached_property
+    def counting(self) -> Counting:
+        """What is evaluated at many noises, rows that do not count set to zero once."""
+        G, keep = self.masked(self.G), ~self.left_out
+        both = keep[:, :, None] & keep[:, None, :]
+        visit = self.blocks.places.one_hot
+        by_visit = (visit[..., None] * G[:, :, None, :]).reshape(*G.shape[:2], -1)
+        by_visit = np.ascontiguousarray(by_visit.transpose(0, 2, 1))
+        return Counting(
+            self.masked(self.r), self.masked(self.X), G, by_visit,
+            self.covariance if keep.all() else self.covariance * both,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Counting:
+    """Residual, columns, joint columns, those of each visit by itself (C, visits·joints, m), and
+    stated covariance, with zeros where nothing counts."""
+
+    r: Array
+    X: Array
+    G: Array
+    by_visit: Array
+    covariance: Array
+
+
+def covariance(data: NoisyData, noise: NoiseValues) -> Array:
+    """V (C, m, m); rows left out have unit variance of their own."""
+    of = data.counting
+    V = (of.G * noise.joint**2) @ of.G.transpose(0, 2, 1)
+    V *= data.same_visit + noise.shared**2
+    V += noise.factor**2 * of.covariance
+    m = np.arange(V.shape[1])
+    V[:, m, m] += data.left_out
+    return V
+
+
+def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
+    """−2 log prior of the logarithms and its slope.
+
+    The joints' logarithms have a common mean that is itself uncertain.
+    """
+    theta = noise.logs()
+    spread = STATED_SPREAD if stated else UNSTATED_SPREAD
+    z = np.array([theta[0] / spread, (theta[1] - np.log(SHARED)) / SHARED_SPREAD])
+    slope = np.zeros_like(theta)
+    slope[:2] = 2 * z / np.array([spread, SHARED_SPREAD])
+    joints = theta[2:]
+    n = len(joints)
+    inverse = np.linalg.inv(JOINT_SPREAD**2 * np.eye(n) + REPEATABILITY_SPREAD**2)
+    away = joints - np.log(REPEATABILITY)
+    slope[2:] = 2 * inverse @ away
+    return float(z @ z + away @ inverse @ away), slope
+
+
+# Data under one noise: what is left of the residual, and how probable the noise is.
+#
+# With V the noise's covariance and the fitted parameters β ~ N(0, Λ⁻¹) integrated out,
+#
+#     −2 ℓ = log|V| + rᵀPr + log|XᵀV⁻¹X + Λ| − log|Λ| + n log 2π,
+#     P = V⁻¹ − V⁻¹X (XᵀV⁻¹X + Λ)⁻¹ XᵀV⁻¹,
+#
+# (restricted likelihood where Λ → 0; Patterson and Thompson 1971).
+# ∂(−2ℓ)/∂θ = tr(P V_θ) − rᵀP V_θ P r.
+
+ROUNDING = 1e-12
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The data under one noise: V⁻¹ (C, m, m), H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
+
+    P = V⁻¹ − HHᵀ; `u` = P r (C, m); `beta` (p,) the posterior mean β̂; `marginal` the log marginal
+    likelihood ℓ.
+    """
+
+    inverse: Array
+    H: Array
+    u: Array
+    beta: Array
+    marginal: float
+    factor: Array
+
+    @cached_property
+    def spread(self) -> tuple[Array, Array]:
+        """V⁻¹e and Hᵀe, (C, m) and (C, p), of residuals e that scatter as the noise does.
+
+        The fit's own residuals are too small, its leverage less than V: u_c has the covariance
+        P_cc, so e_c = V_c^½ P_cc^−½ u_c has V_c (Bell and McCaffrey 2002).
+        """
+        P = self.inverse - self.H @ self.H.transpose(0, 2, 1)
+        e = _power(self.inverse, -0.5) @ (_power(P, -0.5) @ self.u[..., None])
+        return (self.inverse @ e)[..., 0], (self.H.transpose(0, 2, 1) @ e)[..., 0]
+
+    @property
+    def beta_deviation(self) -> Array:
+        """L⁻¹ (p, p): the posterior covariance of β is L⁻ᵀL⁻¹."""
+        return linalg.solve_triangular(self.factor, np.eye(len(self.factor)), lower=True)
+
+
+def _power(blocks: Array, exponent: float) -> Array:
+    """Symmetric powers of positive definite matrices (C, m, m)."""
+    values, vectors = np.linalg.eigh(blocks)
+    values = np.maximum(values, ROUNDING * values[:, -1:]) ** exponent
+    return np.asarray((vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1))
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """The data whitened by one noise V = KKᵀ, whatever the prior of the coefficients: K⁻¹
+    (C, m, m), K⁻¹X (C, m, p), K⁻¹r (C, m), M = XᵀV⁻¹X (p, p), z = XᵀV⁻¹r (p,), and the part of
+    −2ℓ that stands without X, log|V| + rᵀV⁻¹r + n log 2π."""
+
+    root: Array
+    X: Array
+    r: Array
+    M: Array
+    z: Array
+    alone: float
+
+    @classmethod
+    def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
+        K = np.asarray(np.linalg.cholesky(covariance(data, noise)), dtype=np.float64)
+        log_det = 2 * float(np.log(np.diagonal(K, axis1=1, axis2=2)).sum())
+        root = _inverse(K)
+        X, r = root @ data.counting.X, (root @ data.counting.r[..., None])[..., 0]
+        flat = X.reshape(-1, X.shape[2])
+        alone = log_det + float(np.vdot(r, r)) + data.n_rows * float(np.log(2 * np.pi))
+        return cls(root, X, r, flat.T @ flat, flat.T @ r.ravel(), alone)
+
+    def prior(self, precision: Array) -> Array:
+        """Λ's diagonal (p,), and a little more: what others show as well and the prior leaves wide
+        must not drown in rounding.  By each column's own size: a prior must not tighten because
+        another column is large."""
+        return precision + ROUNDING * np.diag(self.M)
+
+    def factored(self, precision: Array) -> tuple[Array, Array, float]:
+        """L of LLᵀ = M + Λ, L⁻¹z, and ℓ, for a prior of precision Λ (p,)."""
+        M = self.M + np.diag(self.prior(precision))
+        L: Array = linalg.cholesky(M, lower=True, check_finite=False)
+        z = linalg.solve_triangular(L, self.z, lower=True, check_finite=False)
+        log_det = 2 * float(np.log(np.diag(L)).sum()) - float(np.log(precision).sum())
+        return L, z, -0.5 * (self.alone + log_det - float(z @ z))
+
+    def marginal(self, precision: Array) -> float:
+        """The log marginal likelihood ℓ alone, for a prior of precision Λ (p,)."""
+        return self.factored(precision)[2]
+
+    def projection(self, precision: Array) -> Projection:
+        L, z, marginal = self.factored(precision)
+        back = self.root.transpose(0, 2, 1)
+        H = back @ _divided(self.X, L)
+        u = (back @ self.r[..., None])[..., 0] - H @ z
+        beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
+        return Projection(back @ self.root, H, u, beta, marginal, L)
+
+
+def _inverse(K: Array) -> Array:
+    """K⁻¹ of lower triangles K (C, m, m), by halves: a general inverse takes twice as long."""
+    if K.shape[1] == 1:
+        return 1 / K
+    h = K.shape[1] // 2
+    out = np.zeros_like(K)
+    out[:, :h, :h] = upper = _inverse(K[:, :h, :h])
+    out[:, h:, h:] = lower = _inverse(K[:, h:, h:])
+    out[:, h:, :h] = -lower @ (K[:, h:, :h] @ upper)
+    return out
+
+
+def _divided(rows: Array, L: Array, overwrite: bool = False) -> Array:
+    """rows L⁻ᵀ (…, p) of rows (…, p) and a lower triangle L (p, p)."""
+    flat = rows.reshape(-1, rows.shape[-1])
+    # BLAS itself, since scipy's solver hands the rows back column by column.
+    divided = linalg.blas.dtrsm(1.0, L, flat.T, lower=1, overwrite_b=overwrite).T
+    return np.asarray(divided.reshape(rows.shape))
+
+
+def project(data: NoisyData, noise: NoiseValues) -> Projection:
+    return Weighted.of(data, noise).projection(data.precision)
+
+
+def posterior(data: NoisyData, noise: NoiseValues) -> float:
+    """−2 log of marginal likelihood times prior of the noise."""
+    marginal = Weighted.of(data, noise).marginal(data.precision)
+    return -2 * marginal + log_prior(data.stated, noise)[0]
+
+
+def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
+    """−2 log of marginal likelihood times prior, and its slope in the logarithms (2 + joints,).
+
+    The slope wants gᵀQg, Q = P − uuᵀ, of the joints' columns g in every visit and configuration:
+    with g̃ = K⁻¹g and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀg̃ − |L⁻¹X̃ᵀg̃|² − (g̃ᵀẽ)².  What is left of V is
+    the instrument's, and tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ.
+    """
+    of, at = data.counting, Weighted.of(data, noise)
+    L, z, marginal = at.factored(data.precision)
+    beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
+    e = at.r - at.X @ beta
+    g = of.by_visit @ at.root.transpose(0, 2, 1)
+    # Few rows are divided by L rather than many.
+    many = g.shape[1] >= g.shape[2]
+    Xg = g @ _divided(at.X, L) if many else _divided(g @ at.X, L, overwrite=True)
+    J = data.G.shape[2]
+    by_visit, by_block = np.zeros(J), np.zeros(J)
+    for sign, part in ((1, g), (-1, Xg), (-1, g @ e[..., None])):
+        each = part.reshape(len(part), -1, J, part.shape[2])
+        together = each.sum(axis=1)
+        by_visit += sign * np.einsum("cvjk,cvjk->j", each, each)
+        by_block += sign * np.einsum("cjk,cjk->j", together, together)
+    inverse = linalg.solve_triangular(L, np.eye(len(L)), lower=True, check_finite=False)
+    fitted = len(L) - float((inverse**2 @ at.prior(data.precision)).sum())
+    slope = np.empty(2 + J)
+    slope[1] = 2 * noise.shared**2 * float(by_block @ noise.joint**2)
+    slope[2:] = 2 * noise.joint**2 * (by_visit + noise.shared**2 * by_block)
+    slope[0] = 2 * (data.n_rows - fitted - float(np.vdot(e, e))) - slope[2:].sum()
+    prior, prior_slope = log_prior(data.stated, noise)
+    return -2 * marginal + prior, slope + prior_slope
+
+
+# The most probable noise values of data, by a search in their logarithms.
+
+STRIDE, ROUNDS = 1.5, 10  # of the logarithms
+SOME = 250  # configurations that show where the optimum is
+ENOUGH, LEVEL = 1e-3, 3e-3  # change of −2ℓ, and its slope, at which a search ends
+
+
+def fit_noise(data: NoisyData, start: NoiseValues | None = None) -> NoiseValues:
+    """The most probable noise values, by a quasi-Newton search in their logarithms.
+
+    Where nothing is stated it starts from two ends, unless a start is given; with many
+    configurations it comes from some of them to all.
+    """
+    if start is not None:
+        return _climbed(data, start)
+    if len(data.r) >= 2 * SOME:
+        return _climbed(data, fit_noise(data.every(len(data.r) // SOME)))
+    starts = [NoiseValues.usual(data.G.shape[2])]
+    if not data.stated:
+        starts.append(_balanced(data))
+    ends = [_climbed(data, s) for s in starts]
+    return min(ends, key=lambda end: posterior(data, end))
+
+
+def _balanced(data: NoisyData) -> NoiseValues:
+    """Instrument and joints share the scatter of the data equally.
+
+    From far below it the likelihood is flat in a joint's logarithm, and no climb leaves.
+    """
+    used = ~data.left_out
+    whole = float((data.r[used] ** 2).mean())
+    shape = float(np.diagonal(data.covariance, axis1=1, axis2=2)[used].mean())
+    moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)
+    joint = np.clip(np.sqrt(0.5 * whole / (len(moved) * moved)), SMALLEST_NOISE, LARGEST)
+    return NoiseValues(float(np.sqrt(0.5 * whole / shape)), joint, SHARED)
+
+
+def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
+    n = data.G.shape[2]
+
+    observed: dict[bytes, tuple[float, Array]] = {}
+
+    def cost(theta: Array) -> tuple[float, Array]:
+        # A search begins where it has been: at the start, and where the last stride ended.
+        key = theta.tobytes()
+        if key not in observed:
+            observed[key] = likelihood(data, NoiseValues.of_logs(theta))
+        value, slope = observed[key]
+        return value, slope.copy()
+
+    spread = STATED_SPREAD if data.stated else UNSTATED_SPREAD
+    lower = np.array([-4 * spread, -5.0] + [np.log(SMALLEST_NOISE)] * n)
+    upper = np.array([4 * spread, 2.0] + [np.log(LARGEST)] * n)
+    theta = np.clip(start.logs(), lower, upper)
+    ftol = ENOUGH / max(abs(cost(theta)[0]), 1.0)
+    # Step by step: one long stride of the line search ends where V is singular to rounding.
+    # A round ends at the first small gain, often that of a poor first direction: the search is
+    # over when a whole round gains nothing.
+    for _ in range(ROUNDS):
+        low, high = np.maximum(lower, theta - STRIDE), np.minimum(upper, theta + STRIDE)
+        found = optimize.minimize(
+            cost, theta, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
+            options={"maxiter": 60, "ftol": ftol, "gtol": LEVEL},
+        )  # fmt: skip
+        gain, theta = cost(theta)[0] - float(found.fun), found.x
+        inside = (theta > low) & (theta < high) | (theta == lower) | (theta == upper)
+        if inside.all() and gain < ENOUGH:
+            break
+    return NoiseValues.of_logs(theta)
+
+
+# What the noise may be instead: draws about its most probable values.
+
+STEP = 0.05  # of the logarithms, for a difference quotient of the likelihood's slope
+FLATTEST = 0.5  # smallest curvature of −2ℓ: where the prior is all that holds a logarithm
+TRIED = 6  # draws from the Gaussian for each that is kept
+
+
+def noise_draws(
+    data: NoisyData, noise: NoiseValues, n: int, rng: np.random.Generator
+) -> list[NoiseValues]:
+    """n draws of the noise values from likelihood times prior.
+
+    Of draws from the Gaussian about the maximum, logarithms with covariance 2 (∂²(−2ℓ))⁻¹, some
+    are kept, each with the probability that it has beside what the Gaussian gives it (sampling
+    importance resampling, Rubin 1988): a joint's scatter may be anything below what shows.
+    """
+    theta = noise.logs()
+    k = len(theta)
+
+    def slope(at: Array) -> Array:
+        return likelihood(data, NoiseValues.of_logs(at))[1]
+
+    H = np.empty((k, k))
+    for i, e in enumerate(STEP * np.eye(k)):
+        H[i] = (slope(theta + e) - slope(theta - e)) / (2 * STEP)
+    values, vectors = np.linalg.eigh((H + H.T) / 2)
+    root = vectors * np.sqrt(2 / np.maximum(values, FLATTEST))
+    z = rng.normal(size=(TRIED * n, k))
+    drawn = theta + z @ root.T
+    drawn[:, 2:] = np.clip(drawn[:, 2:], np.log(SMALLEST_NOISE), np.log(LARGEST))
+    minus_two = np.array([posterior(data, NoiseValues.of_logs(t)) for t in drawn])
+    log_weight = -0.5 * minus_two + 0.5 * (z**2).sum(axis=1)
+    weight = np.exp(log_weight - log_weight.max())
+    kept = rng.choice(len(drawn), n, p=weight / weight.sum())
+    return [NoiseValues.of_logs(drawn[i]) for i in kept]

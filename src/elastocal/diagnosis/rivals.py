@@ -1,0 +1,343 @@
+"""Who the rivals are: sets that a verdict cannot tell apart, and what may imitate them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import softmax
+
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.diagnosis.diagnosis import Diagnosis
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.evidence import Grams, direct
+from elastocal.diagnosis.hypotheses import Hypothesis, possible, typical_sizes
+from elastocal.diagnosis.model_set import (
+    Item,
+    distances,
+    fit_set,
+    item_key,
+    packed_columns,
+    settings_to_try,
+    with_items,
+)
+from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
+from elastocal.diagnosis.unknown import Generic, generic_blocks
+from elastocal.diagnosis.verdict import ALIKE, UNKNOWN_EFFECT
+from elastocal.errors import InputError, require
+from elastocal.measurements import Measurements
+from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.manipulator import Model
+from elastocal.units import Array
+
+# The noise that a diagnosis found, and the readings that it left out, in the campaign's terms.
+
+
+def noise_found(diagnosis: Diagnosis) -> NoiseValues:
+    """Factor, repeatability (joints,) and shared scatter."""
+    found = diagnosis.noise
+    joint = np.maximum(found.repeatability, SMALLEST_NOISE)
+    return NoiseValues(found.stated_factor, joint, found.shared)
+
+
+def left_out(base: Baseline, diagnosis: Diagnosis) -> NDArray[np.bool_]:
+    """Which observations (N,) of the base, planned ones included, are faulty readings."""
+    lines = [f.line for f in diagnosis.noise.faulty]
+    return np.isin(base.observed.table.row[base.observed.lead], lines)
+
+
+# Who the rivals are: the named sets of an ambiguous verdict, or what an unknown effect may be.
+
+# An unknown effect is told from the known ones that keep a chance, so many at least and at most,
+# as so many blocks at so many places.
+CHANCE = 0.01
+FEWEST_KNOWN, MOST_KNOWN, BLOCKS, PLACES = 2, 6, 2, 2
+# Probability that a rival keeps, however unlikely it looks so far.  Blocks only approximate what
+# is unknown, so that the evidence for them against each other says less.
+LEAST_PROBABILITY, LEAST_PROBABILITY_UNKNOWN = 0.01, 0.05
+
+
+@dataclass(frozen=True)
+class RivalSet:
+    """Items of which one is at work, `beside` other items that are.
+
+    `probability` (rivals,) of each given that it is one of them.
+    """
+
+    rivals: tuple[Item, ...]
+    probability: NDArray[np.float64]
+    beside: tuple[Item, ...]
+
+    @classmethod
+    def of(
+        cls, rivals: Sequence[Item], probability: Sequence[float], beside: Sequence[Item],
+        smallest: float = LEAST_PROBABILITY,
+    ) -> RivalSet:  # fmt: skip
+        p = np.maximum(probability, smallest)
+        return cls(tuple(rivals), p / p.sum(), tuple(beside))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name_of(item) for item in self.rivals)
+
+    def depends_on(self, column: str) -> bool:
+        """Whether a rival needs the table's column: "time" or "approach"."""
+        return any(_depends(item.what, column) for item in self.rivals)
+
+
+def name_of(item: Item) -> str:
+    """ "gear_eccentricity:joint2", or a block's label."""
+    what = item.what
+    return f"{what.name}:{what.where}" if isinstance(what, Hypothesis) else what.label
+
+
+def _depends(what: Hypothesis | Generic, column: str) -> bool:
+    return column in (what.effect.needs if isinstance(what, Hypothesis) else what.kind)
+
+
+class Suspects:
+    """The items that a diagnosis speaks of, with the settings it found for them.
+
+    Raises InputError where they do not belong to this model and table.
+    """
+
+    def __init__(self, model: Model, table: Measurements, diagnosis: Diagnosis) -> None:
+        self.diagnosis = diagnosis
+        known = {(h.name, h.where): h for h in possible(model, table)[0]}
+        self._items: dict[tuple[str, str], Item] = {}
+        self._probability: dict[tuple[str, str], float] = {}
+        for c in diagnosis.candidates:
+            key = c.effect, c.where
+            if key in known:
+                h = known[key]
+                settings = np.array([c.settings[s.key] for s in h.settings])
+                self._items[key] = Item(h, settings, 0.0)
+                self._probability[key] = c.probability
+        self._found = [(f.effect, f.where) for f in diagnosis.effects]
+        named = [(e.effect, e.where) for group in diagnosis.indistinguishable for e in group]
+        named = [key for key in named if key[0] != UNKNOWN_EFFECT]
+        for effect, where in [*self._found, *named]:
+            require(
+                (effect, where) in self._items,
+                f"{table.source}: the diagnosis names {effect} at {where}, which this model and "
+                "table cannot test; plan with those that were diagnosed",
+            )
+        self.sets = tuple(self._named_sets())
+
+    @property
+    def known(self) -> dict[tuple[str, str], tuple[Item, float]]:
+        """Every effect that was tried, with its probability."""
+        return {key: (item, self._probability[key]) for key, item in self._items.items()}
+
+    @property
+    def covered(self) -> float:
+        """Probability that the right answer is among the rivals: that there is something, and that
+        it is none of the effects that are no rivals."""
+        d, ours = self.diagnosis, set(self._rivals())
+        others = sum(p for key, p in self._probability.items() if key not in ours)
+        missed = d.probability_nothing + others + (0.0 if self.unknown else d.probability_unknown)
+        return min(max(1 - missed, 0.0), 1.0)
+
+    def with_sets(self, sets: tuple[RivalSet, ...]) -> Suspects:
+        """The same with other sets of rivals."""
+        other = copy(self)
+        other.sets = sets
+        return other
+
+    def _named_sets(self) -> Iterator[RivalSet]:
+        """The sets that the diagnosis calls indistinguishable."""
+        for group in self.diagnosis.indistinguishable:
+            keys = [(e.effect, e.where) for e in group if e.effect != UNKNOWN_EFFECT]
+            if len(keys) < 2:
+                continue
+            yield RivalSet.of(
+                [self._items[k] for k in keys],
+                [self._probability[k] for k in keys],
+                [self._items[k] for k in self._found if k not in keys],
+            )
+
+    def _rivals(self) -> list[tuple[str, str]]:
+        """The known rivals, and what is at work beside them."""
+        items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
+        keys = [item_key(item) for item in items] + self._found
+        return keys + self._likeliest() if self.unknown else keys
+
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """Everything that may take part."""
+        keys = self._rivals()
+        if self.unknown:
+            # Torques, which may drive what is unknown, come from the compliances' columns.
+            keys += [k for k in self._items if k[0] == JointCompliance.name]
+        whats = [self._items[k].what for k in dict.fromkeys(keys)]
+        return [h for h in whats if isinstance(h, Hypothesis)]
+
+    @property
+    def unknown(self) -> bool:
+        """Whether something without a name is at work."""
+        return self.diagnosis.verdict == "unknown_effect"
+
+    @property
+    def sides_matter(self) -> bool:
+        """Whether the side of approach may tell the rivals apart."""
+        return self.unknown or any(s.depends_on("approach") for s in self.sets)
+
+    @property
+    def waiting_matters(self) -> bool:
+        """Whether some rival relaxes with time, so that later poses may tell more."""
+        constants = [s.kind for h in self.hypotheses for s in h.settings]
+        return self.unknown or "time_constant" in constants
+
+    def unknown_set(self, dataset: DiagnosisData, noise: NoiseValues) -> RivalSet:
+        """The blocks that explain the data best where the diagnosis locates the effect, and the
+        likeliest effects of the catalogue; `scene` with only the data so far counting."""
+        location = self.diagnosis.location
+        assert location is not None  # an unknown effect was found somewhere
+        places = dict.fromkeys([location.where, *location.places])
+        near = list(places)[:PLACES]
+        at = project(dataset.data, noise)
+        items, evidence = [], []
+        for block in generic_blocks(dataset):
+            if block.where in near:
+                item = Item(block, np.zeros(0), 0.0)
+                columns = dataset.data.masked(packed_columns(dataset, item))
+                items.append(item)
+                evidence.append(float(direct(columns, at).evidence()[0]))
+        best = np.argsort(-np.array(evidence), kind="stable")[:BLOCKS]
+        share = self.diagnosis.probability_unknown * softmax(np.array(evidence)[best])
+        keys = self._likeliest()
+        return RivalSet.of(
+            [*(items[k] for k in best), *(self._items[k] for k in keys)],
+            [*share, *(self._probability[k] for k in keys)],
+            [self._items[k] for k in self._found],
+            LEAST_PROBABILITY_UNKNOWN,
+        )
+
+    def _likeliest(self) -> list[tuple[str, str]]:
+        free = [k for k in self._items if k not in self._found]
+        free = sorted(free, key=lambda k: -self._probability[k])[:MOST_KNOWN]
+        return [k for n, k in enumerate(free) if n < FEWEST_KNOWN or self._probability[k] >= CHANCE]
+
+
+def check_open(diagnosis: Diagnosis) -> None:
+    """InputError where the verdict leaves no rivals to tell apart."""
+    if diagnosis.verdict not in ("ambiguous", "unknown_effect"):
+        raise InputError(
+            f"the verdict is {diagnosis.verdict}: there are no rivals to tell apart; extra poses "
+            "are planned for an ambiguous or unknown_effect verdict"
+        )
+
+
+# Rivals that the verdict has no room to name: what one of those named may also be.
+#
+# A set names three effects at most.  Whichever of them is at work, further poses leave open what
+# imitates it, whether it was listed or not; a plan that did not know of it would promise too much.
+
+# Alike, or so near (twice the deviate of 0.97, what a plan is to reach) that their evidence
+# leaves them a chance; so many at most, those named among them.
+NEAR, MOST = 3.76, 10
+
+
+def with_neighbours(
+    base: Baseline, diagnosis: Diagnosis, sets: tuple[RivalSet, ...],
+    known: Mapping[tuple[str, str], tuple[Item, float]],
+) -> tuple[RivalSet, ...]:  # fmt: skip
+    """The sets with what each of their rivals may also be.
+
+    `known`: the items of the diagnosis with their probabilities.
+    """
+    if not sets:
+        return ()
+    hypotheses = [i.what for i, _ in known.values() if isinstance(i.what, Hypothesis)]
+    dataset = diagnosis_data_of(base, hypotheses)
+    dataset, noise = dataset.without(left_out(base, diagnosis)), noise_found(diagnosis)
+    out = []
+    for s in sets:
+        near = dict.fromkeys(known, np.inf)
+        for rival in s.rivals:
+            found = distances(dataset, fit_set(dataset, (rival, *s.beside), noise), 0)[1]
+            near |= {key: min(near[key], d) for key, d in found.items()}
+        taken = {item_key(item) for item in (*s.rivals, *s.beside)}
+        free = [
+            key
+            for key, (_, p) in known.items()
+            if key not in taken and (near[key] < ALIKE or (near[key] < NEAR and p >= CHANCE))
+        ]
+        free = sorted(free, key=lambda key: near[key])[: max(MOST - len(s.rivals), 0)]
+        rivals = [*s.rivals, *(known[key][0] for key in free)]
+        # Those named have their probability given that there is something, as these need, too.
+        something = max(1 - diagnosis.probability_nothing, 1e-9)
+        named = [known[item_key(item)][1] for item in s.rivals]
+        p = [*named, *(known[key][1] / something for key in free)]
+        out.append(RivalSet.of(rivals, p, s.beside))
+    return tuple(out)
+
+
+# The starts from which one rival may imitate another: where a spring would be anchored.
+#
+# A spring's geometry is sought by the diagnosis from several starts, and only the best so far has
+# given its columns to the scene.  Once further poses are measured it is sought anew, and what
+# another start explains of them is no longer told from a rival.
+
+
+def columns_of_starts(dataset: DiagnosisData, item: Item) -> list[Array]:
+    """Columns (C, m, k) of an item about each of its starts, per typical size; none without."""
+    what, base = item.what, dataset.base
+    if not isinstance(what, Hypothesis):
+        return []
+    if not what.effect.starts(what.where, base.model.chain, base.model.cell):
+        return []
+    out = []
+    for rows in dataset.columns.from_each_start(what):
+        measured = dataset.columns.observed(rows)[: base.n_measured]
+        out.append(dataset.pack(rows) * typical_sizes(what, measured))
+    return out
+
+
+# The settings with which one rival may imitate the others: its order, its time.
+#
+# The best in the data so far need not be the best once further poses are measured, when the
+# diagnosis seeks them anew: what is nearly as good stays possible.
+
+NEARLY = 4.0  # in d²: two standard deviations
+SETTINGS = 6  # of a rival that are tried, at most
+
+
+def imitations(
+    dataset: DiagnosisData, noise: NoiseValues, discrimination: RivalSet
+) -> tuple[tuple[Item, ...], ...]:
+    """Of each rival that has settings the item at those which explain most of another's signal,
+    the bests first, then what explains NEARLY as much; of other rivals nothing.
+
+    A signal is a rival's at its estimate; `scene` with only the data so far counting.
+    """
+    rivals = discrimination.rivals
+    widest = tuple(float(item.scales.max()) for item in discrimination.beside)
+    data = with_items(dataset, tuple(discrimination.beside), widest)
+    grams = {}
+    for a, item in enumerate(rivals):
+        C = data.masked(packed_columns(dataset, item))
+        at = project(data.with_columns(C, np.ones(C.shape[2])), noise)
+        signal = C @ at.beta[data.X.shape[2] :]
+        grams[a] = Grams(dataset, data, project(replace(data, r=signal), noise))
+    return tuple(_of_rival(dataset, rivals, b, grams) for b in range(len(rivals)))
+
+
+def _of_rival(
+    dataset: DiagnosisData, rivals: tuple[Item, ...], b: int, grams: dict[int, Grams]
+) -> tuple[Item, ...]:
+    what, size = rivals[b].what, float(rivals[b].scales.max())
+    others = [a for a in range(len(rivals)) if a != b]
+    if not isinstance(what, Hypothesis) or not what.settings or not others:
+        return ()
+    lists = [settings_to_try(dataset, what, rivals[a]) for a in others]
+    tried = np.unique(np.vstack([each for each in lists if each is not None]), axis=0)
+    explained = np.array([grams[a].of_hypothesis(what, tried).explained(size) for a in others])
+    short = explained.max(axis=1, keepdims=True) - explained
+    near = np.flatnonzero((short <= NEARLY).any(axis=0))
+    evenly = near[np.linspace(0, len(near) - 1, min(SETTINGS, len(near))).round().astype(int)]
+    chosen = list(dict.fromkeys([*short.argmin(axis=1), *evenly]))[:SETTINGS]
+    return tuple(replace(rivals[b], settings=tried[k]) for k in chosen)

@@ -1,0 +1,622 @@
+"""How far the gap shrinks at poses that had no part in the fit, with its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from elastocal.diagnosis.backlash_model import EFFECT, under_other_law
+from elastocal.diagnosis.baseline import Baseline, Blocks, visits
+from elastocal.diagnosis.diagnosis import FittedParameter
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, away, widths
+from elastocal.diagnosis.effect_search import SelectedEffects
+from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.hypotheses import Hypothesis, is_driven
+from elastocal.diagnosis.model_set import (
+    Item,
+    ModelSet,
+    beside,
+    extended,
+    fit_extended,
+    fit_set,
+    signal_of,
+)
+from elastocal.diagnosis.noise_floor import (
+    NoiseValues,
+    NoisyData,
+    Projection,
+    covariance,
+    noise_draws,
+    project,
+)
+from elastocal.identification.error_budget import resampled_rms
+from elastocal.measurements import Measurements
+from elastocal.model.manipulator import Model, Regression
+from elastocal.model.observations import Observations, observe
+from elastocal.units import Array, IntArray
+
+# Errors on configurations, or blocks of time, left out of the fit, in closed form.
+
+TENTHS = 10  # blocks of time that are left out in turn
+
+
+def left_out_residual(at: Projection, together: IntArray | None = None) -> Array:
+    """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others.
+
+    `together` (C,) numbers the group that each is left out with; by itself where None.  For a
+    group, with V and H of its configurations,
+
+        P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
+    """
+    if together is None:
+        P = at.inverse - at.H @ at.H.transpose(0, 2, 1)
+        return np.asarray(np.linalg.solve(P, at.u[..., None])[..., 0])
+    Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
+    out = Vu[..., 0]
+    for g in np.unique(together):
+        own = together == g
+        H = at.H[own]
+        inner = np.eye(H.shape[2]) - np.einsum("cmp,cmq->pq", H, VH[own])
+        z = np.linalg.solve(inner, np.einsum("cmp,cm->p", H, Vu[own, :, 0]))
+        out[own] += VH[own] @ z
+    return np.asarray(out)
+
+
+def blocks_of_time(blocks: Blocks, time: Array) -> IntArray:
+    """Which tenth of the campaign (C,) each configuration was first measured in; `time` (N,)."""
+    padded = np.append(time, np.inf)
+    first = padded[blocks.member].min(axis=1)
+    order = np.argsort(np.argsort(first, kind="stable"), kind="stable")
+    return np.asarray(order * TENTHS // len(first))
+
+
+def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
+    """Per configuration: Σ of squared 3-D lengths of `packed` (C, m), and the number of readings.
+
+    Of a pose the position counts, of a distance its one component.
+    """
+    C, M = data.blocks.member.shape
+    size = data.blocks.size
+    used = ~data.left_out.reshape(C, M, size)[:, :, 0]
+    part = packed.reshape(C, M, size)[:, :, : min(size, 3)]
+    return ((part**2).sum(axis=2) * used).sum(axis=1), used.sum(axis=1)
+
+
+def rms_with_interval(
+    data: NoisyData, packed: Array, rng: np.random.Generator
+) -> tuple[float, tuple[float, float]]:
+    """3-D rms in m of residuals (C, m) and its 95 % interval by resampling configurations."""
+    return resampled_rms(*squared_lengths(data, packed), rng)
+
+
+def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
+    """3-D rms in m that the noise alone gives a reading."""
+    V = covariance(data, noise)
+    variance = np.diagonal(V, axis1=1, axis2=2) * ~data.left_out
+    blocks: Blocks = data.blocks
+    C, M = blocks.member.shape
+    part = variance.reshape(C, M, blocks.size)[:, :, : min(blocks.size, 3)]
+    used = ~data.left_out.reshape(C, M, blocks.size)[:, :, 0]
+    return float(np.sqrt(part.sum() / used.sum()))
+
+
+# How far the gap shrinks on poses that had no part in choosing or fitting the effect.
+#
+# The error of a model at a fresh pose is its prediction less the truth, without noise:
+#
+#     e(θ*) = f(q, x̂) − h(q, θ*),    θ* ~ posterior given all data,
+#
+# where f is the model before and after the effect is added, each fitted by the instrument's noise
+# as a calibration would, and h what is held to be the truth: at times a rival or another constant,
+# as probable as each is, which charges the interval for the selection.  The remaining fraction is
+# the ratio of the rms errors over a set of FRESH poses, drawn anew for every θ* from a population
+# that is itself known from the campaign's poses only (Bayesian bootstrap, Rubin 1981).
+
+BOOTSTRAP_DRAWS = 400
+FRESH = 100  # poses of the fresh set that the intervals are for
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """Fraction by which the fresh-pose error falls: best value, `ci90` and `ci95`."""
+
+    reduction: float
+    ci90: tuple[float, float]
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PosteriorDraw:
+    """What may be true: errors (rows, components) of the models `before` and `after` at fresh
+    poses if it is, at its most probable values; the truth moves by `spread` (rows, components, k)
+    times standard normal numbers.  `pose` (rows,) numbers the fresh pose of each reading."""
+
+    before: Array
+    after: Array
+    spread: Array
+    pose: NDArray[np.int64]
+    probability: float
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change that happened in a pause between visits: how far (m² per reading) one on its wrong
+    side is off, the largest `share` of the time that may be on it, and the number of `visits` of
+    a pose: the readings of a visit are on the same side."""
+
+    square: float = 0.0
+    share: float = 0.0
+    visits: float = 1.0
+
+
+def shrinkage(
+    posterior_draws: Sequence[PosteriorDraw],
+    measured: int,
+    unnamed: float,
+    change: Change,
+    rng: np.random.Generator,
+) -> Shrinkage:
+    """Reduction of the rms error from before to after, one of `truths` being true.
+
+    `measured` is the number of poses that tell what poses there are.
+
+    `unnamed` (m²) is the mean squared length of what is known to be there without a name: neither
+    model has it, and it is taken to be as large at fresh poses as it was at the measured ones.
+    """
+    weights = np.array([t.probability for t in posterior_draws])
+    which = rng.choice(len(posterior_draws), BOOTSTRAP_DRAWS, p=weights / weights.sum())
+    parts = [
+        _reductions(posterior_draws[k], int((which == k).sum()), measured, unnamed, change, rng)
+        for k in np.unique(which)
+    ]
+    drawn = np.concatenate(parts)
+    low95, low90, middle, high90, high95 = np.quantile(drawn, [0.025, 0.05, 0.5, 0.95, 0.975])
+    return Shrinkage(float(middle), (float(low90), float(high90)), (float(low95), float(high95)))
+
+
+def _reductions(
+    posterior_draw: PosteriorDraw,
+    n: int,
+    measured: int,
+    unnamed: float,
+    change: Change,
+    rng: np.random.Generator,
+) -> Array:
+    """(n,) draws."""
+    moved = posterior_draw.spread @ rng.normal(size=(posterior_draw.spread.shape[2], n))
+    poses, at, count = np.unique(posterior_draw.pose, return_inverse=True, return_counts=True)
+    share = rng.dirichlet(np.full(len(poses), measured / len(poses)), n)
+    chosen = rng.multinomial(FRESH, share)
+    mean = []
+    for error in (posterior_draw.before, posterior_draw.after):
+        squares = ((error[:, :, None] - moved) ** 2).sum(axis=1)
+        total = np.zeros((len(poses), n))
+        np.add.at(total, at, squares)
+        readings = chosen @ count
+        mean.append((chosen.T * total).sum(axis=0) / readings + unnamed)
+    times = round(FRESH * change.visits)
+    late = rng.binomial(times, change.share * rng.random(n)) / times
+    mean[1] = mean[1] + late * change.square
+    return np.asarray(1 - np.sqrt(mean[1] / np.maximum(mean[0], 1e-300)))
+
+
+# Poses that had no part in a fit: those that another campaign of the same kind might visit.
+
+CANDIDATES = 10  # times as many poses as are wanted
+ROUNDS, HEAVIEST = 20, 20.0  # of raking, and how many times the mean weight a pose may count
+
+
+def new_pose_table(
+    model: Model, table: Measurements, n: int, rng: np.random.Generator
+) -> Measurements:
+    """n fresh configurations like those of the table.
+
+    Each repeats the load states, repeats and markers of one that was measured.  Every joint's
+    angle (with the side it came from, and the torque at it) is that of another one drawn at
+    random, independently of the other joints, and all markers stay inside the box that the
+    measured ones show: floor and fixtures keep fresh poses out of the same regions (unless
+    hardly any is inside).  Of those, angles that lead out of the box more often are chosen more
+    often, until every joint is as far from its middle as it was in the campaign.  Times are
+    uniform over the campaign's.  Readings are left as they are and mean nothing.
+    """
+    drawn, donors = _recombined(table, CANDIDATES * n, rng)
+    low, high = _box(model.target_poses(table)[1], table.configuration)
+    at = model.target_poses(drawn)[1]
+    outside = ((at < low) | (at > high)).any(axis=1)
+    inside = np.setdiff1d(drawn.configuration, drawn.configuration[outside])
+    if len(inside) < n:
+        inside = np.unique(drawn.configuration)
+    chosen = rng.choice(inside, n, replace=False, p=_raked(donors[inside]))
+    return drawn.take(np.isin(drawn.configuration, chosen))
+
+
+def _raked(donors: IntArray) -> Array:
+    """Probabilities (n,) of poses so that each donor of a joint's angle, `donors` (n, joints), is
+    as probable as the others: raking (Deming and Stephan 1940, Ann. Math. Stat. 11)."""
+    weight = np.full(len(donors), 1 / len(donors))
+    for _ in range(ROUNDS):
+        for of_joint in donors.T:
+            share = np.bincount(of_joint, weight)
+            wanted = 1 / np.count_nonzero(share)
+            weight *= (wanted / np.where(share > 0, share, 1.0))[of_joint]
+        weight = np.minimum(weight, HEAVIEST / len(weight))
+        weight /= weight.sum()
+    return weight
+
+
+def _box(at: Array, configuration: IntArray) -> tuple[Array, Array]:
+    """Ends (3,) of the box that positions `at` (n_rows, 3) were drawn from.
+
+    n draws leave a part of 1/(n + 1) beyond each end on average, as long as the step from the last
+    configuration to the one before it; without it the poses that err most would be missing.
+    """
+    codes = np.unique(configuration)
+    low = np.sort([at[configuration == c].min(axis=0) for c in codes], axis=0)
+    high = np.sort([at[configuration == c].max(axis=0) for c in codes], axis=0)
+    return 2 * low[0] - low[min(1, len(low) - 1)], 2 * high[-1] - high[max(-2, -len(high))]
+
+
+def _recombined(
+    table: Measurements, n: int, rng: np.random.Generator
+) -> tuple[Measurements, IntArray]:
+    """n poses, and which measured configuration (n, joints) each joint's angle is from."""
+    codes = np.unique(table.configuration)
+    rows_of = [np.flatnonzero(table.configuration == c) for c in codes]
+    chosen = [rows_of[k] for k in rng.integers(len(codes), size=n)]
+    rows = np.concatenate(chosen)
+    configuration = np.repeat(np.arange(n), [len(r) for r in chosen])
+    labels = tuple(str(c + 1) for c in range(n))
+    fresh = replace(table.take(rows), configuration=configuration, configuration_labels=labels)
+    place = np.concatenate([np.arange(len(r)) for r in chosen])
+    own = {
+        name: getattr(fresh, name)
+        for name in ("q", "approach", "torque")
+        if getattr(fresh, name) is not None
+    }
+    donors = rng.integers(len(codes), size=(n, table.q.shape[1]))
+    for j, of_joint in enumerate(donors.T):
+        of = [rows_of[k] for k in of_joint]
+        source = np.array(
+            [of[c][i % len(of[c])] for c, i in zip(configuration, place, strict=True)]
+        )
+        for name, values in own.items():
+            values[:, j] = getattr(table, name)[source, j]
+    if table.time is None:
+        return fresh, donors
+    at = visits(fresh)
+    time = rng.uniform(table.time.min(), table.time.max(), at.max() + 1)[at]
+    warmth = None
+    if table.temperature is not None:
+        order = np.argsort(table.time)
+        warmth = np.interp(time, table.time[order], table.temperature[order])
+    return replace(fresh, time=time, temperature=warmth), donors
+
+
+# The nonlinear fit of the model with the found effects in it, weighted by the fitted noise.
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Values x (parameters,) of a model, and `spread` (parameters, k): x + spread·z with standard
+    normal z (k,) is a draw from what the data leave possible."""
+
+    base: Baseline
+    x: Array
+    spread: Array
+
+    @property
+    def std(self) -> Array:
+        return np.asarray(np.linalg.norm(self.spread, axis=1))
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A model about the fit `base`: readings as a scene's, scaled columns, and where x = 0 is.
+
+    `further` (rows, k) columns of constants that are not among the model's parameters, scaled to
+    their prior deviations, stand last: at zero in x.
+    """
+
+    base: Baseline
+    data: NoisyData
+    width: Array
+    centre: Array
+
+    @classmethod
+    def of(
+        cls,
+        dataset: DiagnosisData,
+        base: Baseline,
+        further: Array | None = None,
+        prior: Mapping[str, float] | None = None,
+        at: Regression | None = None,
+    ) -> Linear:
+        """`prior` holds standard deviations of parameters by name, where they are not wide; `at`
+        spares evaluating the model at the fit."""
+        observed = base.observed
+        known = prior or {}
+        names = base.model.names
+        width = np.array([known.get(n, w) for n, w in zip(names, widths(base), strict=True)])
+        at = at or base.model.regressor(observed.table, base.x, observations=observed)
+        B = at.B * width
+        residual = at.residual + B @ (away(base) / width)
+        centre = base.x - away(base)
+        if further is not None:
+            k = further.shape[1]
+            B, width = np.hstack([B, further]), np.append(width, np.ones(k))
+            centre = np.append(centre, np.zeros(k))
+        pack, size = dataset.blocks.pack, observed.size
+        data = replace(
+            dataset.data, r=pack(residual.reshape(-1, size, 1))[:, :, 0],
+            X=pack(B.reshape(-1, size, B.shape[1])), precision=np.ones(B.shape[1]),
+        )  # fmt: skip
+        return cls(base, data, width, centre)
+
+    def posterior(self, noise: NoiseValues) -> Posterior:
+        """One step from the fit to the readings, under `noise`."""
+        fit = project(self.data, noise)
+        spread = linalg.solve_triangular(fit.factor, np.diag(self.width), lower=True).T
+        return Posterior(self.base, self.centre + self.width * fit.beta, spread)
+
+
+def refit(fitted: Posterior, items: list[Item]) -> dict[
+    tuple[str, str], tuple[FittedParameter, ...]
+]:  # fmt: skip
+    """Parameters of the known `items` with standard deviations, by effect and place."""
+    std = fitted.std
+    out: dict[tuple[str, str], list[FittedParameter]] = {}
+    for k, p in enumerate(fitted.base.model.parameters):
+        found = FittedParameter(p.name, float(fitted.x[k]), p.unit, float(std[k]))
+        out.setdefault((p.effect, p.where), []).append(found)
+    keys = [(i.what.name, i.what.where) for i in items if isinstance(i.what, Hypothesis)]
+    return {key: tuple(out[key]) for key in keys}
+
+
+# What an effect's searched constants may be instead, and what that does to fresh poses.
+
+MOST = 6  # settings that are kept
+WORTH = 0.02  # probability from which one is
+
+
+def other_settings(dataset: DiagnosisData, chosen: ModelSet, k: int) -> list[tuple[Item, float]]:
+    """Item k at each of its plausible settings, its own first, and their probabilities.
+
+    Only the item itself where it has none.
+    """
+    item = chosen.items[k]
+    what = item.what
+    if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
+        return [(item, 1.0)]
+    data = beside(dataset, chosen, k)
+    grid = dataset.grids[what.name, what.where]
+    grams = Grams(dataset, data, project(data, chosen.noise))
+    own = float(grams.of_hypothesis(what, item.settings[None]).evidence(item.scales)[0])
+    each = grams.of_hypothesis(what).evidence(item.scales)
+    # The chosen one stands for the point of the grid that it was refined from.
+    nearest = grid.nearest(item.settings)
+    each[nearest] = own
+    share = np.exp(each - each.max())
+    share /= share.sum()
+    others = [int(i) for i in np.argsort(-share)[:MOST] if share[i] > WORTH and i != nearest]
+    out = [(item, float(share[nearest]))]
+    return out + [(replace(item, settings=grid.values[i]), float(share[i])) for i in others]
+
+
+def between_visits(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Change:
+    """How far readings on the wrong side of a change are off, and how many there may be.
+
+    A change between two visits is put into the middle of the pause; fresh readings that fall
+    between that and the true moment, a share of up to half the pause over the duration, are
+    off by the whole change.  Nothing for effects that do not change once.
+    """
+    what = chosen.items[k].what
+    time = dataset.base.observed.table.time
+    kinds = [s.kind for s in what.settings] if isinstance(what, Hypothesis) else []
+    if "change_time" not in kinds or time is None:
+        return Change()
+    moments = np.unique(time)
+    changed = chosen.items[k].settings[kinds.index("change_time")]
+    later = int(np.searchsorted(moments, changed))
+    if not 0 < later < len(moments):
+        return Change()
+    pause = float(moments[later] - moments[later - 1]) / float(np.ptp(moments))
+    squares, count = squared_lengths(dataset.data, signal_of(dataset, chosen, k))
+    shown = squares > 0
+    per_reading = float(squares[shown].sum() / max(count[shown].sum(), 1))
+    return Change(per_reading, pause / 2, float(dataset.present.sum() / len(dataset.present)))
+
+
+# What may be true at fresh poses, given what was found: each as probable as it is.
+
+DRAWN = 200  # fresh poses that the sets are drawn from
+NOISES = 10  # values of the noise that a truth is drawn under
+NUDGE = 0.01  # of a setting's grid step: a difference quotient in constants that are not parameters
+WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as the truth
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """Models before and after effects are added, and fresh poses to compare them at.
+
+    `fitted` is the exact model with all known effects, fitted to the scene's readings; `plain` the
+    cell's own model.
+    """
+
+    dataset: DiagnosisData
+    chosen: ModelSet
+    plain: Baseline
+    fitted: Baseline
+    observed: Observations
+    noise: tuple[NoiseValues, ...]
+
+    @classmethod
+    def of(cls, found: SelectedEffects, plain: Baseline, rng: np.random.Generator) -> Confirmation:
+        chosen, dataset = found.chosen, found.dataset
+        fitted = fit_extended(dataset, chosen, _known(chosen.items))
+        table = new_pose_table(plain.model, plain.observed.table, DRAWN, rng)
+        observed = observe(table, plain.model.observe)
+        noise = noise_draws(chosen.data, chosen.noise, NOISES, rng)
+        return cls(dataset, chosen, plain, fitted, observed, tuple(noise))
+
+    @cached_property
+    def parameters(self) -> Posterior:
+        """The exact model's values, weighted by all the noise that was found."""
+        measured = self._regressions(self.fitted)[0]
+        return Linear.of(self.dataset, self.fitted, at=measured).posterior(self.chosen.noise)
+
+    @cached_property
+    def _after(self) -> Array:
+        return self._regressions(self.fitted)[1].prediction
+
+    @cached_property
+    def _known_regressions(self) -> dict[tuple[Model, bytes], tuple[Regression, Regression]]:
+        return {}
+
+    def _regressions(self, base: Baseline) -> tuple[Regression, Regression]:
+        """A model at the measured rows and at the fresh ones; kept, since the truths of all items
+        begin with the one that was fitted."""
+        key = base.model, base.x.tobytes()
+        if key not in self._known_regressions:
+            self._known_regressions[key] = (
+                base.model.regressor(base.observed.table, base.x, observations=base.observed),
+                base.model.regressor(self.observed.table, base.x, observations=self.observed),
+            )
+        return self._known_regressions[key]
+
+    def posterior_draws(
+        self, k: int, rivals: tuple[tuple[Item, float], ...]
+    ) -> list[PosteriorDraw]:
+        """Errors without and with item k if the truth is item k at any plausible setting, or one
+        of its `rivals`, of which itself is the first, with their probabilities."""
+        others = _known(self.chosen.without(k))
+        before = self._calibrated(
+            fit_extended(self.dataset, self.chosen, others) if others else self.plain
+        )
+        out = []
+        for item, share in other_settings(self.dataset, self.chosen, k):
+            like = replace(self.chosen, items=self._with(k, item))
+            at = replace(self.fitted, model=extended(self.plain.model, _known(like.items)))
+            out += self._truth(at, like, item, before, rivals[0][1] * share)
+        out = self._under_both_laws(k, before, out)
+        for item, share in rivals[1:]:
+            if share < WORTH_A_DRAW or not item.known:
+                continue
+            rival = fit_set(self.dataset, self._with(k, item), self.chosen.noise)
+            at = fit_extended(self.dataset, rival, _known(rival.items))
+            out += self._truth(at, rival, item, before, share)
+        return out
+
+    def _under_both_laws(
+        self, k: int, before: Array, posterior_draws: list[PosteriorDraw]
+    ) -> list[PosteriorDraw]:
+        """What is true if item k, where it is play, follows its law, and if it follows another."""
+        doubt, item = self.dataset.other_play, self.chosen.items[k]
+        if not (isinstance(item.what, Hypothesis) and item.what.name == EFFECT and doubt):
+            return posterior_draws
+        held = [replace(t, probability=t.probability * (1 - doubt)) for t in posterior_draws]
+        other = extended(under_other_law(self.plain.model), _known(self.chosen.items))
+        share = doubt * sum(t.probability for t in posterior_draws)
+        at = replace(self.fitted, model=other)
+        return held + self._truth(at, self.chosen, item, before, share)
+
+    def _with(self, k: int, item: Item) -> tuple[Item, ...]:
+        return (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
+
+    @cached_property
+    def unnamed(self) -> float:
+        """Mean squared length (m²) of what is in the set without a name, of each block what the
+        fitted parameters cannot follow: the error of configurations left out of a fit to it."""
+        total = 0.0
+        for k, item in enumerate(self.chosen.items):
+            if not item.known:
+                signal = signal_of(self.dataset, self.chosen, k)
+                alone = replace(beside(self.dataset, self.chosen, k), r=signal)
+                error = left_out_residual(project(alone, self.chosen.noise.of_instrument()))
+                squares, count = squared_lengths(alone, alone.masked(error))
+                total += float(squares.sum() / count.sum())
+        return total
+
+    def _calibrated(self, base: Baseline) -> Array:
+        """What a model reads at the fresh poses, fitted as a calibration would that knows nothing
+        of the joints' scatter; and the scatter fitted beside a missing effect is the effect,
+        which weights by it would spare."""
+        return base.model.predict(self.observed.table, base.x, self.observed)
+
+    def _truth(
+        self, base: Baseline, true: ModelSet, item: Item, before: Array, probability: float
+    ) -> list[PosteriorDraw]:
+        """If that set is true, fitted as `base`, under each of the noises."""
+        measured, fresh = self._by_constant(base, _known(true.items), item)
+        here, at = self._regressions(base)
+        linear = Linear.of(self.dataset, base, measured, self._prior(true), here)
+        B = np.hstack([at.B, fresh])
+        start = np.append(base.x, np.zeros(measured.shape[1]))
+        size = self.observed.size
+        shown = min(size, 3)
+
+        def lengths(rows: Array) -> Array:
+            return rows.reshape(-1, size, *rows.shape[1:])[:, :shown]
+
+        out = []
+        for noise in self.noise:
+            fit = linear.posterior(noise)
+            readings = at.prediction + B @ (fit.x - start)
+            out.append(
+                PosteriorDraw(
+                    lengths(before - readings),
+                    lengths(self._after - readings),
+                    lengths(B @ fit.spread),
+                    self.observed.configuration,
+                    probability / len(self.noise),
+                )
+            )
+        return out
+
+    def _prior(self, true: ModelSet) -> dict[str, float]:
+        """Prior deviations of the set's parameters: their typical sizes, times the scale that the
+        readings prefer where the effect is larger than usual; a tie to the usual size would
+        make the truth smaller than what was found."""
+        out = {}
+        for item, scale in zip(true.items, true.scales, strict=True):
+            if isinstance(item.what, Hypothesis):
+                size = self.dataset.sizes[item.what.name, item.what.where] * max(scale, 1.0)
+                for p, s in zip(item.what.parameters, size, strict=True):
+                    out[f"{item.what.where}.{p.key}"] = float(s)
+        return out
+
+    def _by_constant(self, base: Baseline, known: list[Item], item: Item) -> list[Array]:
+        """Difference quotients (rows, k) in the item's constants that vary smoothly, of the
+        measured readings and of the fresh ones, each by the step of the grid it was searched on:
+        it is not known better than the data tell."""
+        what = item.what
+        assert isinstance(what, Hypothesis)
+        sets = (self.dataset.base.observed, self.observed)
+        columns = [np.zeros((observed.size * len(observed.lead), 0)) for observed in sets]
+        for s, setting in enumerate(what.settings):
+            if setting.kind == "change_time":
+                continue
+            grid = self.dataset.grids[what.name, what.where]
+            step = float(grid.step[grid.nearest(item.settings), s])
+            # At a bound, where the search may well end, the quotient is one-sided.
+            near = item.settings[s] + NUDGE * step * np.array([1.0, -1.0])
+            near = np.clip(near, setting.lower, setting.upper)
+            ends = []
+            for value in near:
+                moved = item.settings.copy()
+                moved[s] = value
+                items = [replace(i, settings=moved) if i.same_as(item) else i for i in known]
+                model = extended(self.plain.model, items)
+                ends.append([model.predict(observed.table, base.x, observed) for observed in sets])
+            apart = float(near[0] - near[1]) / step
+            slopes = [(up - down) / apart for up, down in zip(*ends, strict=True)]
+            columns = [np.column_stack(pair) for pair in zip(columns, slopes, strict=True)]
+        return columns
+
+
+def _known(items: tuple[Item, ...]) -> list[Item]:
+    return [item for item in items if item.known]

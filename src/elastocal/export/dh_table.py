@@ -1,0 +1,304 @@
+"""The calibrated arm as a Denavit–Hartenberg table, standard or modified."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, replace
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+
+from elastocal.cell.arm_description import Robot
+from elastocal.export.exportable import ExportNumbers
+from elastocal.model import rigid
+from elastocal.model.chain import Chain, Joint
+from elastocal.model.dh import FIXED, dh_number, read_dh_table
+from elastocal.model.effects.compliances import transverse_axes
+from elastocal.tables import csv_text
+from elastocal.units import Array
+
+# A link between two joint axes as Denavit–Hartenberg parameters.
+#
+# Every rigid transform between two frames whose z are joint axes is
+#
+#     T = Rz(θ) Tz(d) Tx(a) Rx(α) · Rz(γ) Tz(h)                 axes not parallel
+#     T = Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β) · Rz(γ) Tz(h)     nearly parallel, d chosen (Hayati)
+#
+# Rz(γ) Tz(h) commutes with the motion of the next joint and goes into its θ and d.  So n links are
+# n rows and one remainder at the flange, exactly.  (Denavit and Hartenberg, J. Appl. Mech. 1955;
+# Hayati, IEEE Conference on Decision and Control 1983.)
+
+# Below this angle between two axes (rad) the foot of their common normal runs away with the
+# smallest error, a/α away; Hayati's parameter keeps it in place.
+NEARLY_PARALLEL = 0.02
+ANGLES = (0, 3, 4)
+
+
+@dataclass(frozen=True)
+class DhRow:
+    """θ, d, a, α and Hayati's β of one row, in rad and m."""
+
+    theta: float = 0.0
+    d: float = 0.0
+    a: float = 0.0
+    alpha: float = 0.0
+    beta: float = 0.0
+
+    def leading(self) -> Array:
+        """Rz(θ) Tz(d) (4, 4): what belongs to the joint's own axis."""
+        return _product(_turn("z", self.theta), _shift("z", self.d))
+
+    def trailing(self) -> Array:
+        """Tx(a) Rx(α) Ry(β) (4, 4)."""
+        return _product(_shift("x", self.a), _turn("x", self.alpha), _turn("y", self.beta))
+
+    def transform(self) -> Array:
+        """T (4, 4) of the row with its joint at zero."""
+        return self.leading() @ self.trailing()
+
+    def near(self, other: DhRow, tolerance: float = 1e-12) -> DhRow:
+        """This row with the other's number wherever the two agree to rounding."""
+        mine, theirs = astuple(self), astuple(other)
+        return DhRow(
+            *(t if abs(m - t) < tolerance else m for m, t in zip(mine, theirs, strict=True))
+        )
+
+
+def split(T: Array, near: DhRow | None = None, height: float = 0.0) -> tuple[DhRow, Array]:
+    """The row of T (4, 4) and the remainder Rz(γ) Tz(h), so that T = row · remainder.
+
+    (θ, a, α) and (θ ± π, −a, −α) say the same: taken is the one closer to `near`, else the one
+    with the smaller θ.  Turns of `near` beyond π are kept.  Of nearly parallel axes d is that of
+    `near`, else `height`.
+    """
+    z = T[:3, 2]
+    if math.hypot(z[0], z[1]) > NEARLY_PARALLEL:
+        ways = [_skew(T, sign) for sign in (1.0, -1.0)]
+    else:
+        ways = [_parallel(T, sign, near, height) for sign in (1.0, -1.0)]
+    row = min(ways, key=lambda way: _distance(way, near))
+    if near is not None:
+        row = _same_turns(row, near)
+    return row, np.asarray(np.linalg.solve(row.transform(), T), dtype=np.float64)
+
+
+def _skew(T: Array, sign: float) -> DhRow:
+    z, p = T[:3, 2], T[:3, 3]
+    theta = math.atan2(sign * z[0], -sign * z[1])
+    x = np.array([math.cos(theta), math.sin(theta), 0.0])
+    alpha = math.atan2(sign * math.hypot(z[0], z[1]), z[2])
+    # p = d·z₀ + a·x + h·z: the common normal meets both axes.
+    d, a, _ = np.linalg.solve(np.column_stack([[0.0, 0.0, 1.0], x, z]), p)
+    return DhRow(theta, float(d), float(a), alpha)
+
+
+def _parallel(T: Array, sign: float, near: DhRow | None, height: float) -> DhRow:
+    z, p = T[:3, 2], T[:3, 3]
+    d = height if near is None else near.d
+    foot = p - (p[2] - d) / z[2] * z  # where the second axis passes through the height d
+    a = sign * math.hypot(foot[0], foot[1])
+    theta = math.atan2(sign * foot[1], sign * foot[0])
+    if abs(a) < 1e-12:  # one axis in the other's line: any direction will do
+        theta, a = (0.0 if near is None else near.theta), 0.0
+    # z = Rz(θ) Rx(α) Ry(β) e_z = Rz(θ) (sin β, −sin α cos β, cos α cos β)
+    c, s = math.cos(theta), math.sin(theta)
+    u = (c * z[0] + s * z[1], -s * z[0] + c * z[1], z[2])
+    alpha = math.atan2(-u[1], u[2])
+    beta = math.atan2(u[0], math.hypot(u[1], u[2]))
+    return DhRow(theta, d, a, alpha, beta)
+
+
+def _distance(row: DhRow, near: DhRow | None) -> float:
+    if near is None:
+        return abs(row.theta) - 1e-9 * row.a
+    turn = [1 - math.cos(x - y) for x, y in ((row.theta, near.theta), (row.alpha, near.alpha))]
+    return sum(turn) + abs(row.a - near.a)
+
+
+def _same_turns(row: DhRow, near: DhRow) -> DhRow:
+    mine, theirs = astuple(row), astuple(near)
+    return DhRow(
+        *(
+            m + 2 * math.pi * round((t - m) / (2 * math.pi)) if k in ANGLES else m
+            for k, (m, t) in enumerate(zip(mine, theirs, strict=True))
+        )
+    )
+
+
+def _turn(axis: str, angle: float) -> ca.SX:
+    return rigid.joint_motion("revolute", _unit(axis), angle)
+
+
+def _shift(axis: str, length: float) -> ca.SX:
+    return rigid.joint_motion("prismatic", _unit(axis), length)
+
+
+def _unit(axis: str) -> tuple[float, float, float]:
+    return {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}[axis]
+
+
+def _product(*factors: ca.SX) -> Array:
+    T = ca.SX.eye(4)
+    for factor in factors:
+        T = T @ factor
+    return np.array(ca.DM(T).full())
+
+
+# The calibrated arm as a Denavit–Hartenberg table, standard or modified.
+#
+# Calibration leaves neighbouring axes skew, so a table of four parameters per joint holds them;
+# where they are nearly parallel there is a column beta_rad.  Rows of type fixed carry what no joint
+# row can: where the first axis stands in the base frame, and the flange.  Numbers that calibration
+# did not change are those of the nominal arm.
+#
+# The chain is written as  L₀ X₀ · L₁(q₁) X₁ · … · L_n(q_n) X_n · F  with L = Rz(θ) Tz(d) and
+# X = Tx(a) Rx(α) Ry(β).  A standard row is an L with the X after it, a modified row an L with the
+# X before it.
+
+Convention = Literal["standard", "modified"]
+CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}
+HEADER = ("joint", "type", "theta0_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
+LIMITS = {"revolute": ("lower_rad", "upper_rad"), "prismatic": ("lower_m", "upper_m")}
+ZERO = 1e-14  # m or rad; rounding of a product of rotations
+
+
+@dataclass(frozen=True)
+class Line:
+    """One row of the table: `joint` None for a fixed one."""
+
+    name: str
+    joint: Joint | None
+    row: DhRow
+
+
+def dh_lines(robot: Robot, pieces: ExportNumbers, convention: Convention) -> list[Line]:
+    """The rows of the calibrated table; `robot` says which nominal table, if any, to keep to."""
+    nominal = pieces.chain
+    like = _nominal_rows(robot, nominal, convention)
+    ideal = [
+        row if own is None else row.near(own)
+        for row, own in zip(_decompose(nominal, like)[0], like, strict=True)
+    ]
+    rows, F = _decompose(pieces.calibrated_chain(), ideal, keep_last=True)
+    first, *joints = [row.near(old) for row, old in zip(rows, ideal, strict=True)]
+    end, last = split(F)
+    flange = [end, DhRow(theta=math.atan2(last[1, 0], last[0, 0]), d=float(last[2, 3]))]
+    # (what moves, L and X) in the order of the chain
+    whole: list[tuple[str, Joint | None, DhRow]] = [("base", None, first)]
+    whole += [(j.name, j, row) for j, row in zip(nominal.joints, joints, strict=True)]
+    whole += [(f"flange{k}", None, row) for k, row in enumerate(flange, start=1)]
+    if convention == "modified":
+        before = [DhRow(), *(row for _, _, row in whole[:-1])]
+        whole = [
+            (name, joint, replace(b, theta=row.theta, d=row.d))
+            for (name, joint, row), b in zip(whole, before, strict=True)
+        ]
+    cleaned = [Line(name, joint, row.near(DhRow(), ZERO)) for name, joint, row in whole]
+    return [line for line in cleaned if line.joint is not None or line.row != DhRow()]
+
+
+FORMULA = {
+    "standard": "T = Rz(theta0 + q) Tz(d) Tx(a) Rx(alpha) Ry(beta) per row",
+    "modified": "T = Rx(alpha) Tx(a) Ry(beta) Rz(theta0 + q) Tz(d) per row",
+}
+
+
+def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
+    """CSV text of a table, which `[robot] dh` reads: angles in rad, lengths in m.
+
+    beta_rad stands there only where a row needs it; limits are those of commanded values; comments
+    begin with #.
+    """
+    with_beta = any(line.row.beta for line in lines)
+    kinds = {line.joint.kind for line in lines if line.joint is not None and _limits(line.joint)}
+    limits = [name for kind, names in LIMITS.items() if kind in kinds for name in names]
+    header = [*(HEADER if with_beta else HEADER[:-1]), *limits]
+    rows = []
+    for line in lines:
+        numbers = dict(zip(HEADER[2:], astuple(line.row), strict=True))
+        if line.joint is not None:
+            numbers |= _limits(line.joint)
+        kind = FIXED if line.joint is None else line.joint.kind
+        cells = [repr(numbers[name] + 0.0) if name in numbers else "" for name in header[2:]]
+        rows.append([line.name, kind, *cells])
+    return csv_text(header, rows, comments)
+
+
+def without_beta(lines: Sequence[Line]) -> list[Line]:
+    """The same table with β left out, as programs of four columns read it."""
+    return [replace(line, row=replace(line.row, beta=0.0)) for line in lines]
+
+
+def _decompose(
+    chain: Chain, like: Sequence[DhRow | None], keep_last: bool = False
+) -> tuple[list[DhRow], Array]:
+    """Rows 0 … n of a chain and its flange in the last row's frame, near the rows `like`.
+
+    `keep_last`: the last row changes in θ and d alone, the rest is the flange's.  Its z is often
+    in line with the last axis, where a row of its own would turn any way.
+    """
+    turned = [_z_to(joint.axis) for joint in chain.joints]
+    ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
+    starts = [np.eye(4), *turned]
+    rows: list[DhRow] = []
+    carried: Array = np.eye(4)
+    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        last = i == chain.n_joints
+        T = carried @ np.linalg.inv(start) @ end @ (np.eye(4) if last else turned[i])
+        near = like[i]
+        if last and keep_last and near is not None:
+            row = _along_axis(T, near)
+            carried = np.asarray(np.linalg.solve(row.transform(), T), dtype=np.float64)
+        else:
+            row, carried = split(T, near, height=float(T[2, 3]) if last else 0.0)
+        rows.append(row)
+    return rows, carried
+
+
+def _along_axis(T: Array, near: DhRow) -> DhRow:
+    """`near` with the turn about and the shift along its axis that bring it closest to T."""
+    R = T[:3, :3] @ near.trailing()[:3, :3].T
+    theta = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
+    theta += 2 * math.pi * round((near.theta - theta) / (2 * math.pi))
+    return replace(near, theta=theta, d=float(T[2, 3]))
+
+
+def _z_to(axis: Array) -> Array:
+    """A rotation (4, 4) whose z column is the axis; the identity where that is z already."""
+    T = np.eye(4)
+    x, y = transverse_axes(axis)
+    T[:3, :3] = np.column_stack([x, y, axis])
+    return T
+
+
+def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[DhRow | None]:
+    """What the user's own table says of links 0 … n; None where it is in another convention."""
+    nothing: list[DhRow | None] = [None] * (chain.n_joints + 1)
+    if robot.dh is None or robot.dh_convention != convention:
+        return nothing
+    table = read_dh_table(robot.dh)
+    n = len(table.row)
+    if any(table.text(i, "type") == FIXED for i in range(n)):
+        return nothing
+    keys = (
+        ("angle", "theta0"),
+        ("length", "d"),
+        ("length", "a"),
+        ("angle", "alpha"),
+        ("angle", "beta"),
+    )
+    numbers = np.nan_to_num([[dh_number(table, i, *key) for key in keys] for i in range(n)])
+    own = [DhRow(*row) for row in numbers.tolist()]
+    if convention == "standard":
+        return [DhRow(), *own]
+    after = [*own[1:], DhRow()]
+    first = replace(own[0], theta=0.0, d=0.0)
+    pairs = zip(own, after, strict=True)
+    return [first, *(replace(a, theta=row.theta, d=row.d) for row, a in pairs)]
+
+
+def _limits(joint: Joint) -> dict[str, float]:
+    ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
+    return {name: value for name, value in ends if math.isfinite(value)}

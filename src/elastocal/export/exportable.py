@@ -1,0 +1,491 @@
+"""What of a calibrated model a file can hold, and what leaving the rest out costs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InsufficientDataError, option
+from elastocal.measurements import Measurements
+from elastocal.model import rigid
+from elastocal.model.arm import Arm
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.chain import Chain, LinkMass, finite_ranges, joint_limits
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.base import Format
+from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.loads import LinkGravity
+from elastocal.model.manipulator import Model
+from elastocal.model.symbolic import SymbolicArm
+from elastocal.simulation.mujoco_arm import numbers
+from elastocal.units import Array
+
+# Rigid transforms as URDF writes them.
+
+
+def rpy(R: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll), the URDF's convention.
+
+    Yaw is taken first and undone in the other two, so that all three are exact to rounding at
+    pitch = ±π/2 as well, where the textbook formula divides 0 by 0.
+    """
+    yaw = math.atan2(R[1, 0], R[0, 0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    pitch = math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = math.atan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return roll, pitch, yaw
+
+
+def origin_attributes(T: Array) -> dict[str, str]:
+    """xyz and rpy of an <origin> for a transform (4, 4)."""
+    return {"xyz": numbers(T[:3, 3]), "rpy": numbers(rpy(T[:3, :3]))}
+
+
+# What of the calibrated model a file can hold, as a model of its own beside the full one.
+#
+# A rigid format (URDF, DH table) holds geometry; MJCF also holds linear springs and weights.  The
+# full model less what it cannot hold is again a `Model`, of the same effects, so the cost of the
+# export is the difference of two predictions of one and the same machinery.
+
+# What a spring in a file cannot follow, named like effects among the omissions.
+LEVELS, LINEAR, NEGATIVE = "levels of a joint", "linear deflections", "negative compliance"
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What the arm is compared under: force (3,) N in the tracker frame at the load point, time
+    in s and temperature in °C of the table's columns (None: not stated)."""
+
+    force: Array = field(default_factory=lambda: np.zeros(3))
+    time: float | None = None
+    temperature: float | None = None
+
+    def state(self, need: str) -> bool:
+        """Is what an effect needs ("time", "temperature", …) stated here?"""
+        return not (
+            (need == "time" and self.time is None)
+            or (need == "temperature" and self.temperature is None)
+        )
+
+
+@dataclass(frozen=True)
+class Valued:
+    """A model and the values x (parameters,) to evaluate it at."""
+
+    model: Model
+    x: Array
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Name → value in SI units."""
+        return dict(zip(self.model.names, map(float, self.x), strict=True))
+
+    @property
+    def effects(self) -> list[str]:
+        """Active effects in the catalogue's order, link weights included, the load left out."""
+        spec = self.model.cell.model
+        active = {choice.name for choice in spec.effects}
+        if spec.link_gravity:
+            active.add(LinkGravity.name)
+        return [name for name in CATALOGUE if name in active]
+
+
+@dataclass(frozen=True)
+class Omission:
+    """One thing that the file cannot hold; `without` is the full model without it.
+
+    `without` is None where its cost cannot be stated, and `note` says why.
+    """
+
+    effect: str
+    note: str
+    without: Valued | None
+
+
+@dataclass(frozen=True)
+class Kept:
+    """`full`: the calibrated arm; `exported`: what the file holds of it; `omissions` between.
+
+    `of_the_measurement`: effects of the instrument, which are no part of the arm; neither model
+    has them."""
+
+    full: Valued
+    exported: Valued
+    conditions: Conditions
+    omissions: tuple[Omission, ...]
+    of_the_measurement: tuple[str, ...]
+
+
+def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Kept:
+    """Split the calibrated model into what a rigid or an elastic format holds and the rest.
+
+    Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
+    file has no column of measured torques.
+    """
+    cell = calibrated.model.cell
+    chosen = Valued(calibrated.model, calibrated.x).effects
+    instrument = tuple(name for name in chosen if CATALOGUE[name].of_the_measurement)
+    unstated = {
+        name: [need for need in CATALOGUE[name].needed(cell) if not conditions.state(need)]
+        for name in chosen
+        if name not in instrument
+    }
+    whole = [name for name, needs in unstated.items() if not needs]
+    full = _part(calibrated, whole)
+    format: Format = "elastic" if elastic else "rigid"
+    dropped = _cannot_be_springs(full) if elastic else {}
+    kept_names = [
+        name for name in whole if format in CATALOGUE[name].formats and name not in dropped
+    ]
+    omissions = [
+        Omission(name, dropped.get(name, ""), _part(calibrated, set(whole) - {name}))
+        for name in whole
+        if name not in kept_names
+    ]
+    omissions += [
+        Omission(name, f"no cost without {' and '.join(map(_option, needs))}", None)
+        for name, needs in unstated.items()
+        if needs
+    ]
+    exported = full if len(kept_names) == len(whole) else _part(calibrated, kept_names)
+    if elastic:
+        exported, changed = _as_springs(exported)
+        omissions += [
+            Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
+        ]
+    return Kept(full, exported, conditions, tuple(omissions), instrument)
+
+
+def _option(need: str) -> str:
+    return option({"time": "time_s", "temperature": "temperature_c"}[need])
+
+
+def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
+    """The calibrated model with the effects `names` alone."""
+    cell = calibrated.model.cell
+    spec = cell.model
+    spec = replace(
+        spec,
+        effects=tuple(choice for choice in spec.effects if choice.name in names),
+        link_gravity=spec.link_gravity and LinkGravity.name in names,
+        observe="position",
+        torque="computed",
+    )
+    return _valued(calibrated.model, replace(cell, model=spec), calibrated.values)
+
+
+def _valued(like: Model, cell: Cell, values: dict[str, float]) -> Valued:
+    model = Model.assembled(like.chain, cell)
+    return Valued(model, np.array([values[name] for name in model.names]))
+
+
+def _cannot_be_springs(full: Valued) -> dict[str, str]:
+    """Effects whose values no physical spring or body has, with the reason."""
+    values, model = full.values, full.model
+    reasons = {
+        name: CATALOGUE[name].unphysical(values, model.chain, model.cell) for name in full.effects
+    }
+    return {name: reason for name, reason in reasons.items() if reason}
+
+
+def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tuple[str, str]]]:
+    """One spring of positive stiffness per joint, and (effect, sentence) for what that changes.
+
+    A joint split into levels gets their mean; a negative compliance becomes rigid; deflections
+    are those at the deflected pose.  `only` makes the change of one of them alone.
+    """
+    cell, values = part.model.cell, part.values
+    changed = []
+    spec = cell.model
+    if spec.compliance_levels and JointCompliance.name in part.effects and only in (None, LEVELS):
+        for joint, levels in spec.compliance_levels.items():
+            names = [f"{joint}.compliance_level{k + 1}" for k in range(len(levels))]
+            if names[0] in values:
+                values[f"{joint}.compliance"] = float(np.mean([values[name] for name in names]))
+                told = f"one spring with the mean compliance of {joint}'s {len(names)} levels"
+                changed.append((LEVELS, told))
+        spec = replace(spec, compliance_levels={})
+    if spec.deflection_model == "linear" and only in (None, LINEAR):
+        spec = replace(spec, deflection_model="equilibrium")
+        changed.append((LINEAR, "springs settle under the load at the deflected pose, eq. (3) not"))
+    model = Model.assembled(part.model.chain, replace(cell, model=spec))
+    negative = [p.name for p in model.parameters if p.lower == 0.0 and values[p.name] < 0.0]
+    if negative and only in (None, NEGATIVE):
+        values |= dict.fromkeys(negative, 0.0)
+        changed.append((NEGATIVE, f"rigid, as no spring yields so: {', '.join(negative)}"))
+    return Valued(model, np.array([values[name] for name in model.names])), _once(changed)
+
+
+def _once(changed: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    told: dict[str, list[str]] = {}
+    for effect, sentence in changed:
+        told.setdefault(effect, []).append(sentence)
+    return [(effect, "; ".join(sentences)) for effect, sentences in told.items()]
+
+
+# The numbers of an exported model: joint placements, markers, springs, masses.
+#
+# All of them are the expressions of the symbolic arm, evaluated; nothing is derived here a second
+# time.
+
+PAYLOAD = ("load.payload_scale", *(f"load.load_point_{k}" for k in "xyz"))
+
+
+@dataclass(frozen=True)
+class SpringValue:
+    """A spring of the arm with its compliance in rad/(N m) or m/N; the rest as in Spring."""
+
+    name: str
+    site: str
+    kind: str
+    axis: tuple[float, float, float]
+    compliance: float
+
+
+@dataclass(frozen=True)
+class ExportNumbers:
+    """The arm in numbers, in SI units.
+
+    `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of
+    the joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point`
+    (3,) in the flange frame; `load_scale`: what acts per newton declared; `masses`: as in Chain,
+    empty where no weights act.
+    """
+
+    chain: Chain
+    links: tuple[Array, ...]
+    offsets: Array
+    T_tracker_base: Array
+    markers: dict[str, Array]
+    load_point: Array
+    load_scale: float
+    springs: tuple[SpringValue, ...]
+    masses: tuple[LinkMass, ...]
+
+    def offset_motion(self, i: int) -> Array:
+        """Motion (4, 4) of joint i (0-based) by its offset: what stands at encoder zero."""
+        joint = self.chain.joints[i]
+        return ca.DM(rigid.joint_motion(joint.kind, joint.axis, float(self.offsets[i]))).full()
+
+    def placement(self, i: int) -> Array:
+        """Joint i's frame (0-based) in the frame before it, without its offset."""
+        return self.chain.joints[0].placement if i == 0 else self.links[i - 1]
+
+    def calibrated_chain(self) -> Chain:
+        """The chain whose nominal motion is the calibrated one: offsets are in its placements."""
+        joints = tuple(
+            replace(joint, placement=self.placement(i) @ self.offset_motion(i))
+            for i, joint in enumerate(self.chain.joints)
+        )
+        return replace(
+            self.chain, joints=joints, flange_placement=self.links[-1], masses=self.masses
+        )
+
+
+def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
+    """The pieces of an exported model at its values, at the stated time and temperature."""
+    model = part.model
+    symbolic = SymbolicArm(model.chain, model.cell)
+    arm = symbolic.arm
+    given = {"time": conditions.time, "temperature": conditions.temperature}
+    inputs = [np.full(s.shape[0], given.get(name) or 0.0) for name, s in arm.inputs.items()]
+    expressions = [
+        *arm.links,
+        ca.vertcat(*arm.q),
+        arm.T_tracker_base,
+        *arm.markers.values(),
+        *arm.marker_rotation.values(),
+        ca.vertcat(ca.SX.zeros(0, 1), *[spring.law(ca.SX(1.0)) for spring in arm.springs]),
+    ]
+    function = ca.Function("pieces", [*arm.inputs.values(), symbolic.p], expressions)
+    numbers = [value.full() for value in function.call([*inputs, part.x])]
+    n = model.chain.n_joints
+    links, (offsets, T_tracker_base), rest = numbers[:n], numbers[n : n + 2], numbers[n + 2 :]
+    values = part.values
+    scale, *shift = (values.get(name, 0.0) for name in PAYLOAD)
+    return ExportNumbers(
+        chain=model.chain,
+        links=tuple(links),
+        offsets=offsets[:, 0],
+        T_tracker_base=T_tracker_base,
+        markers=_markers(arm, rest),
+        load_point=model.cell.tool.load_point + np.array(shift),
+        load_scale=1.0 + scale,
+        springs=tuple(
+            SpringValue(s.name, s.site, s.kind, s.axis, float(k))
+            for s, k in zip(arm.springs, rest[-1][:, 0], strict=True)
+        ),
+        masses=_masses(model.chain, values, model.cell.model.link_gravity),
+    )
+
+
+def _markers(arm: Arm, numbers: list[Array]) -> dict[str, Array]:
+    placed = {}
+    for k, name in enumerate(arm.markers):
+        T = np.eye(4)
+        T[:3, 3], T[:3, :3] = numbers[k][:, 0], numbers[len(arm.markers) + k]
+        placed[name] = T
+    return placed
+
+
+def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple[LinkMass, ...]:
+    """Nominal masses with what `link_mass_error` found missing: mass and first moment add up."""
+    errors = [name for name in values if name.endswith(".mass_error")]
+    if not link_gravity and not errors:
+        return ()
+    bodies = []
+    for i, body in enumerate(chain.masses, start=1):
+        nominal = body.mass if link_gravity else 0.0
+        mass = nominal + values.get(f"link{i}.mass_error", 0.0)
+        moment = nominal * body.com + [values.get(f"link{i}.moment_{k}", 0.0) for k in "xyz"]
+        bodies.append(LinkMass(mass, moment / mass if mass > 0 else body.com))
+    return tuple(bodies)
+
+
+# Inertia tensors of the bodies that each joint carries, from the robot's URDF.
+
+
+def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
+    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes.
+
+    Joints beside the chain are held at zero, as when the chain was read.  Empty where the file
+    states no inertia that pinocchio can read.
+    """
+    import pinocchio as pin
+
+    try:
+        whole = pin.buildModelFromXML(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RuntimeError):
+        return ()
+    moving = {joint.name for joint in chain.joints}
+    held = [i for i in range(1, whole.njoints) if whole.names[i] not in moving]
+    model = pin.buildReducedModel(whole, held, pin.neutral(whole)) if held else whole
+    tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
+    return tuple(tensors) if len(tensors) == chain.n_joints else ()
+
+
+# What an export costs: how far the file's arm is from the calibrated one, effect by effect.
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Distance between two predictions over the poses, in m: of the flange and of the markers."""
+
+    flange_rms: float
+    flange_max: float
+    marker_rms: float
+    marker_max: float
+
+    def to_json(self) -> dict[str, float]:
+        """The four numbers in µm."""
+        return {f"{name}_um": value * 1e6 for name, value in vars(self).items()}
+
+
+@dataclass(frozen=True)
+class EffectCost:
+    """What leaving one effect out changes; `difference` is None where that cannot be said."""
+
+    effect: str
+    note: str
+    difference: Difference | None
+
+
+@dataclass(frozen=True)
+class Cost:
+    """`total` between the full model and the file's, `effects` one by one, over `poses`.
+
+    Effects interact, so the total need not be their sum.  `unsettled`: poses without a static
+    equilibrium under the load, left out.
+    """
+
+    total: Difference
+    effects: tuple[EffectCost, ...]
+    poses: int
+    unsettled: int
+    force: Array
+
+
+def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
+    """Differences at `poses` random poses inside the joint limits, under the stated conditions.
+
+    A joint split into compliance levels stands at one of its levels, for which alone the full
+    model is identified.  Raises InsufficientDataError where no pose has an equilibrium.
+    """
+    table = random_table(kept.full.model, kept.conditions, poses, seed)
+    # No omission touches the tool, so one set of markers serves every model.
+    tool = evaluate_pieces(kept.exported, kept.conditions).markers
+    markers = np.array([np.zeros(3), *(T[:3, 3] for T in tool.values())])
+    full = _positions(kept.full, table, markers)
+    exported = _positions(kept.exported, table, markers)
+    settled = np.isfinite(full).all(axis=(1, 2)) & np.isfinite(exported).all(axis=(1, 2))
+    if not settled.any():
+        raise InsufficientDataError(
+            f"none of {poses} random poses has a static equilibrium under the load "
+            f"{kept.conditions.force.tolist()} N; check {option('load')} and the "
+            "compliances of the result"
+        )
+    effects = []
+    for omission in kept.omissions:
+        difference = None
+        if omission.without is not None:
+            without = _positions(omission.without, table, markers)
+            difference = _difference(full[settled], without[settled])
+        effects.append(EffectCost(omission.effect, omission.note, difference))
+    effects.sort(key=lambda e: -np.inf if e.difference is None else -e.difference.marker_rms)
+    return Cost(
+        total=_difference(full[settled], exported[settled]),
+        effects=tuple(effects),
+        poses=poses,
+        unsettled=int((~settled).sum()),
+        force=kept.conditions.force,
+    )
+
+
+def random_table(model: Model, conditions: Conditions, poses: int, seed: int) -> Measurements:
+    """`poses` random poses, a row each, with every column that the arm's effects may ask for."""
+    cell, chain = model.cell, model.chain
+    rng = np.random.default_rng(seed)
+    low, high = finite_ranges(chain, *joint_limits(cell, chain))
+    q = rng.uniform(low, high, (poses, chain.n_joints))
+    for joint, levels in cell.model.compliance_levels.items():
+        q[:, int(joint.removeprefix("joint")) - 1] = rng.choice(levels, poses)
+    return Measurements(
+        source="random poses",
+        row=np.arange(poses) + 2,
+        q=q,
+        configuration=np.arange(poses),
+        configuration_labels=tuple(str(i + 1) for i in range(poses)),
+        repeat=np.zeros(poses, dtype=np.int64),
+        marker=np.zeros(poses, dtype=np.int64),
+        marker_names=tuple(cell.tool.markers)[:1],
+        force=np.tile(conditions.force, (poses, 1)),
+        approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)),
+        time=_column(conditions.time, poses),
+        temperature=_column(conditions.temperature, poses),
+    )
+
+
+def _column(value: float | None, n: int) -> Array | None:
+    return None if value is None else np.full(n, value)
+
+
+def _positions(part: Valued, table: Measurements, points: Array) -> Array:
+    """Points (k, 3) of the flange frame in the tracker frame (poses, k, 3); NaN: no equilibrium."""
+    T = part.model.flange_poses(table, part.x)
+    return np.asarray(T[:, None, :3, :3] @ points[..., None])[..., 0] + T[:, None, :3, 3]
+
+
+def _difference(a: Array, b: Array) -> Difference:
+    distance = np.linalg.norm(a - b, axis=2)
+    flange, markers = distance[:, :1], distance[:, 1:]
+    return Difference(_rms(flange), float(flange.max()), _rms(markers), float(markers.max()))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))

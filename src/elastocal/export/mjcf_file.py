@@ -1,0 +1,316 @@
+"""The calibrated arm as MJCF, whose rest under load is the model's static equilibrium."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from elastocal.errors import ElastocalError, InputError
+from elastocal.export.exportable import ExportNumbers, SpringValue
+from elastocal.model.chain import LinkMass
+from elastocal.model.effects.compliances import transverse_axes
+from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.simulation.mujoco_arm import NO_INERTIA, NO_MASS, numbers, placed_body
+from elastocal.units import Array
+
+# The calibrated arm as MJCF, whose rest under load is the model's static equilibrium.
+#
+# Each joint is a hinge or slide that a position actuator drives: its control is the commanded
+# joint value, its gain kp = 1/k the identified stiffness, so that at rest q − q_commanded = k τ.
+# Springs that no motor holds (bearings across the axis, links, pedestal) are passive joints of
+# stiffness 1/k in series, where the model has them, and so is a drive's with such bearings.
+# Geometry, masses, load point and the spring of a gravity compensator are those of the model.
+
+# A drive without identified compliance: 5 kN m turn it by 5e-9 rad, 15 nm at 3 m.
+RIGID = 1e12  # N m/rad or N/m
+# Damping over stiffness, s.  It only settles the motion: nothing of the rest depends on it, and
+# an implicit integrator keeps even the rigid drives stable with it.
+SETTLING = 0.02
+# Keeps the mass matrix regular where links weigh nothing, and the accelerations of a stiff drive
+# after a step of its command below the 1e10 rad/s² beyond which MuJoCo gives up.
+ARMATURE, ARMATURE_PER_STIFFNESS = 0.1, 1e-8  # kg m² (kg), s²
+SHORTEST = 1e-3  # m; a shorter link is not drawn
+
+
+def calibrated_mjcf(
+    pieces: ExportNumbers,
+    note: str,
+    inertias: Sequence[Array] = (),
+    compensator: dict[str, float] | None = None,
+    base_frame: bool = False,
+) -> str:
+    """MJCF text of the exported pieces.
+
+    Actuators joint1 … jointN (control: commanded rad or m) and load_x, load_y, load_z (control:
+    N at the load point, axes of the tracker).  Sites: flange, load_point, marker_NAME.  The world
+    is the robot's base, or with `base_frame` the tracker's frame.  `inertias`: (3, 3) kg m² per
+    link about its centre of mass in its joint's axes; `compensator`: values of
+    `gravity_compensator` by key, with `joint` its 0-based index.
+    """
+    chain = pieces.chain
+    root = ET.Element("mujoco", model=chain.name)
+    root.append(ET.Comment(f" {note.replace('--', '- -')} "))
+    ET.SubElement(root, "compiler", angle="radian", balanceinertia="true", autolimits="false")
+    R = pieces.T_tracker_base[:3, :3]
+    up = np.array([0.0, 0.0, 1.0]) if base_frame else R.T @ [0.0, 0.0, 1.0]
+    ET.SubElement(
+        root, "option", gravity=numbers(-STANDARD_GRAVITY * up), integrator="implicitfast"
+    )
+    world = ET.SubElement(root, "worldbody")
+    tracker = np.eye(4)
+    tracker[:3, :3] = np.eye(3) if base_frame else R.T
+    ET.SubElement(world, "site", placed_body("tracker_axes", tracker))
+    actuators = ET.Element("actuator")
+    T_base = pieces.T_tracker_base if base_frame else np.eye(4)
+    body = _body(world, "base", T_base, None, None)
+    for spring in _springs(pieces, "base"):
+        _passive(body, spring, np.eye(4))
+    before: list[SpringValue] = []
+    for i, joint in enumerate(chain.joints):
+        own, in_series = _drive(pieces, i)
+        offset = pieces.offset_motion(i)
+        mass = pieces.masses[i] if pieces.masses else None
+        T = pieces.placement(i)
+        if before:  # on a body of their own: MuJoCo takes six joints at most in one
+            body = _body(body, f"link{i}_end", T, None, None)
+            for spring in before:
+                _passive(body, spring, np.eye(4))
+            T = np.eye(4)
+        if compensator is not None and compensator["joint"] == i:
+            _anchor(body, T, joint.axis, compensator)
+        body = _body(body, f"link{i + 1}", T @ offset, mass, inertias[i] if inertias else None)
+        for spring in in_series:
+            _passive(body, spring, offset)
+        _motor(body, actuators, pieces, i, own)
+        if compensator is not None and compensator["joint"] == i:
+            _arm_end(body, joint.axis, offset, compensator)
+        before = _springs(pieces, f"link{i + 1}")
+        _draw(body, pieces.links[i])
+    flange = _body(body, "flange", pieces.links[-1], None, None)
+    for spring in before:
+        _passive(flange, spring, np.eye(4))
+    _sites(flange, pieces)
+    if compensator is not None:
+        _tendon(root, compensator)
+    _load(actuators, pieces.load_scale)
+    root.append(actuators)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _springs(pieces: ExportNumbers, site: str) -> list[SpringValue]:
+    return [s for s in pieces.springs if s.site == site and s.compliance > 0]
+
+
+def _drive(pieces: ExportNumbers, i: int) -> tuple[float, list[SpringValue]]:
+    """Compliance of joint i's drive, and the springs before it.
+
+    Springs across the axis stand between the joint's own and its motion: turns about different
+    axes do not commute, and so that spring is a passive joint as well, with a rigid drive.
+    """
+    axis = tuple(map(float, pieces.chain.joints[i].axis))
+    springs = _springs(pieces, f"joint{i + 1}")
+    if all(s.axis == axis and s.kind == pieces.chain.joints[i].kind for s in springs):
+        return sum(s.compliance for s in springs), []
+    return 0.0, springs
+
+
+def _body(
+    parent: ET.Element, name: str, T: Array, mass: LinkMass | None, inertia: Array | None
+) -> ET.Element:
+    body = ET.SubElement(parent, "body", placed_body(name, T))
+    mass = LinkMass(0.0, np.zeros(3)) if mass is None else mass
+    inertial = {"pos": numbers(mass.com), "mass": repr(max(float(mass.mass), NO_MASS))}
+    moments = np.diag(inertia).tolist() if inertia is not None else [0.0]
+    if inertia is not None and min(moments) > NO_INERTIA:
+        entries = [*moments, inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+        inertial["fullinertia"] = numbers(entries)
+    else:
+        inertial["diaginertia"] = numbers([NO_INERTIA] * 3)
+    ET.SubElement(body, "inertial", inertial)
+    return body
+
+
+def _passive(body: ET.Element, spring: SpringValue, offset: Array) -> None:
+    """A spring of the model; its axis stands before the body was turned by the joint's offset."""
+    back = np.linalg.inv(offset)
+    stiffness = 1.0 / spring.compliance
+    ET.SubElement(
+        body,
+        "joint",
+        name=f"spring_{spring.name}",
+        type="slide" if spring.kind == "prismatic" else "hinge",
+        pos=numbers(back[:3, 3]),
+        axis=numbers(back[:3, :3] @ spring.axis),
+        stiffness=repr(stiffness),
+        damping=repr(SETTLING * stiffness),
+        armature=_armature(stiffness),
+    )
+
+
+def _armature(stiffness: float) -> str:
+    return repr(max(ARMATURE, ARMATURE_PER_STIFFNESS * stiffness))
+
+
+def _motor(
+    body: ET.Element, actuators: ET.Element, pieces: ExportNumbers, i: int, compliance: float
+) -> None:
+    joint = pieces.chain.joints[i]
+    name = f"joint{i + 1}"
+    kp = 1.0 / compliance if compliance > 0 else RIGID
+    ET.SubElement(
+        body,
+        "joint",
+        name=name,
+        type="slide" if joint.kind == "prismatic" else "hinge",
+        axis=numbers(joint.axis),
+        armature=_armature(kp),
+    )
+    drive = {"name": name, "joint": name, "kp": repr(kp), "kv": repr(SETTLING * kp)}
+    # Limits are stated for what is commanded; the joint itself may yield past them.
+    if math.isfinite(joint.lower) and math.isfinite(joint.upper):
+        drive |= {"ctrllimited": "true", "ctrlrange": numbers([joint.lower, joint.upper])}
+    ET.SubElement(actuators, "position", drive)
+
+
+def _draw(body: ET.Element, T: Array) -> None:
+    """A line to the next frame, to be seen only: it weighs nothing and touches nothing."""
+    if np.linalg.norm(T[:3, 3]) < SHORTEST:
+        return
+    ends = numbers([0, 0, 0, *T[:3, 3]])
+    ET.SubElement(
+        body, "geom", type="capsule", fromto=ends, size="0.02", mass="0", contype="0",
+        conaffinity="0", group="2",
+    )  # fmt: skip
+
+
+def _sites(flange: ET.Element, pieces: ExportNumbers) -> None:
+    load = np.eye(4)
+    load[:3, 3] = pieces.load_point
+    placed = {f"marker_{name}": T for name, T in pieces.markers.items()}
+    for name, T in {"flange": np.eye(4), "load_point": load, **placed}.items():
+        ET.SubElement(flange, "site", placed_body(name, T))
+
+
+def _load(actuators: ET.Element, scale: float) -> None:
+    """Forces in N along the tracker's axes, which keep their direction while the arm moves."""
+    for k, axis in enumerate("xyz"):
+        gear = np.zeros(6)
+        gear[k] = scale
+        ET.SubElement(
+            actuators, "motor", name=f"load_{axis}", site="load_point", refsite="tracker_axes",
+            gear=numbers(gear),
+        )  # fmt: skip
+
+
+def _anchor(body: ET.Element, T: Array, axis: Array, values: dict[str, float]) -> None:
+    """Where the compensator's spring hangs on the link before the joint: opposite (a_x, a_y)."""
+    x, y = transverse_axes(axis)
+    point = -values["compensator_anchor_x"] * x - values["compensator_anchor_y"] * y
+    place = T[:3, :3] @ point + T[:3, 3]
+    ET.SubElement(body, "site", name="compensator_anchor", pos=numbers(place))
+
+
+def _arm_end(body: ET.Element, axis: Array, offset: Array, values: dict[str, float]) -> None:
+    # The offset turns the frame about the axis before the joint moves, and the model's angle
+    # counts it; so the arm's end stands at angle zero of the joint's own, offset frame.
+    x, _ = transverse_axes(axis)
+    place = values["compensator_arm"] * x
+    ET.SubElement(body, "site", name="compensator_arm", pos=numbers(place))
+
+
+def _tendon(root: ET.Element, values: dict[str, float]) -> None:
+    tendon = ET.SubElement(root, "tendon")
+    spring = ET.SubElement(
+        tendon, "spatial", name="compensator",
+        stiffness=repr(values["compensator_stiffness"]),
+        springlength=repr(values["compensator_free_length"]),
+    )  # fmt: skip
+    for site in ("compensator_anchor", "compensator_arm"):
+        ET.SubElement(spring, "site", site=site)
+
+
+# Where MuJoCo's arm of an exported MJCF comes to rest: the check that the file says the same.
+#
+# At rest the generalised force r(x) = passive + actuator − bias of all joints x is zero.  Newton's
+# method on C r, C the compliances, so that soft and stiff joints are found alike.
+
+MAX_STEPS = 30
+TOLERANCE = 1e-12  # last step, rad or m
+DIFFERENCE_STEP = 1e-6  # rad or m
+
+
+class MujocoRest:
+    """An exported MJCF in MuJoCo.  Raises InputError where MuJoCo is missing or refuses it."""
+
+    def __init__(self, mjcf: str) -> None:
+        try:
+            import mujoco
+        except ImportError:
+            raise InputError(
+                "the check needs MuJoCo, which is not installed; run: pip install elastocal[mujoco]"
+            ) from None
+        self._mujoco = mujoco
+        try:
+            self.model = mujoco.MjModel.from_xml_string(mjcf)
+        except ValueError as error:
+            raise InputError(f"MuJoCo refuses the exported MJCF: {error}") from None
+        self._data = mujoco.MjData(self.model)
+        self._drives = [k for k in range(self.model.nu) if self._is_drive(k)]
+        self._driven = [
+            int(self.model.jnt_dofadr[self.model.actuator_trnid[k, 0]]) for k in self._drives
+        ]
+        stiffness = np.array(self.model.jnt_stiffness, dtype=float).reshape(self.model.nv, -1)[:, 0]
+        stiffness[self._driven] = self.model.actuator_gainprm[self._drives, 0]
+        self._compliance = 1.0 / stiffness
+
+    def _is_drive(self, k: int) -> bool:
+        return bool(self.model.actuator_trntype[k] == self._mujoco.mjtTrn.mjTRN_JOINT)
+
+    def settle(self, q: Array, force: Array) -> Any:
+        """MuJoCo's data (frames, sites) at rest, commanded to q (n,) under `force` (3,) N.
+
+        Raises ElastocalError where no rest is found.
+        """
+        control = np.zeros(self.model.nu)
+        control[self._drives] = q
+        for axis, value in zip("xyz", force, strict=True):
+            control[self.model.actuator(f"load_{axis}").id] = value
+        self._data.ctrl[:] = control
+        x = np.zeros(self.model.nv)
+        x[self._driven] = q
+        for _ in range(MAX_STEPS):
+            r = self._residual(x)
+            slope = np.column_stack([self._slope(x, j) for j in range(len(x))])
+            step = np.linalg.solve(slope, r)
+            x = x - step
+            if not np.isfinite(x).all():
+                break
+            if np.max(np.abs(step)) < TOLERANCE:
+                self._residual(x)
+                return self._data
+        raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")
+
+    def sites(self, q: Array, force: Array, names: Sequence[str]) -> Array:
+        """Positions (len(names), 3) in m in the MJCF's world, at rest."""
+        data = self.settle(q, force)
+        return np.array([data.site(name).xpos.copy() for name in names])
+
+    def _residual(self, x: Array) -> Array:
+        data = self._data
+        data.qpos[:] = x
+        data.qvel[:] = 0.0
+        self._mujoco.mj_fwdPosition(self.model, data)
+        self._mujoco.mj_fwdVelocity(self.model, data)
+        self._mujoco.mj_fwdActuation(self.model, data)
+        force = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
+        return np.asarray(self._compliance * force)
+
+    def _slope(self, x: Array, j: int) -> Array:
+        h = np.zeros(len(x))
+        h[j] = DIFFERENCE_STEP
+        return (self._residual(x + h) - self._residual(x - h)) / (2 * DIFFERENCE_STEP)

@@ -1,0 +1,698 @@
+"""Fits under constraints and with a prior, linear and nonlinear: minimum, conflicts, columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
+from scipy.optimize import linprog
+
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
+from elastocal.identification.constrained_solver import (
+    Active,
+    Affine,
+    ConicPoint,
+    ConstrainedObjective,
+    Kkt,
+    LossName,
+    ResidualLoss,
+    active_at,
+    active_from_duals,
+    bounded_least_squares,
+    equality_space,
+    extremes,
+    kkt,
+    least_excess,
+    loss_of,
+    polished,
+    solve_conic,
+    tangent_rows,
+)
+from elastocal.identification.identifiability import WORTH_A_COLUMN
+from elastocal.identification.knowledge import (
+    ROUND_OFF,
+    Bounds,
+    Constraints,
+    Entry,
+    GaussianPrior,
+    LinearEquality,
+    Matrix,
+    SemidefiniteMatrix,
+    System,
+    combination,
+    share_of_prior,
+)
+from elastocal.identification.least_squares import FitProblem
+from elastocal.identification.solve import Solution
+from elastocal.model.manipulator import Regression
+from elastocal.text import listed, quoted
+from elastocal.units import Array, IntArray
+
+# Which constraints contradict each other, and how far the constraints let a parameter go.
+
+MATTERS = 1e-6  # of the largest multiplier
+
+
+def raise_conflict(system: System) -> NoReturn:
+    """Raise InputError that names the constraints which no x satisfies together.
+
+    Every constraint is relaxed by one t, in the units of `system`, and t made as small as can be.
+    The constraints with a multiplier are a proof of the contradiction (Farkas); the others could
+    be dropped and it would remain.
+    """
+    found = least_excess(system) if system.matrices else _linear_excess(system)
+    largest = max(found.values(), default=0.0)
+    guilty = [f"'{k}'" for k, v in found.items() if v > MATTERS * largest] or [
+        f"'{label}'" for label in found
+    ]
+    raise InputError(
+        f"the constraints contradict each other: no values satisfy {listed(guilty)} together; "
+        "relax or drop one of them"
+    )
+
+
+def _linear_excess(system: System) -> dict[str, float]:
+    """Multipliers by label of min t for bounds and equalities, by linear programming."""
+    p = len(system.names)
+    norms = np.linalg.norm(system.A, axis=1)
+    norms = np.where(norms > 0, norms, 1.0)
+    A, b = system.A / norms[:, None], system.b / norms
+    below, above = np.isfinite(system.lower), np.isfinite(system.upper)
+    rows = np.vstack([A, -A, -np.eye(p)[below], np.eye(p)[above]])
+    rhs = np.concatenate([b, -b, -system.lower[below], system.upper[above]])
+    cost = np.append(np.zeros(p), 1.0)
+    relaxed = np.column_stack([rows, -np.ones(len(rows))])
+    solved = linprog(cost, relaxed, rhs, bounds=[(None, None)] * p + [(0, None)], method="highs")
+    price = np.abs(solved.ineqlin.marginals)
+    k = len(b)
+    named = dict(zip(system.equality_labels, price[:k] + price[k : 2 * k], strict=True))
+    names = np.array(system.names)
+    lower, upper = price[2 * k : 2 * k + below.sum()], price[2 * k + below.sum() :]
+    named |= {f"the lower bound of {n}": v for n, v in zip(names[below], lower, strict=True)}
+    named |= {f"the upper bound of {n}": v for n, v in zip(names[above], upper, strict=True)}
+    return {label: float(value) for label, value in named.items()}
+
+
+def extent(system: System, index: int) -> tuple[float, float]:
+    """Smallest and largest value of x[index] among all x that satisfy the constraints."""
+    if system.matrices:
+        return extremes(system, index)
+    cost = np.eye(len(system.names))[index]
+    bounds = np.column_stack([system.lower, system.upper])
+    ends = []
+    for sign in (1.0, -1.0):
+        solved = linprog(
+            sign * cost,
+            A_eq=system.A if len(system.b) else None,
+            b_eq=system.b if len(system.b) else None,
+            bounds=bounds,
+            method="highs",
+        )
+        ends.append(sign * float(solved.fun) if solved.status == 0 else -sign * np.inf)
+    return ends[0], ends[1]
+
+
+# The minimum of an objective under constraints: scaled, solved, polished, named.
+
+CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
+CERTIFIED = 1e-6  # KKT residual above which the point is no minimum
+FAR_OFF, MAX_RESCALINGS = 10.0, 3  # solve anew where x is that much longer than supposed
+UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
+
+
+@dataclass(frozen=True)
+class ActiveConstraint:
+    """A constraint that holds with equality at the solution.
+
+    `value` is the bound or the equality's right-hand side (0 for a matrix), in the parameter's
+    unit; `multiplier` the shadow price ∂(minimum of the objective)/∂value: ≥ 0 at a lower bound,
+    ≤ 0 at an upper one; for a matrix tr Z, the price of M ⪰ t·I per unit of t.
+    """
+
+    label: str
+    kind: Literal["lower", "upper", "equality", "semidefinite"]
+    names: tuple[str, ...]
+    value: float
+    multiplier: float
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Minimiser x (p,), the objective there, active constraints, cofactor (p, p), KKT residual.
+
+    `cofactor` is the inverse of half the objective's Hessian within the active face, zero across
+    it: (BᵀB + PᵀP)⁻¹ for squares and no active constraint.
+    """
+
+    x: Array
+    objective: float
+    active: tuple[ActiveConstraint, ...]
+    cofactor: Array
+    kkt: float
+
+
+def minimise(objective: ConstrainedObjective, system: System) -> Minimum:
+    """Minimise the objective over the system's x; raises as `solve_constrained` does."""
+    # Columns of unit length: x is then in units of the standard deviation a parameter would have
+    # alone, whatever its physical unit, and so are slacks and tolerances.
+    unit = 1 / objective.norms
+    zero = np.zeros(len(unit))
+    scaled, limits = objective.moved(zero, unit), system.moved(zero, unit)
+    space = equality_space(limits.A, limits.b)
+    if space.gap > CONTRADICTION * max(1.0, float(np.max(np.abs(space.origin)))):
+        raise_conflict(limits)
+    centre, R = _least_squares(scaled, space, system.names)
+    data = float(np.linalg.norm(scaled.y) + np.linalg.norm(scaled.target))
+    # About the unconstrained minimum numbers are as small as the constraints allow.
+    scaled, limits = scaled.moved(centre, zero + 1), limits.moved(centre, zero + 1)
+    start, active = _constrained_start(scaled, limits, space.basis, R)
+    z, active, at = polished(scaled, limits, active, start, data)
+    if not at.residual <= CERTIFIED:
+        raise ElastocalError(
+            f"no certified minimum: the KKT residual is {at.residual:.1e}; state values that the "
+            "constraints pin from two sides as equalities, and check the units of the bounds"
+        )
+    x = unit * (centre + z)
+    x[active.lower], x[active.upper] = system.lower[active.lower], system.upper[active.upper]
+    return Minimum(
+        x,
+        objective.value(x),
+        _named(system, limits, active, at, z, unit),
+        _cofactor(scaled, limits, active, z) * np.outer(unit, unit),
+        at.residual,
+    )
+
+
+def _least_squares(
+    objective: ConstrainedObjective, space: Affine, names: tuple[str, ...]
+) -> tuple[Array, Array]:
+    """Least-squares x (p,) in the space, and R (q, q) with RᵀR = basisᵀ(BᵀB + PᵀP) basis."""
+    J = np.vstack([objective.B, objective.P])
+    t = np.concatenate([objective.y, objective.target]) - J @ space.origin
+    if not space.basis.shape[1]:
+        return space.origin, np.zeros((0, 0))
+    Q, R = linalg.qr(J @ space.basis, mode="economic")
+    singular, right = linalg.svd(R)[1:]
+    tiny = UNDETERMINED * float(np.max(singular, initial=0.0))
+    loose = right[int((singular > tiny).sum()) :]
+    if len(loose):
+        moved = np.abs(loose @ space.basis.T).max(axis=0)
+        free = [n for n, m in zip(names, moved, strict=True) if m > 1e-3 * moved.max()]
+        raise InsufficientDataError(
+            f"data, prior and equalities do not determine {listed(free)}: values can change "
+            "together without moving a reading; hold some of them, or state a prior"
+        )
+    return space.origin + space.basis @ linalg.solve_triangular(R, Q.T @ t), R
+
+
+def _constrained_start(
+    objective: ConstrainedObjective, system: System, basis: Array, R: Array
+) -> tuple[Array, Active]:
+    """A minimum to a solver's accuracy, and its active constraints; 0 is the free minimum."""
+    none = np.zeros(len(system.names), dtype=bool)
+    no_nulls = tuple(np.zeros((len(m.balance), 0)) for m in system.matrices)
+    found = bounded_least_squares(R, basis, system.lower, system.upper)
+    if found is None:
+        raise_conflict(system)
+    x, at_lower, at_upper = found
+    # Where no reading is beyond Huber's threshold, his loss is squares.
+    longest = np.max(objective.loss.lengths(objective.y - objective.B @ x), initial=0.0)
+    if longest <= objective.loss.threshold and all(_semidefinite(m, x) for m in system.matrices):
+        return x, Active(at_lower, at_upper, no_nulls)
+    size = system.distance(none.astype(float))
+    if not objective.loss.quadratic:
+        size = max(size, objective.loss.threshold)
+    point = _conic_point(objective, system, basis, size)
+    for _ in range(MAX_RESCALINGS):
+        length = float(np.linalg.norm(point.x))
+        if length <= FAR_OFF * size:
+            break
+        size = length
+        point = _conic_point(objective, system, basis, size)
+    return point.x, active_from_duals(system, point.x, point.lower, point.upper, point.matrices)
+
+
+def _semidefinite(matrix: Matrix, x: Array) -> bool:
+    values = np.linalg.eigvalsh(matrix.at(x))
+    return bool(values[0] >= -ROUND_OFF * max(np.abs(values).max(), 0.0))
+
+
+def _conic_point(
+    objective: ConstrainedObjective, system: System, basis: Array, size: float
+) -> ConicPoint:
+    point = solve_conic(objective, system, basis, size)
+    if point is None:
+        raise_conflict(system)
+    return point
+
+
+def _cofactor(objective: ConstrainedObjective, system: System, active: Active, x: Array) -> Array:
+    basis = equality_space(*tangent_rows(system, active, x)).basis
+    R = linalg.qr(objective.root(x) @ basis, mode="r")[0][: basis.shape[1]]
+    try:
+        half = linalg.solve_triangular(R, basis.T, trans="T") if R.size else np.zeros((0, len(x)))
+    except (linalg.LinAlgError, ValueError):
+        raise InputError(
+            "Huber's loss sees too few readings within its threshold to curve in every "
+            "direction: check sigma, which should be the noise of a whitened row"
+        ) from None
+    return half.T @ half
+
+
+def _named(
+    system: System, scaled: System, active: Active, at: Kkt, z: Array, unit: Array
+) -> tuple[ActiveConstraint, ...]:
+    """Equalities, then bounds, then matrices on which z lies, prices in the units of x."""
+    touched = active_at(scaled, z)
+    found = []
+    for row, label, b, price in zip(
+        system.A, system.equality_labels, system.b, at.equalities, strict=True
+    ):
+        names = tuple(system.names[i] for i in np.flatnonzero(row))
+        found.append(ActiveConstraint(label, "equality", names, float(b), 2 * float(price)))
+    sides = (
+        ("lower", ">=", active.lower | touched.lower, system.lower),
+        ("upper", "<=", active.upper | touched.upper, system.upper),
+    )
+    for kind, sign, chosen, bound in sides:
+        for i in np.flatnonzero(chosen):
+            name, value = system.names[i], float(bound[i])
+            price = 2 * float(at.bounds[i] / unit[i]) if getattr(active, kind)[i] else 0.0
+            label = f"{name} {sign} {value:.6g}"
+            found.append(ActiveConstraint(label, kind, (name,), value, price))  # type: ignore[arg-type]
+    for matrix, N, Z in zip(scaled.matrices, touched.nulls, at.matrices, strict=True):
+        if N.shape[1]:
+            names = tuple(n for n, s in zip(system.names, matrix.slopes, strict=True) if s.any())
+            price = 2 * float(matrix.balance**2 @ np.diag(Z))
+            found.append(ActiveConstraint(matrix.label, "semidefinite", names, 0.0, price))
+    return tuple(found)
+
+
+# Constrained and regularised linear least squares.
+
+
+@dataclass(frozen=True)
+class ConstrainedSolution:
+    """Estimates x (p,) of the parameters `names`, residual y − B x (rows,), and their optimality.
+
+    `objective` is Σ loss + prior, `rss` the residual's sum of squares.  `cofactor` (p, p) times
+    the variance of a whitened row is the (posterior) covariance with the active constraints taken
+    as equalities; for Huber's loss it is the inverse of half the Hessian, no covariance.
+    `prior_share` (p,) says what share of each estimate's information is the prior's (0 without
+    prior, NaN where constraints fix the value).  `kkt` is the relative KKT residual, about 1e-12
+    at a minimum.
+    """
+
+    names: tuple[str, ...]
+    x: Array
+    residual: Array
+    objective: float
+    rss: float
+    active: tuple[ActiveConstraint, ...]
+    cofactor: Array
+    prior_share: Array
+    kkt: float
+
+    @property
+    def mostly_prior(self) -> tuple[str, ...]:
+        """Parameters that owe more than half of their information to the prior."""
+        share = np.nan_to_num(self.prior_share)
+        return tuple(n for n, s in zip(self.names, share, strict=True) if s > 0.5)
+
+
+def solve_constrained(
+    B: ArrayLike,
+    y: ArrayLike,
+    names: Sequence[str],
+    constraints: Constraints | None = None,
+    *,
+    prior: GaussianPrior | None = None,
+    loss: LossName = "squares",
+    size: int = 1,
+    sigma: float = 1.0,
+) -> ConstrainedSolution:
+    """Minimise Σ ρ(y − B x) + σ² (x − m)ᵀ C⁻¹ (x − m) subject to the constraints.
+
+    B (rows, p) and y (rows,) are whitened with rows of standard deviation `sigma`; `names` (p,)
+    are the columns; m and C come from the prior (maximum a posteriori).  "squares" is ρ = |r|²;
+    "huber" is Huber's loss of the length of each observation of `size` rows, with the threshold
+    of 95 % efficiency.
+
+    Squares under bounds and equalities are solved by Lawson and Hanson's LDP; matrices and
+    Huber's loss by an interior-point method (Clarabel); both end with Newton steps on the active
+    face, so that the result is good to rounding and not to a solver's tolerance.
+
+    Raises InputError where names are unknown, numbers not finite, constraints contradict each
+    other (and names those), or Clarabel is needed and missing; InsufficientDataError where data,
+    prior and equalities leave a direction undetermined.
+    """
+    objective = objective_of(B, y, names, prior, loss, size, sigma)
+    found = minimise(objective, (constraints or Constraints()).resolve(names))
+    residual = objective.y - objective.B @ found.x
+    return ConstrainedSolution(
+        tuple(names),
+        found.x,
+        residual,
+        found.objective,
+        float(residual @ residual),
+        found.active,
+        found.cofactor,
+        share_of_prior(found.cofactor, objective.P),
+        found.kkt,
+    )
+
+
+def objective_of(
+    B: ArrayLike,
+    y: ArrayLike,
+    names: Sequence[str],
+    prior: GaussianPrior | None,
+    loss: LossName,
+    size: int,
+    sigma: float,
+) -> ConstrainedObjective:
+    """The checked objective of `solve_constrained`."""
+    B, y = np.asarray(B, dtype=float), np.asarray(y, dtype=float)
+    p = len(names)
+    require(
+        B.ndim == 2 and B.shape[1] == p and y.shape == B.shape[:1],
+        f"B must be (rows, {p}) for {p} names and y (rows,); found {B.shape} and {y.shape}",
+    )
+    require(len(set(names)) == p and p > 0, "the names of the columns must differ, at least one")
+    require(bool(np.isfinite(B).all() and np.isfinite(y).all()), "B and y must be finite")
+    require(bool(np.isfinite(sigma) and sigma > 0), f"sigma must be positive, found {sigma}")
+    rho = loss_of(loss, size, sigma)
+    require(len(y) % size == 0, f"{len(y)} rows are no multiple of {size} per observation")
+    P, target = (np.zeros((0, p)), np.zeros(0)) if prior is None else prior.rows(names)
+    return ConstrainedObjective(B, y, sigma * P, sigma * target, rho)
+
+
+# Constrained fit of the nonlinear model: sequential convex programming on the exact B.
+
+# Predicted fall of the objective, relative to it, below which the step is the last one.
+TOLERANCE = 1e-12
+FIRST_RADIUS, LEAST_RADIUS = 10.0, 1e-12  # in typical sizes of the parameters
+POOR, GOOD = 0.25, 0.75  # actual over predicted fall (Conn, Gould and Toint 2000, section 6.1)
+
+
+@dataclass(frozen=True)
+class ConstrainedFit:
+    """Values x (parameters,), raw and whitened residual (rows,), B (rows, columns), raw.
+
+    `columns` are the fitted parameters; `cofactor` (columns, columns) and `prior_share`
+    (columns,) as in `ConstrainedSolution`, on the model linearised at x; multipliers of `active`
+    are in units of the objective per unit of the constraint.  `kkt` is the relative KKT residual
+    of the nonlinear problem at x.
+    """
+
+    x: Array
+    residual: Array
+    whitened: Array
+    B: Array
+    columns: NDArray[np.int64]
+    names: tuple[str, ...]
+    objective: float
+    active: tuple[ActiveConstraint, ...]
+    cofactor: Array
+    prior_share: Array
+    kkt: float
+    converged: bool
+    reason: str
+    steps: int
+
+
+def constrained_fit(
+    problem: FitProblem,
+    constraints: Constraints | None = None,
+    *,
+    prior: GaussianPrior | None = None,
+    loss: LossName = "squares",
+    sigma: float = 1.0,
+    max_steps: int = 60,
+) -> ConstrainedFit:
+    """Minimise Σ ρ(W (y − h(X))) + σ² (X − m)ᵀ C⁻¹ (X − m) over X[columns] under constraints.
+
+    Each step minimises the objective of the linearised model under the constraints, which are
+    convex and kept as they are, inside a box around X (trust region); it is taken where the true
+    objective falls too.  Every iterate satisfies the constraints; at the limit no step improves
+    the linearised model, which is the KKT condition of the nonlinear problem.  `sigma` is the
+    standard deviation of a whitened row; Huber's loss is of each reading's length.  The problem's
+    `bounded` and `tie` hold as in `fit`.
+
+    Raises InputError as `solve_constrained` does, and where a held parameter alone breaks a
+    constraint; ElastocalError where the start has poses without equilibrium.
+    """
+    columns = np.asarray(problem.columns, dtype=np.int64)
+    names = tuple(problem.model.names[c] for c in columns)
+    system = fit_system(problem, constraints or Constraints())
+    P, target = _prior_rows(problem, columns, prior, sigma)
+    nonlinear = _Nonlinear(
+        problem, columns, P, target, loss_of(loss, problem.observations.size, sigma)
+    )
+    size, zero = problem.sizes[columns], np.zeros(len(columns))
+    x = nonlinear.moved(problem.x, _nearest(zero, size, system.moved(problem.x[columns], zero + 1)))
+    at, objective = nonlinear.linearised(x)
+    value, radius = objective.value(zero), FIRST_RADIUS
+    reason, converged, steps = "the step limit was reached; the start may be far off", False, 0
+    while steps < max_steps and not converged:
+        steps += 1
+        found = minimise(objective, system.moved(x[columns], zero + 1).boxed(radius * size))
+        length = float(np.max(np.abs(found.x) / size))
+        trial = nonlinear.moved(x, found.x)
+        reached, fall = nonlinear.value(trial), value - found.objective
+        converged = fall <= TOLERANCE * value or length <= LEAST_RADIUS
+        if converged:
+            reason = "no step within the constraints improves the fit"
+        gained = value - reached if np.isfinite(reached) else -np.inf
+        if gained < POOR * fall:
+            radius = POOR * length
+        elif gained > GOOD * fall:
+            radius = max(radius, 3 * length)
+        # The last step cannot be judged by a fall that drowns in round-off.
+        if gained > 0 or (converged and gained >= -TOLERANCE * value):
+            x = trial
+            at, objective = nonlinear.linearised(x)
+            value = objective.value(zero)
+    limits = system.moved(x[columns], zero + 1)
+    final = minimise(objective, limits)
+    return ConstrainedFit(
+        x, at.residual, objective.y, at.B, columns, names, value, _in_place(final, system),
+        final.cofactor, share_of_prior(final.cofactor, P), _kkt(objective, limits), converged,
+        reason, steps,
+    )  # fmt: skip
+
+
+def fit_system(problem: FitProblem, constraints: Constraints) -> System:
+    """The constraints on the problem's columns, with the effects' own bounds where `bounded`."""
+    columns = np.asarray(problem.columns, dtype=np.int64)
+    own = [problem.model.parameters[c] for c in columns] if problem.bounded else []
+    stated = constraints + Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in own))
+    return stated.resolve(problem.model.names).restricted(columns, problem.x)
+
+
+@dataclass(frozen=True)
+class _Nonlinear:
+    """The objective as a function of all parameters, and its linearisation in a step."""
+
+    problem: FitProblem
+    columns: NDArray[np.int64]
+    P: Array
+    target: Array
+    loss: ResidualLoss
+
+    def moved(self, x: Array, step: Array) -> Array:
+        """x (parameters,) with `step` (columns,) added."""
+        trial = x.astype(float)
+        trial[self.columns] += step
+        return trial
+
+    def linearised(self, x: Array) -> tuple[Regression, ConstrainedObjective]:
+        observed, apply = self.problem.observations, self.problem.weights.apply
+        at = self.problem.model.regressor(observed.table, x, self.columns, observed)
+        lack = self.target - self.P @ x[self.columns]
+        return at, ConstrainedObjective(apply(at.B), apply(at.residual), self.P, lack, self.loss)
+
+    def value(self, x: Array) -> float:
+        """The objective at x; NaN where a pose has no equilibrium."""
+        observed = self.problem.observations
+        misfit = observed.value - self.problem.model.predict(observed.table, x, observed)
+        lack = self.target - self.P @ x[self.columns]
+        return self.loss.value(self.problem.weights.apply(misfit)) + float(lack @ lack)
+
+
+def _prior_rows(
+    problem: FitProblem, columns: NDArray[np.int64], prior: GaussianPrior | None, sigma: float
+) -> tuple[Array, Array]:
+    """P (k, columns) and target (k,) of the prior, given the held parameters, and of the tie."""
+    P, target = np.zeros((0, len(columns))), np.zeros(0)
+    if prior is not None:
+        P, target = prior.rows(problem.model.names)
+        held = np.setdiff1d(np.arange(len(problem.x)), columns)
+        target = sigma * (target - P[:, held] @ problem.x[held])
+        P = sigma * P[:, columns]
+    if problem.tie is not None:
+        centre = (problem.x if problem.centre is None else problem.centre)[columns]
+        P = np.vstack([P, np.diag(1 / problem.tie)])
+        target = np.concatenate([target, centre / problem.tie])
+    return P, target
+
+
+def _nearest(x: Array, size: Array, system: System) -> Array:
+    """The point nearest to x, in typical sizes, that satisfies the constraints."""
+    none = np.zeros((0, len(x)))
+    return minimise(
+        ConstrainedObjective(np.diag(1 / size), x / size, none, none[:, 0], ResidualLoss()), system
+    ).x
+
+
+def _in_place(found: Minimum, system: System) -> tuple[ActiveConstraint, ...]:
+    """Active constraints of a step, told as constraints on the parameters."""
+    lower, upper = (
+        dict(zip(system.names, side, strict=True)) for side in (system.lower, system.upper)
+    )
+    equalities = dict(zip(system.equality_labels, system.b, strict=True))
+    told = []
+    for a in found.active:
+        if a.kind == "equality":
+            told.append(replace(a, value=float(equalities[a.label])))
+        elif a.kind == "semidefinite":
+            told.append(a)
+        else:
+            value = float((lower if a.kind == "lower" else upper)[a.names[0]])
+            sign = ">=" if a.kind == "lower" else "<="
+            told.append(replace(a, value=value, label=f"{a.names[0]} {sign} {value:.6g}"))
+    return tuple(told)
+
+
+def _kkt(objective: ConstrainedObjective, limits: System) -> float:
+    """KKT residual at the linearisation point itself."""
+    zero, unit = np.zeros(len(limits.names)), 1 / objective.norms
+    scaled, inside = objective.moved(zero, unit), limits.moved(zero, unit)
+    return kkt(scaled, inside, active_at(inside, zero), zero).residual
+
+
+# Which parameters a fit with constraints and a prior has, and its constraints on these alone.
+
+# Share of a column that others must leave over: B is exact to 1e-15, but a base that is tilted by
+# some µrad already tells its turn from that of joint 1.
+TOLD_APART = 1e-6
+
+
+def fitted_columns(
+    solution: Solution, std: Array, constraints: Constraints, prior: GaussianPrior | None
+) -> IntArray:
+    """Indices of the parameters to fit under the constraints and the prior, ascending.
+
+    These are the kept parameters of the solution (and those that bounds held); the free ones that
+    the prior or an equality names, for that is knowledge of themselves; and, of the parameters
+    that are known only together with one of these, as many as can now be told apart from it: with
+    a prior on k, readings of k + d are knowledge of d.  Told apart is what readings, prior and
+    equalities determine better than its typical size, as in the choice of the kept parameters.
+    Bounds and matrices make nothing known: they act on the fitted parameters, with all others
+    held where the fit held them.
+
+    `std` (kept,) is that of the solution's estimates.  Raises InputError for a name that is no
+    parameter, or a prior on a parameter that is held fixed; InsufficientDataError where an
+    equality names a parameter that stays undetermined.
+    """
+    problem, reduction = solution.problem, solution.reduction
+    names, free = problem.model.names, set(problem.free.tolist())
+    constraints.resolve(names)
+    tied = {name for e in constraints.equalities for name, factor in e.terms.items() if factor}
+    priors = set() if prior is None else set(prior.names)
+    if prior is not None:
+        prior.rows(names)
+    fixed = [quoted(n) for n in sorted(priors) if names.index(n) not in free]
+    require(
+        not fixed,
+        f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
+    )
+    named = {names.index(n) for n in tied | priors} & free
+    columns = {*reduction.kept.tolist(), *reduction.at_bound.tolist(), *named}
+
+    def told_apart(c: int) -> bool:
+        return _told_apart(solution, [*sorted(columns - {c}), c], constraints, prior)
+
+    new = {names.index(n) for n in tied - priors} & free - set(reduction.kept.tolist())
+    unknown = [quoted(names[c]) for c in sorted(new) if not told_apart(c)]
+    if unknown:
+        raise InsufficientDataError(
+            f"readings, prior and equalities do not determine {listed(unknown)}, which an equality "
+            f"names; hold it ({option('fixed')}) or state a prior for it, or drop the equality"
+        )
+    partners: dict[int, None] = {}
+    for k, c in enumerate(reduction.kept.tolist()):
+        if c in named:
+            partners |= dict.fromkeys(reduction.terms(k, solution.sizes, std[k]))
+    for d in partners:
+        if d not in columns and told_apart(d):
+            columns.add(d)
+    return np.array(sorted(columns), dtype=np.int64)
+
+
+def _told_apart(
+    solution: Solution, columns: list[int], constraints: Constraints, prior: GaussianPrior | None
+) -> bool:
+    """Whether readings, prior and equalities tell the last of the columns from the others."""
+    problem, observed, e = solution.problem, solution.problem.observations, solution.fit.whitened
+    chosen = np.array(columns)
+    size, names = solution.sizes[chosen], problem.model.names
+    at = problem.model.regressor(observed.table, solution.fit.x, chosen, observed)
+    sigma = max(float(np.sqrt(e @ e / len(e))), 1e-12)
+    J = problem.weights.apply(at.B) * size / sigma
+    if prior is not None:
+        J = np.vstack([J, prior.rows(names)[0][:, chosen] * size])
+    A = constraints.resolve(names).A[:, chosen] * size
+    A = A[A.any(axis=1)]
+    # An equality is exact: it counts as much as the most that anything else tells.
+    A *= np.linalg.norm(J, axis=0).max() / np.linalg.norm(A, axis=1)[:, None]
+    J = np.vstack([J, A])
+    lengths = np.linalg.norm(J, axis=0)
+    J = J / np.where(lengths > 0, lengths, 1.0)
+    left = J[:, -1] - J[:, :-1] @ np.linalg.lstsq(J[:, :-1], J[:, -1], rcond=None)[0]
+    off = float(np.linalg.norm(left))
+    return off > TOLD_APART and off * lengths[-1] > WORTH_A_COLUMN
+
+
+def own_bounds(solution: Solution) -> Constraints:
+    """The bounds that the effects of a bounded problem state themselves."""
+    if not solution.problem.bounded:
+        return Constraints()
+    parameters = solution.problem.model.parameters
+    return Constraints(
+        tuple(
+            Bounds(p.name, p.lower, p.upper)
+            for p in parameters
+            if np.isfinite(p.lower) or np.isfinite(p.upper)
+        )
+    )
+
+
+def on_columns(stated: Constraints, held: Mapping[str, float]) -> Constraints:
+    """The constraints on the other parameters where those in `held` have these values.
+
+    A constraint on held parameters alone is left out; `constrained_fit` has checked that it holds.
+    """
+    equalities = []
+    for e in stated.equalities:
+        terms = {n: c for n, c in e.terms.items() if n not in held}
+        if any(terms.values()):
+            value = e.value - sum(c * held[n] for n, c in e.terms.items() if n in held)
+            equalities.append(LinearEquality(terms, value, str(e)))
+    matrices = []
+    for m in stated.matrices:
+        rows = tuple(tuple(_entry(entry, held) for entry in row) for row in m.entries)
+        if any(name for row in rows for entry in row for name in combination(entry)):
+            matrices.append(SemidefiniteMatrix(m.label, rows))
+    bounds = tuple(b for b in stated.bounds if b.name not in held)
+    return Constraints(bounds, tuple(equalities), tuple(matrices))
+
+
+def _entry(entry: Entry, held: Mapping[str, float]) -> Entry:
+    terms = combination(entry)
+    constant = terms.pop("", 0.0) + sum(c * held[n] for n, c in terms.items() if n in held)
+    return {n: c for n, c in terms.items() if n not in held} | {"": constant}

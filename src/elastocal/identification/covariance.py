@@ -1,0 +1,384 @@
+"""Covariances of a least-squares fit under different assumptions on the errors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg, stats
+
+from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.identification.linear_solver import checked_problem
+from elastocal.units import Array
+
+# An estimated covariance of a fit, and the t intervals that follow from it.
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance (p, p) of x̂ in the squared units of the parameters, with t degrees of freedom.
+
+    `dof` (p,) belongs to the variance of each parameter on its own: infinite where the variance
+    is known, 0 where the estimator cannot tell it (the interval is then unbounded).  The interval
+    of a combination Cx needs its own dof: pass B C⁻¹ to the estimator, whose result then refers
+    to Cx.
+    """
+
+    kind: str
+    matrix: Array
+    dof: Array
+    description: str
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (p,); infinite where `dof` is 0."""
+        return np.where(self.dof > 0, np.sqrt(np.diag(self.matrix)), np.inf)
+
+    def interval(self, x: Array, level: float = 0.95) -> Array:
+        """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,).
+
+        Raises InputError where x does not match or `level` is not between 0 and 1.
+        """
+        x = np.asarray(x, dtype=np.float64)
+        require(
+            x.shape == self.dof.shape,
+            f"the covariance is of {self.dof.size} parameters, but x has shape {x.shape}",
+        )
+        half = t_quantile(level, self.dof) * self.std
+        return np.column_stack([x - half, x + half])
+
+
+def t_quantile(level: float, dof: Array) -> Array:
+    """Two-sided quantile of t with `dof`, at any shape: P(|t| ≤ quantile) = level.
+
+    Infinite at dof 0.  Raises InputError unless 0 < level < 1.
+    """
+    require(0 < level < 1, f"level must lie between 0 and 1, for example 0.95; got {level}")
+    known = np.where(dof > 0, dof, 1.0)
+    return np.where(dof > 0, stats.t.ppf((1 + level) / 2, known), np.inf)
+
+
+# Orthogonal factors of B, in which every covariance estimator of this package works.
+
+EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True)
+class Orthogonal:
+    """Q (rows, p) with QᵀQ = I and V (p, p) with x̂ = V Qᵀy and V Vᵀ = (BᵀB)⁻¹.
+
+    Any sandwich (BᵀB)⁻¹ BᵀΩB (BᵀB)⁻¹ is V (QᵀΩQ) Vᵀ: BᵀB, whose condition is that of B squared,
+    is never formed.  Row j of V is the coefficient of parameter j on the columns of Q.
+    """
+
+    Q: Array
+    V: Array
+
+    def sandwich(self, meat: Array) -> Array:
+        """V · meat · Vᵀ (p, p), symmetric to the last bit, of QᵀΩQ (p, p)."""
+        matrix = self.V @ meat @ self.V.T
+        return (matrix + matrix.T) / 2
+
+
+def orthogonal(B: ArrayLike, y: ArrayLike) -> tuple[Orthogonal, Array]:
+    """Factors of the whitened B (rows, p), and y or e (rows,) as a checked float array.
+
+    Raises InputError where the arrays do not match, are not finite or the columns depend on each
+    other, InsufficientDataError where there are no more rows than parameters.
+    """
+    B, y, _, _ = checked_problem(B, y, None, None)
+    rows, p = B.shape
+    if rows <= p:
+        raise InsufficientDataError(
+            f"{rows} rows leave no residual of {p} parameters to estimate a variance from;"
+            " measure more configurations or fit fewer parameters"
+        )
+    lengths = np.linalg.norm(B, axis=0)
+    lengths[lengths == 0] = 1.0
+    Q, R, order = linalg.qr(B / lengths, mode="economic", pivoting=True)
+    pivots = np.abs(np.diag(R))
+    dependent = np.flatnonzero(pivots <= rows * EPS * pivots[0])
+    if dependent.size:
+        names = sorted(int(k) for k in order[dependent])
+        raise InputError(f"columns {names} of B depend on the others; drop them first")
+    V = np.empty((p, p))
+    V[order] = linalg.solve_triangular(R, np.eye(p)) / lengths[order, None]
+    return Orthogonal(Q, V), y
+
+
+# Satterthwaite degrees of freedom of variance estimates that are sums of squares.
+#
+# A sandwich estimate of var(x̂_j) is v_j = Σ_c (a_cᵀ e_c)², with e = (I − QQᵀ)u and one vector a_c
+# per cluster.  Under the working model u ~ N(0, σ²I) the numbers a_cᵀe_c have covariance
+# σ²Γ, Γ = diag(a_cᵀa_c) − b bᵀ with rows b_c = Q_cᵀa_c, and v_j has the mean σ² tr Γ and the
+# variance 2σ⁴ tr Γ².  A scaled χ² with the same two moments has
+#
+#     dof_j = (tr Γ)² / tr Γ²
+#
+# (Satterthwaite 1946; Bell & McCaffrey 2002; Pustejovsky & Tipton 2018).  With
+#
+#     tr Γ = Σ_c (a_cᵀa_c − |b_c|²),   tr Γ² = Σ_c [(a_cᵀa_c)² − 2 a_cᵀa_c |b_c|²] + ‖Σ_c b_c b_cᵀ‖²
+#
+# only p-dimensional quantities are summed over clusters; neither Γ nor I − QQᵀ is formed.
+
+
+class SatterthwaiteSums:
+    """The sums over clusters for all p parameters at once, added block by block."""
+
+    def __init__(self, p: int) -> None:
+        self._size, self._trace, self._square = np.zeros(p), np.zeros(p), np.zeros(p)
+        self._outer = np.zeros((p, p, p))
+
+    def add(self, aa: Array, b: Array) -> None:
+        """Add clusters: aa (clusters, p) with a_cᵀa_c, b (clusters, p of Q, p) with b_c."""
+        bb = np.sum(b * b, axis=1)
+        self._size += aa.sum(axis=0)
+        self._trace += (aa - bb).sum(axis=0)
+        self._square += (aa * (aa - 2 * bb)).sum(axis=0)
+        by_parameter = b.transpose(2, 1, 0)
+        self._outer += by_parameter @ by_parameter.transpose(0, 2, 1)
+
+    def dof(self) -> Array:
+        """Degrees of freedom (p,); 0 where the residual says nothing of the variance."""
+        square = self._square + np.sum(self._outer**2, axis=(1, 2))
+        told = (self._trace > 1e-9 * self._size) & (square > 0)
+        return np.where(told, self._trace**2 / np.where(told, square, 1.0), 0.0)
+
+
+# Covariance from independent rows: of common variance, or each of its own (HC0 to HC4).
+
+HCKind = Literal["HC0", "HC1", "HC2", "HC3", "HC4"]
+
+ALONE = 1e-9  # 1 − leverage below which a row is fitted exactly, whatever was read there
+ENTRIES = 2**22  # of a temporary array, 32 MB
+
+ROW_DESCRIPTION = {
+    "HC0": "each row its own variance, e² as it is (biased low in small samples)",
+    "HC1": "each row its own variance, e² · n/(n − p)",
+    "HC2": "each row its own variance, e²/(1 − h), unbiased under equal variances",
+    "HC3": "each row its own variance, e²/(1 − h)², nearly the jackknife",
+    "HC4": "each row its own variance, e²/(1 − h)^min(4, nh/p)",
+}
+
+
+def classical(B: ArrayLike, e: ArrayLike) -> Covariance:
+    """s² (BᵀB)⁻¹ with s² = eᵀe/(n − p) and n − p degrees of freedom.
+
+    B (n, p) and e (n,) whitened, e = y − B x̂ the least-squares residual.  Right where whitened
+    rows are independent with a common variance: Klimchik et al. 2013, eq. (7), and (13) with
+    weights known up to a factor.  Raises InputError and InsufficientDataError as `orthogonal`.
+    """
+    factors, e = orthogonal(B, e)
+    n, p = factors.Q.shape
+    matrix = factors.sandwich(np.eye(p) * float(e @ e) / (n - p))
+    text = "rows independent, of common variance"
+    return Covariance("classical", matrix, np.full(p, float(n - p)), text)
+
+
+def hc(B: ArrayLike, e: ArrayLike, kind: HCKind = "HC3") -> Covariance:
+    """Heteroscedasticity-consistent (BᵀB)⁻¹ Bᵀ diag(f_i² e_i²) B (BᵀB)⁻¹, rows independent.
+
+    With the leverage h_i = |Q_i|², B = QR, and f_i² = 1 (HC0; White 1980), n/(n − p) (HC1),
+    1/(1 − h_i) (HC2), 1/(1 − h_i)² (HC3; MacKinnon & White 1985) or (1 − h_i)^−min(4, n h_i/p)
+    (HC4; Cribari-Neto 2004).  Degrees of freedom: n − p for HC0 and HC1; for the others those of
+    Satterthwaite (Bell & McCaffrey 2002), as `cluster_robust` with every row a cluster.
+
+    B (n, p) and e (n,) whitened, e = y − B x̂.  Raises InsufficientDataError where HC2 to HC4
+    meet a row of leverage one: its residual is zero whatever was read, so its variance is
+    unknown.  InputError as `orthogonal`, and for an unknown kind.
+    """
+    require(kind in get_args(HCKind), f"kind must be one of {get_args(HCKind)}; got {kind!r}")
+    factors, e = orthogonal(B, e)
+    Q, V = factors.Q, factors.V
+    n, p = Q.shape
+    h = np.einsum("ij,ij->i", Q, Q)
+    adjusted = kind not in ("HC0", "HC1")
+    exact = np.flatnonzero(1 - h < ALONE)
+    if adjusted and exact.size:
+        raise InsufficientDataError(
+            f"row {exact[0]} of B alone determines a combination of the parameters (leverage"
+            f" one; {exact.size} such rows), so {kind} has no residual to judge it by; measure"
+            " there again, fit fewer parameters, or use HC1"
+        )
+    f = _factor(kind, h, p)
+    scores = Q * (f * e)[:, None]
+    matrix = factors.sandwich(scores.T @ scores)
+    dof = _dof(Q, V, f) if adjusted else np.full(p, float(n - p))
+    return Covariance(kind, matrix, dof, ROW_DESCRIPTION[kind])
+
+
+def _factor(kind: HCKind, h: Array, p: int) -> Array:
+    """f (n,), by which the residual is multiplied."""
+    n = h.size
+    if kind == "HC0":
+        return np.ones(n)
+    if kind == "HC1":
+        return np.full(n, np.sqrt(n / (n - p)))
+    power = np.minimum(4.0, n * h / p) if kind == "HC4" else 1.0 if kind == "HC2" else 2.0
+    return np.asarray((1 - h) ** (-power / 2))
+
+
+def _dof(Q: Array, V: Array, f: Array) -> Array:
+    """Satterthwaite dof (p,): every row a cluster, a_i = f_i Q_iᵀv_j, b_i = a_i Q_i."""
+    n, p = Q.shape
+    sums = SatterthwaiteSums(p)
+    block = max(1, ENTRIES // p**2)
+    for start in range(0, n, block):
+        part = slice(start, start + block)
+        a = f[part, None] * (Q[part] @ V.T)
+        sums.add(a**2, Q[part, :, None] * a[:, None, :])
+    return sums.dof()
+
+
+# Cluster-robust covariance: rows of a cluster may be correlated in any way (CR0 to CR3).
+#
+# A cluster is what shares an error: the readings of one configuration share the arm's
+# repeatability, those of one day its temperature.  With B = QR, cluster rows Q_c, e_c and x̂ = V
+# Qᵀy,
+#
+#     cov(x̂) = V [ Σ_c Q_cᵀA_c e_c e_cᵀA_cᵀQ_c ] Vᵀ
+#
+#     CR0  A_c = I                               Liang & Zeger 1986
+#     CR1  CR0 · G/(G − 1) · (n − 1)/(n − p)     the usual correction for G clusters
+#     CR2  A_c = (I − Q_cQ_cᵀ)^(−1/2)            Bell & McCaffrey 2002: unbiased where whitened rows
+#                                                are independent and of common variance
+#     CR3  A_c = (I − Q_cQ_cᵀ)^(−1)              nearly the jackknife over clusters, errs wide
+#
+# The working model of CR2 and of the degrees of freedom is the identity: B and e are whitened.
+
+CRKind = Literal["CR0", "CR1", "CR2", "CR3"]
+DEPENDS = 1e-6  # share of a parameter in such a direction above which it depends on it
+
+CLUSTER_DESCRIPTION = {
+    "CR0": "uncorrected (biased low with few clusters)",
+    "CR1": "corrected by G/(G − 1) · (n − 1)/(n − p)",
+    "CR2": "bias-reduced, unbiased under the working model",
+    "CR3": "nearly the jackknife over clusters",
+}
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Rows by cluster: `order` sorts them, cluster g has rows order[start[g] : start[g]+size[g]].
+
+    `label` (G,) are the labels given, ascending.
+    """
+
+    label: NDArray[np.int64]
+    order: NDArray[np.intp]
+    start: NDArray[np.intp]
+    size: NDArray[np.intp]
+
+    def __len__(self) -> int:
+        return self.label.size
+
+    def sums(self, rows: Array) -> Array:
+        """Sum over each cluster (G, ...) of an array (rows, ...)."""
+        return np.asarray(np.add.reduceat(rows[self.order], self.start, axis=0))
+
+    def blocks(self, columns: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Clusters (k,) of equal size and their rows (k, size), in blocks of bounded memory."""
+        for size in np.unique(self.size):
+            same = np.flatnonzero(self.size == size)
+            step = max(1, ENTRIES // (columns * max(int(size), columns)))
+            for first in range(0, same.size, step):
+                some = same[first : first + step]
+                yield some, self.order[self.start[some][:, None] + np.arange(size)]
+
+
+def clusters_of(cluster: ArrayLike, rows: int) -> Clusters:
+    """Clusters of the integer labels (rows,).
+
+    Raises InputError where there is not one integer per row, InsufficientDataError for a single
+    cluster.
+    """
+    labels = np.asarray(cluster)
+    if labels.shape != (rows,) or not np.issubdtype(labels.dtype, np.integer):
+        raise InputError(
+            f"cluster must be {rows} integer labels, one per row of B; got shape {labels.shape}"
+            f" of {labels.dtype} (repeat a label for each component of an observation)"
+        )
+    order = np.argsort(labels, kind="stable")
+    label, start, size = np.unique(labels[order], return_index=True, return_counts=True)
+    if label.size < 2:
+        raise InsufficientDataError(
+            "a cluster-robust covariance compares clusters, but all rows are in one;"
+            " measure more configurations, or use a covariance of independent rows (HC3)"
+        )
+    return Clusters(label.astype(np.int64), order, start, size)
+
+
+def cluster_robust(
+    B: ArrayLike, e: ArrayLike, cluster: ArrayLike, kind: CRKind = "CR2"
+) -> Covariance:
+    """Covariance of x̂ that allows any correlation within a cluster (equations above).
+
+    B (n, p) and e (n,) whitened, e = y − B x̂ the least-squares residual; `cluster` (n,) integer
+    labels in any order.  Degrees of freedom by Satterthwaite for every kind, each for its own
+    A_c (Pustejovsky & Tipton 2018); at most G, or G − 1 for CR0 and CR1, whose scores sum to zero
+    over the clusters, and far fewer where few clusters matter.
+
+    Where a cluster alone determines a direction, I − Q_cQ_cᵀ is singular: CR2 takes the
+    generalised inverse square root, which leaves parameters outside that direction unbiased
+    (there, Theorem 1).  A parameter that depends on it has no cluster-robust variance: its dof
+    is 0 and its interval unbounded.  CR3 does not exist then: InsufficientDataError.
+
+    Cost: n p² + G p³ operations and 32 MB of temporaries; nothing of size n² is formed.
+    Raises InputError and InsufficientDataError as `orthogonal` and `clusters_of`.
+    """
+    require(kind in get_args(CRKind), f"kind must be one of {get_args(CRKind)}; got {kind!r}")
+    factors, e = orthogonal(B, e)
+    Q, V = factors.Q, factors.V
+    n, p = Q.shape
+    groups = clusters_of(cluster, n)
+    meat, sums, alone = np.zeros((p, p)), SatterthwaiteSums(p), np.zeros(p, dtype=bool)
+    for some, rows in groups.blocks(p):
+        Qc = Q[rows]
+        adjusted, determined = _adjusted(Qc, kind)
+        if determined.any():
+            if kind == "CR3":
+                label = groups.label[some[np.argmax(determined)]]
+                raise InsufficientDataError(
+                    f"cluster {label} alone determines a combination of the parameters: leaving"
+                    " it out, as CR3 does, leaves no answer; fit fewer parameters or use CR2"
+                )
+            alone |= _depends(Qc[determined], V)
+        scores = (e[rows][:, None, :] @ adjusted)[:, 0]
+        meat += scores.T @ scores
+        a = adjusted @ V.T
+        sums.add(np.sum(a * a, axis=1), Qc.transpose(0, 2, 1) @ a)
+    if kind == "CR1":
+        meat *= len(groups) / (len(groups) - 1) * (n - 1) / (n - p)
+    text = f"rows correlated within {len(groups)} clusters, {CLUSTER_DESCRIPTION[kind]}"
+    if alone.any():
+        text += f"; parameters {np.flatnonzero(alone).tolist()} hang on a single cluster"
+    return Covariance(kind, factors.sandwich(meat), np.where(alone, 0.0, sums.dof()), text)
+
+
+def _adjusted(Qc: Array, kind: CRKind) -> tuple[Array, NDArray[np.bool_]]:
+    """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.
+
+    For g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) the smaller of the two is decomposed.
+    """
+    by_row = Qc.shape[1] < Qc.shape[2]
+    gram = Qc @ Qc.transpose(0, 2, 1) if by_row else Qc.transpose(0, 2, 1) @ Qc
+    values, U = np.linalg.eigh(gram)
+    gap = 1 - values
+    single = gap < ALONE
+    determined = np.asarray(single.any(axis=1))
+    if kind in ("CR0", "CR1"):
+        return Qc, determined
+    power = np.where(single, 1.0, gap) ** (-0.5 if kind == "CR2" else -1.0)
+    A = (U * np.where(single, 0.0, power)[:, None, :]) @ U.transpose(0, 2, 1)
+    return (A @ Qc if by_row else Qc @ A), determined
+
+
+def _depends(Qc: Array, V: Array) -> NDArray[np.bool_]:
+    """Which parameters (p,) depend on a direction that one of the clusters determines alone."""
+    values, U = np.linalg.eigh(Qc.transpose(0, 2, 1) @ Qc)
+    share = (V @ U) / np.linalg.norm(V, axis=1)[:, None]
+    in_it = (np.abs(share) > DEPENDS) & (1 - values < ALONE)[:, None, :]
+    return np.asarray(in_it.any(axis=(0, 2)))

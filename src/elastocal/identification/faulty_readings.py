@@ -1,0 +1,629 @@
+"""What is wrong with the readings: single ones, a marker, a configuration, a run of lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special, stats
+
+from elastocal.errors import ElastocalError, require
+from elastocal.identification.noise_choice import NoiseFit, linearised, own_noise, weights_of
+from elastocal.identification.outliers import FALSE_ALARM, blocks
+from elastocal.identification.robust_core import Design, RobustEstimate, design, lengths
+from elastocal.identification.robust_fits import mm_of
+from elastocal.identification.solve import Solution
+from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
+from elastocal.units import Array, BoolArray
+
+# Influence in closed form: what the estimate would be without a row, marker, configuration.
+#
+# With whitened B = QR, whitened least-squares residual e, and group g of m_g rows,
+#
+#     x̂ − x̂₍₋g₎ = R⁻¹ (I − Q_gᵀQ_g)⁻¹ Q_gᵀ e_g,        held-out residual  (I − Q_g Q_gᵀ)⁻¹ e_g,
+#     Δ_g = e_gᵀ (I − Q_g Q_gᵀ)⁻¹ e_g                  (what leaving g out takes off the rss)
+#
+# exactly for a linear model (Cook and Weisberg 1982, chapter 3; Belsley, Kuh and Welsch 1980).
+
+ALONE = 1e-9  # smallest eigenvalue of I − H_gg below which a group alone determines something
+
+
+@dataclass(frozen=True)
+class Influence:
+    """One entry per group, in ascending order of `label` (G,).
+
+    `rows` (G,) rows of the group; `shift` (G, p) = x̂ − x̂₍₋g₎ in the parameters' units; `dfbetas`
+    (G, p) = shift over its standard deviation √(s₍₋g₎² (BᵀB)⁻¹_jj); `cook` (G,) =
+    shiftᵀ BᵀB shift/(p s²); `covratio` (G,) = det cov(x̂₍₋g₎)/det cov(x̂), above 1 where the group
+    helps; `F` and `p_value` (G,) = (Δ_g/m_g)/s₍₋g₎² against F(m_g, rows − m_g − p), the externally
+    studentised held-out residual; `held_out` (rows,).  A group that alone determines a parameter
+    has no held-out fit: its held-out residual is infinite and its other entries NaN.
+    """
+
+    label: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    shift: Array
+    dfbetas: Array
+    cook: Array
+    covratio: Array
+    F: Array
+    p_value: Array
+    held_out: Array
+
+
+def influence(
+    B: ArrayLike, y: ArrayLike, group: ArrayLike | None = None, *, size: int = 1
+) -> Influence:
+    """Leave-one-group-out influence on the least-squares fit of y (n·size,) on B (n·size, p).
+
+    `group` (n,) integer label of each observation of `size` rows: its marker, configuration or
+    any other; by default every observation by itself.  B and y are whitened.
+
+    Raises InputError for wrong shapes or dependent columns.
+    """
+    problem = design(B, y, size)
+    n, p, m = problem.n, problem.p, len(problem.y)
+    labels = np.arange(n) if group is None else np.asarray(group)
+    require(
+        labels.shape == (n,) and np.issubdtype(labels.dtype, np.integer),
+        f"group must hold one integer label per observation, ({n},); found {labels.dtype} "
+        f"{labels.shape}",
+    )
+    names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
+    e = problem.residual(problem.Q.T @ problem.y)
+    rows_of = np.argsort(np.repeat(code, size), kind="stable")
+    starts = np.cumsum(count * size) - count * size
+    G = len(names)
+    moved, drop, logdet = np.full((G, p), np.nan), np.full(G, np.nan), np.full(G, np.nan)
+    held = np.full(m, np.inf)
+    for length in np.unique(count) * size:
+        chosen = np.flatnonzero(count * size == length)
+        rows = rows_of[starts[chosen][:, None] + np.arange(length)]
+        found = _leave_out(problem.Q[rows], e[rows])
+        moved[chosen], drop[chosen], logdet[chosen] = found[:3]
+        held[rows] = found[3]
+    return _summary(problem.parameters(moved.T).T, problem.cofactor, moved, drop, logdet, held,
+                    names, count * size, float(e @ e))  # fmt: skip
+
+
+def _leave_out(Q: Array, e: Array) -> tuple[Array, Array, Array, Array]:
+    """Shift in z (k, p), Δ (k,), log det(I − H) (k,), held-out residual (k, m) of k equal groups.
+
+    Works with I − QᵀQ (p × p) for large groups and I − QQᵀ (m × m) for small ones; both have the
+    same determinant.
+    """
+    _, m, p = Q.shape
+    QT = Q.transpose(0, 2, 1)
+    wide = m > p
+    gap = np.eye(p) - QT @ Q if wide else np.eye(m) - Q @ QT
+    alone = np.linalg.eigvalsh(gap)[:, 0] < ALONE
+    gap[alone] = np.eye(gap.shape[1])
+    if wide:
+        shift = np.asarray(np.linalg.solve(gap, QT @ e[..., None]))[..., 0]
+        held = np.asarray(e + np.einsum("gij,gj->gi", Q, shift))
+    else:
+        held = np.asarray(np.linalg.solve(gap, e[..., None]))[..., 0]
+        shift = np.einsum("gij,gi->gj", Q, held)
+    drop = np.asarray((e * held).sum(axis=1))
+    logdet = np.asarray(np.linalg.slogdet(gap)[1])
+    shift[alone], drop[alone], logdet[alone], held[alone] = np.nan, np.nan, np.nan, np.inf
+    return shift, drop, logdet, held
+
+
+def _summary(
+    shift: Array,
+    cofactor: Array,
+    moved: Array,
+    drop: Array,
+    logdet: Array,
+    held: Array,
+    names: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    rss: float,
+) -> Influence:
+    m, p = int(rows.sum()), len(cofactor)
+    s2 = rss / (m - p)
+    dof = m - p - rows
+    possible = np.where(dof > 0, dof, np.nan)
+    without = np.maximum(rss - drop, 0.0) / possible
+    with np.errstate(divide="ignore", invalid="ignore"):
+        F = drop / rows / without
+        dfbetas = shift / np.sqrt(without[:, None] * np.diag(cofactor))
+        cook = (moved**2).sum(axis=1) / (p * s2)
+        covratio = np.exp(p * np.log(without / s2) - logdet)
+    return Influence(
+        names, rows, shift, dfbetas, cook, covratio, F, stats.f.sf(F, rows, possible), held
+    )
+
+
+# Tests of single readings and of groups against the fit to the readings held to be good.
+
+ABSORBED = 1e-6  # share of a group's error that must be left after the model has followed it
+NOTHING = 1e-9  # share of a direction's information below which it is undetermined
+ROUNDS = 30
+SUSPECT = 0.01  # share of clean readings that the first set, from the robust fit, leaves out
+
+
+@dataclass(frozen=True)
+class GroupTest:
+    """Two F-tests of a group: of one error `shift` (size,) common to its readings, and of any.
+
+    `p_common` and `p_any` are their p-values (1 where untestable), `gain` what the more telling
+    of the two takes off the rss beyond what noise would.  `common` says whether the shift
+    explains at least half of what is wrong; if not, the readings err in different directions.
+    """
+
+    shift: Array
+    p_common: float
+    p_any: float
+    gain: float
+    common: bool
+
+    @property
+    def p_value(self) -> float:
+        """The smaller of the two, for two tests."""
+        return min(1.0, 2 * min(self.p_common, self.p_any))
+
+
+class CleanFit:
+    """Least squares on the `good` observations (n,), and tests of everything against it.
+
+    `T` (n, size, p) are the rows of B in coordinates where those of the good ones are
+    orthonormal, so that T_i T_jᵀ is the covariance of two predictions in units of σ²; directions
+    that the good ones leave undetermined have none.  `e` (n, size) is y less its prediction.
+    """
+
+    def __init__(self, problem: Design, good: BoolArray) -> None:
+        n, size, p = problem.n, problem.size, problem.p
+        Q3 = problem.Q.reshape(n, size, p)
+        Qg = Q3[good].reshape(-1, p)
+        values, vectors = np.linalg.eigh(Qg.T @ Qg)
+        known = values > NOTHING
+        self.problem, self.good = problem, good
+        self.to_z = vectors[:, known] / np.sqrt(values[known])
+        self.T = Q3 @ self.to_z
+        open_ = np.abs(Q3 @ vectors[:, ~known]).max(axis=(1, 2), initial=0.0)
+        self.undetermined: BoolArray = open_ > np.sqrt(NOTHING)
+        y = problem.y.reshape(n, size)
+        fitted = np.einsum("nij,ni->j", self.T[good], y[good])
+        self.z = self.to_z @ fitted
+        self.e = y - self.T @ fitted
+        self.rss = float((self.e[good] ** 2).sum())
+        self.dof = int(good.sum()) * size - int(known.sum())
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of a whitened row."""
+        return max(float(np.sqrt(self.rss / max(self.dof, 1))), self.problem.floor)
+
+    def reading_p(self) -> Array:
+        """p-value (n,) of every observation's error, as if it had been left out of the fit.
+
+        A good one has eᵀ(I − H)⁻¹e, any other eᵀ(I + H)⁻¹e; both over size · s², s² without the
+        observation, follow F.  1 where the others do not predict it.
+        """
+        size = self.problem.size
+        H = self.T @ self.T.transpose(0, 2, 1)
+        sign = np.where(self.good, -1.0, 1.0)[:, None, None]
+        spread = np.eye(size) + sign * H
+        alone = (np.linalg.eigvalsh(spread)[:, 0] < NOTHING) | self.undetermined
+        spread[alone] = np.eye(size)
+        drop = (self.e * np.linalg.solve(spread, self.e[..., None])[..., 0]).sum(axis=1)
+        dof = self.dof - size * self.good
+        floor = len(drop) * self.problem.floor**2
+        rest = np.maximum(self.rss - np.where(self.good, drop, 0.0), floor)
+        p = special.fdtrc(size, np.maximum(dof, 1), drop / size * np.maximum(dof, 1) / rest)
+        return np.where(alone | (dof < 1), 1.0, p)
+
+    def group_test(self, members: BoolArray) -> GroupTest | None:
+        """Test the observations `members` (n,) together, whether good ones or not.
+
+        With A = Σ T_iᵀT_i over the good ones less or plus the members, the model is fitted with
+        them (rss₁), without them (rss₀), and with them and a common shift (rss₁ − gain):
+
+            F_common = (gain/size)/((rss₁ − gain)/dof),   F_any = ((rss₁ − rss₀)/m)/(rss₀/dof₀)
+
+        None where they touch what the others leave undetermined, or where the model's own
+        parameters absorb a shift (the position of a marker that is itself fitted) and any error.
+        """
+        if (self.undetermined & members).any():
+            return None
+        size, n = self.problem.size, int(members.sum())
+        floor = len(self.e) * self.problem.floor**2
+        rss_with, dof_with, G, c = self._changed(members & ~self.good, 1.0)
+        S, e = self.T[members].sum(axis=0), self.e[members].sum(axis=0)
+        solved = np.linalg.solve(G, np.column_stack([S.T, c]))
+        M = n * np.eye(size) - S @ solved[:, :size]
+        shift, gain, p_common = np.zeros(size), 0.0, 1.0
+        if dof_with > size and np.linalg.eigvalsh(M)[0] > ABSORBED * n:
+            b = e - S @ solved[:, size]
+            shift = np.linalg.solve(M, b)
+            gain = float(b @ shift)
+            F = gain / size * (dof_with - size) / max(rss_with - gain, floor)
+            p_common = float(special.fdtrc(size, dof_with - size, F))
+        excess, p_any = 0.0, 1.0
+        rss_without, dof_without, G, _ = self._changed(members & self.good, -1.0)
+        if dof_without > 0 and np.linalg.eigvalsh(G)[0] > ABSORBED:
+            drop, s2 = max(rss_with - rss_without, 0.0), max(rss_without, floor) / dof_without
+            p_any = float(special.fdtrc(n * size, dof_without, drop / (n * size) / s2))
+            excess = drop - n * size * s2
+        if p_common == p_any == 1.0:
+            return None
+        return GroupTest(shift, p_common, p_any, max(gain, excess), gain >= excess / 2)
+
+    def _changed(self, members: BoolArray, sign: float) -> tuple[float, int, Array, Array]:
+        """rss, dof, Σ TᵀT and Σ Tᵀe of the fit with `members` added (+1) or removed (−1)."""
+        T, e = self.T[members], self.e[members]
+        G = np.eye(self.T.shape[2]) + sign * np.einsum("nij,nik->jk", T, T)
+        c = np.einsum("nij,ni->j", T, e)
+        rss = self.rss + sign * float((e**2).sum())
+        if np.linalg.eigvalsh(G)[0] > ABSORBED:
+            rss -= float(c @ np.linalg.solve(G, c))
+        return max(rss, 0.0), self.dof + int(sign) * e.size, G, c
+
+    def move(self, members: BoolArray) -> Array:
+        """Change (p,) of x̂ in its standard deviations if `members` were fitted along as read.
+
+        Infinite where they touch what the good ones leave undetermined.
+        """
+        extra = members & ~self.good
+        if (self.undetermined & extra).any():
+            return np.full(self.problem.p, np.inf)
+        Tx = self.T[extra]
+        G = np.eye(self.T.shape[2]) + np.einsum("nij,nik->jk", Tx, Tx)
+        moved = np.linalg.solve(G, np.einsum("nij,ni->j", Tx, self.e[extra]))
+        P = self.problem.parameters(self.to_z)
+        return P @ moved / (self.sigma * np.linalg.norm(P, axis=1))
+
+
+def screened(found: RobustEstimate, active: BoolArray, limit: float) -> CleanFit:
+    """The fit to the `active` observations (n,) whose own p-value is not below `limit`.
+
+    Starts from those near the robust fit and repeats until the set stands; a set without a
+    majority of the active ones cannot judge, and its predecessor stands.
+    """
+    size = found.design.size
+    inside = lengths(found.residual, size) <= found.scale * stats.chi.isf(SUSPECT, size)
+    good = active & inside
+    if 2 * good.sum() <= active.sum():
+        good = active
+    fit = CleanFit(found.design, good)
+    visited = {good.tobytes()}
+    for _ in range(ROUNDS):
+        good = active & (fit.reading_p() >= limit)
+        if 2 * good.sum() <= active.sum() or good.tobytes() in visited:
+            break
+        visited.add(good.tobytes())
+        fit = CleanFit(found.design, good)
+    return fit
+
+
+# Groups of readings that may share an error: which of them to blame, and in what order.
+
+Level = Literal["reading", "marker", "configuration", "block"]
+
+SMALLEST_BLOCK = 3
+WORTH_A_BLOCK = 1.1  # a run of lines must explain that much more than the best named group
+
+
+@dataclass(frozen=True)
+class Group:
+    """Observations `members` (n,) that may share an error."""
+
+    level: Level
+    name: str
+    members: BoolArray
+
+
+def groups_of(level: Level, labels: NDArray[Any]) -> list[Group]:
+    """Every group with more than one reading and less than half of them."""
+    names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
+    testable = np.flatnonzero((count > 1) & (2 * count < len(labels)))
+    return [Group(level, str(names[k]), code == k) for k in testable]
+
+
+def accepted_groups(
+    clean_fit: Callable[[BoolArray], CleanFit],
+    n: int,
+    groups: list[Group],
+    lines: NDArray[np.int64],
+    adjust: dict[Level, int],
+    false_alarm: float,
+) -> tuple[CleanFit, list[tuple[Group, GroupTest, int]]]:
+    """Groups beyond the noise, with how many of their readings are so alone, and the fit to the
+    good readings outside them.
+
+    One at a time, the one that explains most first, as long as a majority is left.  `adjust`
+    holds the number of tests that a p-value of each level is multiplied by; runs of `lines` (n,)
+    are tried where it has "block".  `clean_fit` makes the fit to the good ones among those (n,)
+    that are still in question.
+    """
+    active = np.ones(n, dtype=bool)
+    accepted: list[tuple[Group, GroupTest, int]] = []
+    while True:
+        fit = clean_fit(active)
+        runs = _runs(fit, active, lines) if "block" in adjust else []
+        tested = _tested(fit, active, groups + runs, adjust, false_alarm)
+        significant = [t for t in tested if t[1].p_value * adjust[t[0].level] < false_alarm]
+        if not significant:
+            return fit, accepted
+        group, test = max(significant, key=_weight)
+        if 2 * (active & ~group.members).sum() <= n:
+            return fit, accepted
+        accepted.append((group, test, int((group.members & ~fit.good).sum())))
+        active = active & ~group.members
+
+
+def _runs(fit: CleanFit, active: BoolArray, lines: NDArray[np.int64]) -> list[Group]:
+    """Runs of lines at least half of whose readings lie beyond the noise, and three or more."""
+    beyond = active & ~fit.good
+    found = []
+    for first, last in blocks([int(k) for k in lines[beyond]]):
+        run = active & (lines >= first) & (lines <= last)
+        if (beyond & run).sum() >= max(SMALLEST_BLOCK, run.sum() / 2):
+            found.append(Group("block", f"{first} to {last}", run))
+    return found
+
+
+def _tested(
+    fit: CleanFit,
+    active: BoolArray,
+    groups: list[Group],
+    adjust: dict[Level, int],
+    false_alarm: float,
+) -> Iterator[tuple[Group, GroupTest]]:
+    """Tests of all groups still active, on all of their readings where most are beyond the noise
+    and that is no chance, else on those that are not."""
+    beyond = active & ~fit.good
+    for group in groups:
+        present = active & group.members
+        inside, outside = int((beyond & present).sum()), int((beyond & ~present).sum())
+        count, others = int(present.sum()), int((active & ~present).sum())
+        rate = (outside + 1) / (others + 1)
+        chance = float(special.bdtrc(inside - 1, count, rate)) if inside else 1.0
+        whole = 2 * inside >= count and chance * adjust[group.level] < false_alarm
+        if group.level == "block" and not whole:
+            continue
+        used = present if whole else present & fit.good
+        test = fit.group_test(used) if used.sum() > 1 else None
+        if test is not None:
+            yield Group(group.level, group.name, present), test
+
+
+def _weight(candidate: tuple[Group, GroupTest]) -> float:
+    group, test = candidate
+    return test.gain / (WORTH_A_BLOCK if group.level == "block" else 1.0)
+
+
+# Which readings, markers, configurations and runs of lines lie beyond the noise.
+#
+# All are judged against the fit of the majority: an MM-estimate, then least squares on what agrees
+# with it.  A reading is tested as if left out; a group by the error common to its readings, which
+# shows long before any one of them does, and by their errors whatever the direction.  Readings
+# beyond the noise count for their group only where they are most of it and far more frequent there
+# than elsewhere: scattered blunders make no bad marker.
+#
+# The false-alarm rate holds for the whole report: it is shared between the levels tested, and
+# within a level between its tests (Bonferroni; for blocks between all possible runs of lines).  The
+# group that explains most is accepted first, its readings are set aside, and the rest is judged
+# anew, so that a displaced marker accuses neither each of its readings nor the configurations that
+# it was seen in.
+
+
+@dataclass(frozen=True)
+class FaultyGroup:
+    """One thing that is wrong.
+
+    `readings` (k,) indices of its observations and `lines` their lines; `beyond` how many of
+    these lie beyond the noise on their own.  `pattern` says whether a group errs in common, a
+    displacement, or by scatter; `error` is the length of the common error or the rms length, in
+    the units of y, `sigmas` the same over the noise of a row.  `p_value` is adjusted for all
+    tests of the report.  `influence` is the largest change of a parameter, in its standard
+    deviations, if the readings were fitted along, and `column` that parameter.
+    """
+
+    level: Level
+    name: str
+    pattern: Literal["single", "common", "scatter"]
+    readings: tuple[int, ...]
+    lines: tuple[int, ...]
+    beyond: int
+    error: float
+    sigmas: float
+    p_value: float
+    influence: float
+    column: int
+
+
+@dataclass(frozen=True)
+class OutlierReport:
+    """Findings, groups before readings and the largest first, and what is left without them.
+
+    `x` (p,) is the estimate without them and `sigma` the noise of a whitened row.  `tests` says
+    how many were made per level, `good` (n,) which observations x rests on, `names` (p,) those of
+    the parameters where they have any.
+    """
+
+    findings: tuple[FaultyGroup, ...]
+    x: Array
+    sigma: float
+    dof: int
+    good: BoolArray
+    tests: dict[str, int]
+    false_alarm: float
+    names: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers, strings and lists; an unbounded influence is None."""
+        listed = [asdict(f) for f in self.findings]
+        for entry in listed:
+            entry["readings"], entry["lines"] = list(entry["readings"]), list(entry["lines"])
+            if not np.isfinite(entry["influence"]):
+                entry["influence"] = None
+            if self.names:
+                entry["moves_most"] = self.names[entry.pop("column")]
+        return {
+            "findings": listed,
+            "sigma": self.sigma,
+            "dof": self.dof,
+            "readings_used": int(self.good.sum()),
+            "tests": dict(self.tests),
+            "false_alarm": self.false_alarm,
+        }
+
+
+def outlier_report(
+    B: ArrayLike,
+    y: ArrayLike,
+    *,
+    size: int = 1,
+    marker: ArrayLike | None = None,
+    configuration: ArrayLike | None = None,
+    line: ArrayLike | None = None,
+    seed: int = 0,
+    good: BoolArray | None = None,
+    false_alarm: float = FALSE_ALARM,
+) -> OutlierReport:
+    """Find what is beyond the noise in y (n·size,) ≈ B (n·size, p) x, whitened.
+
+    `marker` and `configuration` (n,) labels, `line` (n,) integer line of each observation (by
+    default its number); a level without labels is not tested, and neither are groups of a single
+    reading or of half the table.  `seed` fixes the search of the MM-estimate, `good` (n,) says
+    which observations to rely on where that is known already; then nothing is searched for, and
+    what is reported are the others, alone or as groups.
+
+    Raises InputError for wrong shapes or dependent columns.
+    """
+    require(0 < false_alarm < 0.5, f"false_alarm lies between 0 and 0.5; found {false_alarm}")
+    problem = design(B, y, size)
+    n = problem.n
+    lines = np.arange(n) if line is None else _labels("line", line, n)
+    require(np.issubdtype(lines.dtype, np.integer), "line must hold integers")
+    groups: list[Group] = []
+    if marker is not None:
+        groups += groups_of("marker", _labels("marker", marker, n))
+    if configuration is not None:
+        groups += groups_of("configuration", _labels("configuration", configuration, n))
+    tests: dict[Level, int] = {"reading": n}
+    for group in groups:
+        tests[group.level] = tests.get(group.level, 0) + 1
+    if line is not None:
+        tests["block"] = n * (n + 1) // 2
+    adjust = {level: count * len(tests) for level, count in tests.items()}
+
+    if good is None:
+        found, limit = mm_of(problem, seed), false_alarm / adjust["reading"]
+        chosen = partial(screened, found, limit=limit)
+    else:
+        chosen = partial(_known, problem, good)
+    fit, accepted = accepted_groups(chosen, n, groups, lines, adjust, false_alarm)
+    findings = []
+    active = np.ones(n, dtype=bool)
+    for group, test, beyond in accepted:
+        active &= ~group.members
+        final = fit.group_test(group.members) or test  # against the fit without any of the others
+        p = min(1.0, test.p_value * adjust[group.level])
+        findings.append(
+            _finding(fit, group, lines, beyond, p, final.shift if final.common else None)
+        )
+    p_reading = fit.reading_p()
+    for i in np.flatnonzero(active & ~fit.good):
+        alone = Group("reading", str(lines[i]), np.arange(n) == i)
+        p = min(1.0, float(p_reading[i]) * adjust["reading"])
+        findings.append(_finding(fit, alone, lines, 1, p, None))
+    findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
+    return OutlierReport(
+        tuple(findings), problem.parameters(fit.z), fit.sigma, fit.dof, fit.good,
+        {str(level): count for level, count in tests.items()}, false_alarm,
+    )  # fmt: skip
+
+
+def _known(problem: Design, good: BoolArray, active: BoolArray) -> CleanFit:
+    return CleanFit(problem, good & active)
+
+
+def _finding(
+    fit: CleanFit,
+    group: Group,
+    lines: NDArray[np.int64],
+    beyond: int,
+    p: float,
+    shift: Array | None,
+) -> FaultyGroup:
+    move = np.abs(fit.move(group.members))
+    column = int(np.argmax(move))
+    chosen = np.flatnonzero(group.members)
+    error = float(np.sqrt((fit.e[chosen] ** 2).sum(axis=1).mean()))
+    pattern: Literal["single", "common", "scatter"] = "scatter"
+    if shift is not None:
+        pattern, error = "common", float(np.linalg.norm(shift))
+    elif group.level == "reading":
+        pattern = "single"
+    return FaultyGroup(
+        group.level, group.name, pattern, tuple(chosen.tolist()), tuple(lines[chosen].tolist()),
+        beyond, error, error / fit.sigma, p, float(move[column]), column,
+    )  # fmt: skip
+
+
+def _labels(name: str, given: ArrayLike, n: int) -> NDArray[Any]:
+    labels = np.asarray(given)
+    require(
+        labels.shape == (n,), f"{name} needs one label per observation, ({n},); got {labels.shape}"
+    )
+    return labels
+
+
+# What is wrong with the readings: single ones, a marker, a configuration, a block of lines.
+
+
+def report_faulty(
+    whole: Solution, clean: Solution, noise: NoiseFit | None, good: BoolArray
+) -> OutlierReport | None:
+    """The report of the readings that are not `good` (N,), under the `noise` of the method.
+
+    Readings are linearised at a fit that faulty ones do not bend (`clean`), B and residual whitened
+    by the noise of single readings, D.  Where a configuration's readings share a deviation, what is
+    looked at is D V⁻¹ e, the residual less that deviation's best prediction, and configurations are
+    not tested: that they deviate is part of the noise.
+
+    None for a table too large for B, and where the good readings do not determine the fit.
+    """
+    problem, columns = whole.problem, clean.fit.columns
+    if problem.large:
+        return None
+    observed, table = problem.observations, problem.observations.table
+    readings = linearised(problem.model, observed, clean.fit.x, columns)
+    size = clean.sizes[columns]
+    B, e = readings.B.reshape(len(observed.value), -1) * size, readings.e.ravel()
+    shared = False
+    if noise is None:
+        weights = problem.weights
+        B, e = weights.apply(B), weights.apply(e)
+    else:
+        own = own_noise(noise.fit, readings)[0]
+        root = block_diagonal(inverse_factor(own))
+        whiten = weights_of(noise, readings).whiten
+        shared = bool((noise.fit.common > 0).any()) and whiten is not None
+        if shared and whiten is not None:
+            e = block_diagonal(own) @ (whiten.T @ (whiten @ e))
+        B, e = root @ B, root @ e
+    try:
+        report = outlier_report(
+            B, e, size=observed.size, good=good, line=table.row[observed.lead],
+            marker=_reading_labels(table.marker_names, table.marker[observed.lead]),
+            configuration=None if shared else _reading_labels(
+                table.configuration_labels, table.configuration[observed.lead]
+            ),
+        )  # fmt: skip
+    except (ElastocalError, np.linalg.LinAlgError):
+        return None
+    return replace(report, names=tuple(problem.model.names[c] for c in columns))
+
+
+def _reading_labels(names: tuple[str, ...], codes: np.ndarray) -> np.ndarray | None:
+    """Labels (N,), None where all are the same."""
+    return np.array(names)[codes] if len(np.unique(codes)) > 1 else None

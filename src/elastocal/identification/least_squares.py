@@ -1,0 +1,367 @@
+"""Nonlinear weighted least squares on the exact B: Levenberg–Marquardt, and the fit it ends in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.optimize import least_squares, lsq_linear
+
+from elastocal.errors import ElastocalError
+from elastocal.identification.linear_solver import solve_weighted
+from elastocal.identification.weighted_problem import (
+    Evaluation,
+    Partition,
+    RFactor,
+    Weights,
+    evaluate,
+    is_large,
+    partition,
+)
+from elastocal.model.manipulator import Model, Regression
+from elastocal.model.observations import Observations
+from elastocal.units import Array
+
+# Least squares on triangles: Levenberg–Marquardt where one evaluation is a pass over the table.
+
+SETTLED = "the sum of squares no longer fell"
+NEGLIGIBLE = "the steps became negligible"
+EXHAUSTED = "the step limit was reached; the start may be far off or the data ill-conditioned"
+
+FIRST_DAMPING = 1e-3  # of the largest squared column, once a full step has failed
+ROUNDING = 1e-12  # relative: what separates two evaluations at the minimum
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Where it ended: variables u (p,), the evaluation there, why, and after how many."""
+
+    u: Array
+    at: Evaluation
+    converged: bool
+    reason: str
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class SumOfSquares:
+    """|e(u)|² + |(u − centre)/tie|² over lower ≤ u ≤ upper, B = −∂e/∂u.
+
+    `evaluate` gives the triangle of e and of B per unit of u, (p,) in typical sizes; it raises
+    ElastocalError where the model has no prediction.  A `tie` (p,) of infinity is none.
+    `evaluate_last`, where given, evaluates in its place where the descent means to end: for what
+    else is wanted there.
+    """
+
+    evaluate: Callable[[Array], Evaluation]
+    tie: Array
+    centre: Array
+    lower: Array
+    upper: Array
+    evaluate_last: Callable[[Array], Evaluation] | None = None
+
+    def cost(self, u: Array, at: Evaluation) -> float:
+        """The sum of squares, ties included."""
+        return at.r_factor.rss + float(np.sum(((u - self.centre) / self.tie) ** 2))
+
+    def step(self, u: Array, at: Evaluation, damping: float) -> tuple[Array, float]:
+        """Minimiser of the linearised cost + damping · |step|², and by how much the cost falls."""
+        p = len(u)
+        A = np.vstack([at.r_factor.R, np.diag(1 / self.tie)])
+        b = np.concatenate([at.r_factor.projected, (self.centre - u) / self.tie])
+        damped = np.vstack([A, np.sqrt(damping) * np.eye(p)])
+        target = np.concatenate([b, np.zeros(p)])
+        if np.isfinite(self.lower).any() or np.isfinite(self.upper).any():
+            box = (self.lower - u, self.upper - u)
+            step = lsq_linear(damped, target, box, method="bvls", tol=1e-14).x
+        else:
+            cond = max(at.r_factor.rows, p) * np.finfo(float).eps
+            step = linalg.lstsq(damped, target, cond=cond)[0]
+        left = b - A @ step
+        return step, float(b @ b - left @ left)
+
+
+def descend(objective: SumOfSquares, u: Array, tolerance: float, max_evaluations: int) -> Descent:
+    """Full Gauss–Newton steps while they lower the cost, damped ones where they do not.
+
+    Ends where the linearised cost promises less than `tolerance` of itself: that last step is
+    still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
+    converges.  Steps are judged by the cost itself, so no rounding of it can keep it from ending.
+
+    Raises ElastocalError where the start has no prediction.
+    """
+    ending = objective.evaluate_last or objective.evaluate
+    at = objective.evaluate(u)
+    cost, damping, evaluations = objective.cost(u, at), 0.0, 1
+    while evaluations < max_evaluations:
+        step, promised = objective.step(u, at, damping)
+        last = promised <= tolerance * cost
+        if last and np.abs(step).max(initial=0.0) <= ROUNDING:
+            return Descent(u, at, True, NEGLIGIBLE, evaluations)
+        evaluations += 1
+        try:
+            trial = (ending if last else objective.evaluate)(u + step)
+            trial_cost = objective.cost(u + step, trial)
+        except ElastocalError:
+            trial, trial_cost = at, np.inf
+        if last and damping == 0:
+            kept = trial_cost <= cost * (1 + ROUNDING)
+            at, u = (trial, u + step) if kept else (at, u)
+            return Descent(u, at, True, SETTLED, evaluations)
+        if cost - trial_cost > 1e-4 * promised:
+            u, at, cost = u + step, trial, trial_cost
+            damping = damping / 10 if damping > 1e-9 * _steepest(at) else 0.0
+        elif np.abs(step).max(initial=0.0) <= ROUNDING:
+            return Descent(u, at, True, NEGLIGIBLE, evaluations)
+        else:
+            damping = max(10 * damping, FIRST_DAMPING * _steepest(at))
+    return Descent(u, at, False, EXHAUSTED, evaluations)
+
+
+def _steepest(at: Evaluation) -> float:
+    """The largest squared column of B."""
+    return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
+
+
+# Nonlinear weighted least squares on the exact B.
+
+# Relative change of the cost at which the trust region stops; one exact Gauss–Newton step follows
+# and squares what error is left.
+TOLERANCE = 1e-10
+# The same of a large table, whose evaluations are dear.  The last step is taken: at a million rows
+# it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
+LARGE_TOLERANCE = 1e-8
+
+REASON = {
+    -1: "the solver reported improper input",
+    0: "the step limit was reached; the start may be far off or the data ill-conditioned",
+    1: "the gradient vanished",
+    2: "the sum of squares no longer fell",
+    3: "the steps became negligible",
+    4: "sum of squares and steps both settled",
+}
+
+
+@dataclass(frozen=True)
+class FitProblem:
+    """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear), the other parameters held at `x`.
+
+    `sizes` (parameters,) scale the variables.  `tie` (columns,), where given, adds
+    ((X − centre)/tie)² per column, in units of the noise: a weak tie, used only to keep
+    undetermined directions still before they are known to be undetermined.  `among` (ascending)
+    are columns of which those fitted are a choice: a large table's fit leaves their triangle too,
+    which else would take another pass.
+    """
+
+    model: Model
+    observations: Observations
+    weights: Weights
+    x: Array
+    columns: NDArray[np.int64]
+    sizes: Array
+    tie: Array | None = None
+    centre: Array | None = None
+    bounded: bool = False
+    # The table in parts, where whoever poses the problem has cut it already.
+    cut: Partition | None = None
+    among: NDArray[np.int64] | None = None
+
+    @cached_property
+    def parts(self) -> Partition:
+        if self.cut is not None:
+            return self.cut
+        return partition(self.observations, self.weights, len(self.model.parameters))
+
+    @property
+    def tied_to(self) -> Array:
+        """What `tie` ties the columns to."""
+        return (self.x if self.centre is None else self.centre)[self.columns]
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Bounds (columns,) on the variables u of `values`, infinite unless the fit is bounded."""
+        fitted = [self.model.parameters[c] for c in self.columns]
+        if not self.bounded:
+            return np.full(len(fitted), -np.inf), np.full(len(fitted), np.inf)
+        x, size = self.x[self.columns], self.sizes[self.columns]
+        lower, upper = np.array([(p.lower, p.upper) for p in fitted]).T
+        return (lower - x) / size, (upper - x) / size
+
+    def values(self, u: Array) -> Array:
+        """Parameters (parameters,) with the columns moved by u typical sizes."""
+        x = self.x.copy()
+        x[self.columns] += u * self.sizes[self.columns]
+        return x
+
+    @property
+    def large(self) -> bool:
+        """Whether B is reduced part by part instead of being formed."""
+        return is_large(self.observations, len(self.model.parameters))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Values x (parameters,), raw and whitened residual (rows,), `triangle` of whitened B and it.
+
+    `columns` (fitted,) index the parameters; `wide`, where there is one, is the triangle of the
+    columns that these were chosen among.
+    """
+
+    x: Array
+    residual: Array
+    whitened: Array
+    r_factor: RFactor
+    converged: bool
+    reason: str
+    steps: int
+    problem: FitProblem = field(repr=False)
+    wide: RFactor | None = field(default=None, repr=False)
+
+    @property
+    def columns(self) -> NDArray[np.int64]:
+        return self.problem.columns
+
+    @cached_property
+    def B(self) -> Array:
+        """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `triangle`."""
+        return _regression(self.problem, self.x).B
+
+    def cofactor(self) -> Array:
+        """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13).
+
+        Exact to working precision for tables of ordinary size; of a large one from the triangle,
+        exact to working precision times condition number.
+        """
+        scale = self.problem.sizes[self.columns]
+        if self.problem.large:
+            return self.r_factor.cofactor(scale)
+        B = self.problem.weights.apply(self.B)
+        return solve_weighted(B, self.whitened, scale=scale).cofactor
+
+
+def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLERANCE) -> Fit:
+    """Levenberg–Marquardt from the problem's x, derivatives exact.
+
+    A large table is fitted on triangles, with the cost and the gradient of all rows, until a step
+    promises less than `tolerance` of the cost.
+
+    Raises ElastocalError where the start has poses without equilibrium.
+    """
+    if problem.large:
+        return _fit_in_parts(problem, max_steps, tolerance)
+    return _fit_whole(problem, max_steps)
+
+
+class _Points:
+    """The regression at one point after another: residual and B come from one evaluation.
+
+    It lives as long as one descent, whose rows do not change.
+    """
+
+    def __init__(self, problem: FitProblem) -> None:
+        self.problem = problem
+        self._u: Array | None = None
+        self._at: Regression | None = None
+
+    def at(self, u: Array) -> Regression:
+        """The regression at u (columns,).  Raises ElastocalError for poses without one."""
+        if self._at is None or self._u is None or not np.array_equal(u, self._u):
+            self._at = _regression(self.problem, self.problem.values(u))
+            self._u = u.copy()
+        return self._at
+
+    def residual(self, u: Array) -> Array:
+        """Predicted minus observed (rows,), NaN where a pose has no equilibrium."""
+        try:
+            return -self.at(u).residual
+        except ElastocalError:
+            observed, x = self.problem.observations, self.problem.values(u)
+            return self.problem.model.predict(observed.table, x, observed) - observed.value
+
+
+def _regression(problem: FitProblem, x: Array) -> Regression:
+    observed = problem.observations
+    return problem.model.regressor(observed.table, x, problem.columns, observed)
+
+
+def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
+    size, weights, points = problem.sizes[problem.columns], problem.weights, _Points(problem)
+
+    def residual(u: Array) -> Array:
+        r = weights.apply(points.residual(u))
+        if problem.tie is None:
+            return r
+        x = problem.values(u)
+        return np.concatenate([r, (x[problem.columns] - problem.tied_to) / problem.tie])
+
+    def jacobian(u: Array) -> Array:
+        B = weights.apply(points.at(u).B * size)
+        return B if problem.tie is None else np.vstack([B, np.diag(size / problem.tie)])
+
+    lower, upper = problem.limits
+    start = np.clip(np.zeros(len(problem.columns)), lower, upper)
+    if not np.isfinite(residual(start)).all():
+        points.at(start)  # names the row
+        raise ElastocalError("the model has no finite prediction at the start values")
+    found = least_squares(
+        residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
+        ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
+    )  # fmt: skip
+    x, final = problem.values(found.x), points.at(found.x)
+    if problem.tie is None and not problem.bounded and found.status > 0:
+        x, final = _polished(problem, x, final)
+    whitened = weights.apply(final.residual)
+    return Fit(
+        x, final.residual, whitened, RFactor.of(weights.apply(final.B), whitened),
+        bool(found.status > 0), REASON[int(found.status)], int(found.nfev), problem,
+    )  # fmt: skip
+
+
+def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
+    columns = problem.columns
+    size = problem.sizes[columns]
+    lower, upper = problem.limits
+
+    def evaluated(u: Array) -> Evaluation:
+        at = evaluate(problem.model, problem.parts, problem.values(u), columns)
+        return Evaluation(at.residual, at.r_factor.scaled(size))
+
+    def among_others(u: Array) -> Evaluation:
+        among = columns if problem.among is None else problem.among
+        at = evaluate(problem.model, problem.parts, problem.values(u), among)
+        own = at.r_factor.of_columns(np.searchsorted(among, columns))
+        return Evaluation(at.residual, own.scaled(size), at.r_factor)
+
+    objective = SumOfSquares(
+        evaluated, np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size,
+        (problem.tied_to - problem.x[columns]) / size, lower, upper,
+        None if problem.among is None else among_others,
+    )  # fmt: skip
+    start = np.clip(np.zeros(len(columns)), lower, upper)
+    found = descend(objective, start, tolerance, max_steps)
+    return Fit(
+        problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
+        found.at.r_factor.scaled(1 / size), found.converged, found.reason, found.evaluations,
+        problem, found.at.wide,
+    )  # fmt: skip
+
+
+def _polished(problem: FitProblem, x: Array, at: Regression) -> tuple[Array, Regression]:
+    """One Gauss–Newton step with the exact linear solver, kept where it does not cost."""
+    weights, columns = problem.weights, problem.columns
+    before = weights.apply(at.residual)
+    step = solve_weighted(weights.apply(at.B), before, scale=problem.sizes[columns])
+    moved = x.copy()
+    moved[columns] += step.x
+    try:
+        there = _regression(problem, moved)
+    except ElastocalError:
+        return x, at
+    after = weights.apply(there.residual)
+    if not np.isfinite(after).all() or after @ after > before @ before:
+        return x, at
+    return moved, there

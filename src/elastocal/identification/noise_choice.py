@@ -1,0 +1,539 @@
+"""Which noise model the readings support, which readings it does not explain, and its weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, sparse, stats
+
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError
+from elastocal.identification.covariance import Covariance, orthogonal
+from elastocal.identification.noise_structure import (
+    REGISTERED,
+    SHARED,
+    STRUCTURES,
+    Readings,
+    Structure,
+    noise_models,
+    polar,
+    shared_effects,
+)
+from elastocal.identification.outliers import FALSE_ALARM
+from elastocal.identification.reml import (
+    LogPrior,
+    Reml,
+    Whitened,
+    kenward_roger,
+    prior_of_groups,
+    reml,
+    usual_start,
+)
+from elastocal.identification.weighted_problem import (
+    Weights,
+    block_diagonal,
+    stated_covariance,
+    whitener,
+)
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
+from elastocal.text import did_you_mean
+from elastocal.tracker_noise import available_noise, polar_axes
+from elastocal.units import Array, BoolArray, IntArray
+
+# Which noise model: what the readings allow is tried, and an information criterion decides.
+#
+#     criterion = −2ℓ + k_own · log(rows − p) + 2 · k_shared
+#
+# For the structure of single readings the price per variance is Schwarz's (BIC): one that is not
+# clearly better only makes the judgement of faulty readings erratic.  For shared effects it is
+# Akaike's (AIC): one that is left out wrongly makes intervals too narrow.
+
+ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
+SEEN = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
+MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One noise model that was tried: how many variances it has, and its criterion."""
+
+    kind: str
+    n_variances: int
+    criterion: float
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """The noise model that was chosen, the estimate under it, and what else was tried.
+
+    `x` (p,) is the generalised least-squares estimate of the readings' Δx, `covariance` that of
+    Kenward and Roger; `kind` is a name of `noise_models` other than auto.  `fit` is in orthonormal
+    parameters: Δx = basis · fit.state.x, which shifts all its log-likelihoods by one constant.
+    """
+
+    kind: str
+    fit: Reml
+    x: Array
+    covariance: Covariance
+    trials: tuple[Trial, ...]
+    reason: str
+    basis: Array  # (p, p)
+
+    @property
+    def description(self) -> str:
+        """The model in words."""
+        text = self.fit.structure.description
+        found = [e.name for e, v in zip(self.fit.shared, self.fit.common, strict=True) if v > 0]
+        return text + (f", and a deviation common to each {' / '.join(found)}" if found else "")
+
+
+def estimate_noise(
+    readings: Readings, kind: str = "auto", like: NoiseFit | None = None
+) -> NoiseFit:
+    """Variances of the chosen noise model by REML, and the estimate under it.
+
+    `kind`: a structure (independent, axis, marker, groups, polar, stated), with "+configuration"
+    for effects that readings of a configuration share, or "auto".  Auto tries every structure
+    that the table has the labels and the readings for, each with shared effects, takes the one
+    with the smallest criterion, and leaves the shared effects out where it is smaller without.
+    `like`, a fit of nearly the same readings, is where the search of a named kind starts.
+
+    Raises InputError for an unknown kind or one that the readings do not support.
+    """
+    if kind not in noise_models():
+        raise InputError(f"there is no noise model '{kind}'{did_you_mean(kind, noise_models())}")
+    basis, T = _orthonormal(readings)
+    if kind != "auto":
+        near = None if like is None else like.fit
+        fit = _fitted(basis, kind.removesuffix(SHARED), kind.endswith(SHARED), near)
+        return _result(kind, fit, T, (), "as asked for")
+    best: tuple[float, str, Reml] | None = None
+    trials: list[Trial] = []
+    price = np.log(max(readings.e.size - readings.n_parameters, 3))
+
+    def attempt(name: str, shared: bool) -> None:
+        nonlocal best
+        try:
+            fit = _fitted(basis, name, shared, best[2] if best else None)
+        except InsufficientDataError:
+            return
+        if shared and not (fit.common > 0).any():
+            shared = False  # none was found: the same model without
+        label = name + (SHARED if shared else "")
+        own, common = _n_variances(fit)
+        criterion = own * price + 2 * common - 2 * fit.log_likelihood
+        trials.append(Trial(label, own + common, float(criterion)))
+        if best is None or criterion < best[0]:
+            best = (criterion, label, fit)
+
+    could_share = bool(shared_effects(STRUCTURES["independent"](basis).cells, readings.size))
+    for name in _supported(basis):
+        attempt(name, could_share)
+    if best is None:
+        raise InsufficientDataError(
+            "there are too few readings to estimate any noise from; measure more poses"
+        )
+    if best[1].endswith(SHARED):
+        attempt(best[1].removesuffix(SHARED), False)
+    _, label, fit = best
+    return _result(label, fit, T, tuple(trials), _reason(label, trials))
+
+
+def _supported(readings: Readings) -> list[str]:
+    """Structures whose variances the table can tell: labels, number of readings."""
+    size, rows = readings.size, readings.e.size
+    spare = (rows - readings.n_parameters) // ROWS_PER_VARIANCE
+    # What is stated is believed until something else is better.
+    names = ["independent"] if readings.stated is None else ["stated", "independent"]
+    if size > 1 and spare >= size:
+        names.append("axis")
+    if size == 3 and 1 < len(np.unique(readings.marker)) <= spare:
+        names.append("marker")
+    if size == 3 and readings.sight is not None and spare >= 3:
+        names.append("polar")
+    groups = len(np.unique(np.column_stack([readings.configuration, readings.load]), axis=0))
+    if 3 <= groups <= MOST_GROUPS and 3 * groups <= len(readings) - readings.n_parameters / size:
+        names.append("groups")
+    return names + [name for name, model in REGISTERED.items() if model.supports(readings)]
+
+
+def _fitted(readings: Readings, name: str, shared: bool, like: Reml | None = None) -> Reml:
+    """A structure's fit; the search starts from the variances of `like` where it has the same."""
+    structure = STRUCTURES[name](readings)
+    effects = shared_effects(structure.cells, readings.size, shared)
+    if shared and not effects:
+        raise InputError(
+            f"'{name}{SHARED}' needs repeats or several markers in a configuration; this table "
+            "has one reading in each"
+        )
+    start, prior = usual_start(structure, effects), None
+    own = len(structure.names)
+    if structure.shrunk:
+        prior = _prior(structure)
+        start[:own] = np.exp(prior.mean)
+    if like is not None and len(like.common) == len(effects):
+        start[own:] = np.where(like.common > 0, like.common, start[own:])
+        if like.structure.names == structure.names:
+            start[:own] = np.where(like.own > SEEN * like.own.max(), like.own, start[:own])
+    return reml(structure, effects, prior, start)
+
+
+def _prior(structure: Structure) -> LogPrior:
+    """Prior of the group variances, from residuals of a fit with the plain mean of repeats."""
+    cells = structure.cells
+    B, e = cells.B.reshape(-1, cells.B.shape[2]), cells.e.ravel()
+    weight = np.repeat(np.sqrt(cells.repeats), cells.e.shape[1])
+    x = linalg.lstsq(B * weight[:, None], e * weight)[0]
+    return prior_of_groups(structure, (e - B @ x).reshape(cells.e.shape))
+
+
+def _n_variances(fit: Reml) -> tuple[int, int]:
+    """How many own and shared variances the readings chose."""
+    own = len(fit.structure.names)
+    if fit.structure.shrunk:
+        own = fit.structure.cells.e.shape[1] + 2  # means of log θ and its two variances
+    return own, int((fit.common > 0).sum())
+
+
+def _reason(label: str, trials: list[Trial]) -> str:
+    others = sorted((t for t in trials if t.kind != label), key=lambda t: t.criterion)
+    mine = min(t.criterion for t in trials if t.kind == label)
+    if not others:
+        return "the only model that the table supports"
+    gaps = ", ".join(f"{t.kind} (+{t.criterion - mine:.1f})" for t in others)
+    return (
+        f"smallest information criterion among the models that the table supports; others: {gaps}"
+    )
+
+
+def _orthonormal(readings: Readings) -> tuple[Readings, Array]:
+    """Readings with B T in the place of B, (B T)ᵀ(B T) = I, and T (p, p).
+
+    Neither the units of the parameters nor their correlation then cost digits, and columns that
+    depend on each other are found out.
+    """
+    n, size, p = readings.B.shape
+    factors, _ = orthogonal(readings.B.reshape(-1, p), readings.e.ravel())
+    return replace(readings, B=factors.Q.reshape(n, size, p)), factors.V
+
+
+def _result(label: str, fit: Reml, T: Array, trials: tuple[Trial, ...], reason: str) -> NoiseFit:
+    adjusted, dof = kenward_roger(fit, T)
+    text = "weights estimated by restricted likelihood; covariance of Kenward and Roger"
+    covariance = Covariance("kenward-roger", adjusted, dof, text)
+    return NoiseFit(label, fit, T @ fit.state.x, covariance, trials, reason, T)
+
+
+# Is a reading explained by the others?  Deletion residuals under an estimated noise model.
+#
+# With P = V⁻¹ − V⁻¹BΦBᵀV⁻¹, the error of predicting reading i from all others, its configuration's
+# shared deviation included, is d_i = P_ii⁻¹ (P e)_i with covariance P_ii⁻¹ (Haslett and Hayes 1998,
+# J. R. Stat. Soc. B 60, 201): one evaluation judges every reading of the fit.
+
+
+def beyond_noise(found: NoiseFit, readings: Readings, good: BoolArray, level: float) -> BoolArray:
+    """Readings (N,) that the noise does not explain, at `level` for the whole table (Bonferroni).
+
+    `found` was estimated from the `good` readings (N,); they and the others are judged by the
+    error of predicting them from good readings that are not they.  Each component of it, in
+    units of its own deviation, is compared with t on the degrees of freedom behind that.
+    """
+    own, dof = own_noise(found.fit, readings)
+    t = np.zeros(readings.e.shape)
+    t[good] = _deletion_fit(found, readings.take(good), own[good])
+    if not good.all():
+        t[~good] = _not_fitted(found, readings.take(~good), own[~good])
+    # A fitted reading has a part in the variance it is measured with: leave it out there as well.
+    squared = np.minimum(t**2, dof * (1 - 1e-12))
+    outside = np.maximum(dof - 1, 1.0)
+    deleted = np.sqrt(squared * outside / (dof - squared))
+    size = np.where(good[:, None], deleted, np.abs(t))
+    p = 2 * stats.t.sf(size, np.where(good[:, None], outside, dof))
+    return np.asarray(p.min(axis=1) < level / readings.e.size)
+
+
+def own_noise(fit: Reml, readings: Readings) -> tuple[Array, Array]:
+    """Covariance (N, size, size) of single readings, and degrees of freedom (N, size) behind it.
+
+    A reading of a group that has none in the fit gets the mean of all variances.
+    """
+    name = fit.structure.name
+    whole = (
+        polar(readings, "angular" in fit.structure.names)
+        if name == "polar"
+        else STRUCTURES[name](readings)
+    )
+    place = {name: k for k, name in enumerate(fit.structure.names)}
+    known = np.array([place.get(name, -1) for name in whole.names])
+    own = fit.own
+    theta = np.where(known >= 0, own[known], own.mean())
+    W = fit.covariance[: len(own), : len(own)]
+    spread = np.where(known >= 0, np.diag(W)[known], np.diag(W).max())
+    cell = readings.cell
+    index, matrix = whole.index[cell], whole.matrix[cell]
+    if name == "stated":
+        matrix = np.asarray(readings.stated)[:, None]
+    covariance = np.einsum("nl,nlij->nij", theta[index], matrix)
+    parts = np.diagonal(matrix, axis1=2, axis2=3)  # (N, L, size)
+    variance = np.einsum("nl,nla->na", spread[index], parts**2)
+    diagonal = np.diagonal(covariance, axis1=1, axis2=2)
+    return covariance, np.maximum(2 * diagonal**2 / np.maximum(variance, 1e-300), 2.0)
+
+
+def _deletion_fit(found: NoiseFit, inside: Readings, own: Array) -> Array:
+    """Deletion residuals (N, size) of the readings of the fit, each over its deviation."""
+    fit = found.fit
+    cells, cell = fit.structure.cells, inside.cell
+    n_cells, size = len(cells), inside.size
+    mean_P, mean_Pe = np.zeros((n_cells, size, size)), np.zeros((n_cells, size))
+    for w in fit.state.whitened:
+        back = w.inverse.transpose(0, 2, 1)
+        VB, Pe = back @ w.B, (back @ _residual(fit, w)[:, :, None])[..., 0]
+        for j in range(w.stack.cells.shape[1]):
+            rows = slice(j * size, (j + 1) * size)
+            column = w.inverse[:, :, rows]
+            P = column.transpose(0, 2, 1) @ column
+            mean_P[w.stack.cells[:, j]] = P - VB[:, rows] @ fit.state.Phi @ VB[:, rows].transpose(
+                0, 2, 1
+            )
+            mean_Pe[w.stack.cells[:, j]] = Pe[:, rows]
+    precision = np.linalg.inv(own)
+    unit = np.einsum("cl,clij->cij", fit.own[fit.structure.index], fit.structure.mean_matrix)
+    share = precision @ unit[cell]  # of a reading in the mean of its cell, transposed
+    P = precision - share @ precision + share @ mean_P[cell] @ share.transpose(0, 2, 1)
+    deviation = (inside.e - cells.e[cell])[:, :, None]
+    Pe = (precision @ deviation + share @ mean_Pe[cell][:, :, None])[..., 0]
+    # A direction that this reading alone determines has no deletion residual.
+    values, vectors = np.linalg.eigh(P)
+    smallest = 1e-9 * np.linalg.eigvalsh(precision)[:, -1:]
+    inverse = np.where(values > smallest, 1 / np.maximum(values, smallest), 0.0)
+    spread = (vectors * inverse[:, None, :]) @ vectors.transpose(0, 2, 1)
+    d = (spread @ Pe[:, :, None])[..., 0]
+    deviation = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    return np.divide(d, deviation, out=np.zeros_like(d), where=deviation > 0)
+
+
+def _not_fitted(found: NoiseFit, rest: Readings, own: Array) -> Array:
+    """Prediction errors (N, size) of readings outside the fit, each over its deviation.
+
+    With k the covariance of a reading with the fitted ones, d = e − BΔx − kᵀV⁻¹r varies by
+    Σ − kᵀV⁻¹k + FΦ_AFᵀ, where F = B − kᵀV⁻¹B_fit.
+    """
+    fit = found.fit
+    d, F = rest.e - rest.B @ found.x, rest.B.copy()
+    spread = own.copy()
+    for effect, variance in zip(fit.shared, fit.common, strict=True):
+        spread += variance * np.diag(effect.axes)
+    if fit.shared:
+        for w in fit.state.whitened:
+            here, u = _common(fit, w, rest)
+            back = u.transpose(0, 2, 1)
+            mates, z = w.B[here[1]], _residual(fit, w)[here[1]]
+            d[here[0]] -= (back @ z[:, :, None])[..., 0]
+            spread[here[0]] -= back @ u
+            observed = (back @ mates).reshape(-1, rest.n_parameters)
+            F[here[0]] -= np.linalg.solve(found.basis.T, observed.T).T.reshape(F[here[0]].shape)
+    spread += F @ found.covariance.matrix @ F.transpose(0, 2, 1)
+    return d / np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+
+
+def _common(fit: Reml, w: Whitened, rest: Readings) -> tuple[tuple[IntArray, IntArray], Array]:
+    """Which readings of `rest` have mates in which cluster of the stack, and R⁻¹k (n, rows, size).
+
+    k is what a reading and its configuration's fitted cells vary by together.
+    """
+    cells, size = fit.structure.cells, rest.size
+    cluster = {int(c): g for g, c in enumerate(cells.configuration[w.stack.cells[:, 0]])}
+    mates = np.array([cluster.get(int(c), -1) for c in rest.configuration])
+    here = np.flatnonzero(mates >= 0)
+    members = w.stack.cells[mates[here]]  # (n, cells)
+    common = np.zeros((len(here), members.shape[1], size))
+    for effect, variance in zip(fit.shared, fit.common, strict=True):
+        same = np.all(
+            [getattr(cells, by)[members] == getattr(rest, by)[here, None] for by in effect.by],
+            axis=0,
+        )
+        common += variance * same[:, :, None] * effect.axes
+    k = (common[:, :, :, None] * np.eye(size)).reshape(len(here), members.shape[1] * size, size)
+    return (here, mates[here]), w.inverse[mates[here]] @ k
+
+
+def _residual(fit: Reml, w: Whitened) -> Array:
+    """R⁻¹ (e − BΔx) (G, n) of a stack; x and B are in the fit's orthonormal basis."""
+    return w.e - w.B @ fit.state.x
+
+
+# A first guess at the faulty readings, from a robust fit: where the search for them starts.
+
+OWN_SCALE = 6  # readings that a group needs for a median and a scale of its own
+MOVED = 1 / 3  # share of a configuration's readings
+LIMIT = 5.0  # robust standard deviations; the verdict that follows takes back what it can explain
+
+
+def screen(readings: Readings, residual: Array, good: BoolArray | None = None) -> BoolArray:
+    """Readings (N,) whose residual (N, size) from a robust fit lies with the others.
+
+    Each component is compared with the median and the median absolute deviation of its
+    configuration (under its load), where that holds enough readings; else with zero and the
+    deviation of the `good` readings (N,) of the whole table (default all).  Where noise is stated,
+    residuals count in units of it.
+
+    What moves a configuration or a marker in it as a whole moves its median too: readings that are
+    not `good` stay out where they make up a third of their configuration.
+    """
+    if readings.stated is not None:
+        residual = residual / np.sqrt(np.diagonal(readings.stated, axis1=1, axis2=2))
+    table = _scale(np.abs(residual if good is None else residual[good]))
+    deviation, scale = np.abs(residual), np.broadcast_to(table, residual.shape).copy()
+    key = np.column_stack([readings.configuration, readings.load])
+    _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(group.ravel(), kind="stable")
+    starts = np.concatenate([[0], np.cumsum(count)[:-1]])
+    for n in np.unique(count[count >= OWN_SCALE]):
+        members = order[starts[count == n, None] + np.arange(n)]  # (groups, n)
+        r = residual[members]
+        deviation[members] = np.abs(r - np.median(r, axis=1, keepdims=True))
+        scale[members] = _scale(deviation[members], axis=1)[:, None]
+    # A group that happens to agree is no reason to suspect the one reading that differs a little.
+    scale = np.maximum(scale, 0.2 * table)
+    near = (deviation <= LIMIT * scale).all(axis=1)
+    if good is None:
+        return np.asarray(near)
+    share = np.bincount(group.ravel(), ~good)[group.ravel()] / count[group.ravel()]
+    return np.asarray(near & (good | (share < MOVED)))
+
+
+def _scale(deviation: Array, axis: int = 0) -> Array:
+    return np.median(deviation, axis=axis) / stats.norm.ppf(0.75)
+
+
+# The default estimate: faulty readings set apart, noise model chosen, x by its weights.
+
+ROUNDS = 12
+FEWEST_GOOD = 0.5
+
+
+@dataclass(frozen=True)
+class NoiseAndOutliers:
+    """The noise found from the `good` readings (N,); the others lie beyond it."""
+
+    noise: NoiseFit
+    good: BoolArray
+
+
+def settle(
+    readings: Readings, kind: str = "auto", good: BoolArray | None = None
+) -> NoiseAndOutliers:
+    """Noise and good readings that agree with each other, starting from `good` (default all).
+
+    The noise model is fitted to the good readings, every reading is judged by the error of its
+    prediction from them (false-alarm rate 1 % for the whole table), and so on.  Starting from
+    all, errors that hide each other may stay: start from a robust fit.  A set that comes back
+    after others ends the search: readings that were good at any time of that round are kept.
+
+    Faulty readings that are taken back bend the fit, so that more of them seem to fit.  Where the
+    better half of all readings is left worse explained than by an earlier set, beyond what chance
+    allows, that set stands.
+    """
+    good = np.ones(len(readings), dtype=bool) if good is None else good
+    noise = estimate_noise(readings.take(good), kind)
+    own = np.asarray(np.linalg.inv(own_noise(noise.fit, readings)[0]), dtype=np.float64)
+    visited = [(_misfit(noise, readings, own), good, noise)]
+    for _ in range(ROUNDS):
+        updated = ~beyond_noise(noise, readings, good, FALSE_ALARM)
+        if np.array_equal(updated, good) or updated.mean() < FEWEST_GOOD:
+            break
+        masks = [mask for _, mask, _ in visited]
+        again = next((k for k, mask in enumerate(masks) if np.array_equal(mask, updated)), None)
+        if again is not None:
+            updated = np.logical_or.reduce(masks[again:])
+        try:
+            noise = estimate_noise(readings.take(updated), noise.kind)
+        except ElastocalError:
+            break  # so few readings cannot judge the others
+        good = updated
+        visited.append((_misfit(noise, readings, own), good, noise))
+        if again is not None:
+            break
+    last, best = visited[-1], min(visited, key=lambda v: v[0])
+    half = (len(readings) // 2 + 1) * readings.size
+    if last[0] > best[0] * stats.f.isf(FALSE_ALARM, half, half):
+        last = best
+    _, good, noise = last
+    if len(visited) > 1 and kind == "auto":
+        noise = estimate_noise(readings.take(good), kind)
+    return NoiseAndOutliers(noise, good)
+
+
+def _misfit(noise: NoiseFit, readings: Readings, precision: Array) -> float:
+    """Sum of the smaller half of the squared residuals, in units of `precision` (N, size, size)."""
+    r = readings.e - readings.B @ noise.x
+    squared = np.einsum("ni,nij,nj->n", r, precision, r)
+    return float(np.sort(squared)[: len(squared) // 2 + 1].sum())
+
+
+# Between a fit and its noise: readings linearised at the fit, weights from an estimated noise.
+
+
+def linearised(
+    model: Model, observed: Observations, x: Array, columns: NDArray[np.int64]
+) -> Readings:
+    """Residuals and B of the `columns` at x (parameters,), with the labels of each observation."""
+    at = model.regressor(observed.table, x, columns, observed)
+    n, size = len(observed.lead), observed.size
+    table = observed.table
+    force = np.round(table.force[observed.lead], 6)
+    load = np.unique(force, axis=0, return_inverse=True)[1].ravel()
+    sight, reach = _sight(model, observed)
+    return Readings(
+        at.B.reshape(n, size, -1), at.residual.reshape(n, size), table.configuration[observed.lead],
+        load, table.marker[observed.lead], sight, reach, _stated(model, observed),
+        table, observed.lead,
+    )  # fmt: skip
+
+
+def weights_of(noise: NoiseFit, readings: Readings) -> Weights:
+    """Weights of the readings (N,) under an estimated noise; whitened residuals have size 1."""
+    size = readings.size
+    covariance = block_diagonal(own_noise(noise.fit, readings)[0])
+    for effect, variance in zip(noise.fit.shared, noise.fit.common, strict=True):
+        if variance <= 0:
+            continue
+        key = np.column_stack([getattr(readings, label) for label in effect.by])
+        unit = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+        place = (np.ones(len(unit)), (np.arange(len(unit)), unit))
+        Z = sparse.csr_array(place, shape=(len(unit), unit.max() + 1))
+        axes = sparse.dia_array((effect.axes[None], [0]), shape=(size, size))
+        covariance = covariance + variance * sparse.kron(Z @ Z.T, axes, format="csr")
+    return Weights(noise.kind, whitener(sparse.csr_array(covariance)), True, noise.description)
+
+
+def _sight(model: Model, observed: Observations) -> tuple[Array | None, Array | None]:
+    """Axes along and across the line of sight (N, 3, 3) and its length (N,), where it is known."""
+    position = observed.table.position
+    if position is None or observed.size != 3:
+        return None, None
+    offset = position[observed.lead] - model.cell.tracker.position
+    reach = np.linalg.norm(offset, axis=1)
+    if not (reach > 0).all():
+        return None, None
+    return polar_axes(offset), reach
+
+
+def _stated(model: Model, observed: Observations) -> Array | None:
+    """Stated covariance (N, size, size) of each observation, None where none is stated.
+
+    Observations that share a reading are correlated; here each stands for itself.
+    """
+    kind = available_noise(observed.table, model.cell.tracker)
+    if kind == "none" and observed.kind != "distance":
+        return None
+    try:
+        rows = stated_covariance(observed, model.cell.tracker, kind)[0]
+    except InputError:
+        return None
+    n = len(observed.lead)
+    squared = sparse.csr_array(observed.combine.power(2))
+    return (squared @ rows.reshape(len(rows), -1)).reshape(n, observed.size, observed.size)

@@ -1,0 +1,465 @@
+"""How the noise of readings may be built: one variance or several, and what readings share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.errors import InputError, require
+from elastocal.measurements import Measurements
+from elastocal.units import Array, BoolArray, IntArray
+
+# Residuals and B per reading, with the labels that say what readings have in common.
+
+
+@dataclass(frozen=True)
+class Readings:
+    """N readings of `size` components, linearised: e = B Δx + noise, shared and per reading.
+
+    `B` (N, size, p); `e` (N, size) in m, and rad from the fourth component on.  Readings of one
+    `configuration`, `load` and `marker` (N,) are repeats.  `sight` (N, 3, 3), where the tracker's
+    position is known, holds the unit vectors along and across the line of sight as rows and
+    `reach` (N,) its length in m; `stated` (N, size, size), where noise is stated, its covariance.
+    `lead` (N,) are the readings' rows in the `table`.
+    """
+
+    B: Array
+    e: Array
+    configuration: IntArray
+    load: IntArray
+    marker: IntArray
+    sight: Array | None = None
+    reach: Array | None = None
+    stated: Array | None = None
+    table: Measurements | None = None
+    lead: IntArray | None = None
+
+    def __post_init__(self) -> None:
+        n, size = self.e.shape
+        require(
+            self.B.shape[:2] == (n, size),
+            f"B is {self.B.shape} where {n} readings of {size} components need ({n}, {size}, p)",
+        )
+        for name in ("configuration", "load", "marker"):
+            found = getattr(self, name).shape
+            require(found == (n,), f"{name} is {found}; one label per reading, ({n},), is needed")
+
+    def __len__(self) -> int:
+        return len(self.e)
+
+    @property
+    def size(self) -> int:
+        return int(self.e.shape[1])
+
+    @property
+    def n_parameters(self) -> int:
+        return int(self.B.shape[2])
+
+    @cached_property
+    def rows(self) -> Measurements:
+        """The rows (N,) of the table that the readings are from: joints, force, time and so on."""
+        require(self.table is not None, "these readings are not from a table")
+        assert self.table is not None and self.lead is not None
+        return self.table.take(self.lead)
+
+    @cached_property
+    def cell(self) -> IntArray:
+        """Number (N,) of the set of repeats that a reading belongs to."""
+        key = np.column_stack([self.configuration, self.load, self.marker])
+        return np.unique(key, axis=0, return_inverse=True)[1].ravel()
+
+    @cached_property
+    def cells(self) -> Cells:
+        """Sets of repeats with plain means; every noise model but the stated one uses them."""
+        return reduce_repeats(self)
+
+    def take(self, chosen: BoolArray) -> Readings:
+        """Only the readings where `chosen` (N,) holds."""
+        names = ("B", "e", "configuration", "load", "marker", "sight", "reach", "stated", "lead")
+        parts = {name: getattr(self, name) for name in names}
+        return replace(self, **{k: v[chosen] for k, v in parts.items() if v is not None})
+
+    def of_columns(self, chosen: BoolArray) -> Readings:
+        """Only the columns of B where `chosen` (p,) holds."""
+        return replace(self, B=self.B[:, :, chosen])
+
+    def moved(self, e: Array) -> Readings:
+        """The same readings with other residuals (N, size)."""
+        return replace(self, e=e)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Sets of repeats, reduced without loss: a mean and what scatters about it.
+
+    With the covariance θ S_i of reading i in a cell, the weighted mean ȳ = U Σ S_i⁻¹ y_i with
+    U = (Σ S_i⁻¹)⁻¹ and the scatter about it are sufficient: ȳ varies by θ U plus whatever all
+    repeats share, the scatter by θ alone with (repeats − 1) · size degrees of freedom.  Repeats
+    are taken to have one B; where theirs differ a little, the mean stands for all.
+    `B` (C, size, p), `e` (C, size), `unit` U (C, size, size), `dof` (C,) repeats − 1, `scatter`
+    (C, size, size), `log_offset`: Σ log|S_i| − log|U| over all cells, which the likelihood needs.
+    """
+
+    B: Array
+    e: Array
+    unit: Array
+    repeats: IntArray
+    dof: Array
+    scatter: Array
+    log_offset: float
+    configuration: IntArray
+    load: IntArray
+    marker: IntArray
+    sight: Array | None
+    reach: Array | None
+
+    def __len__(self) -> int:
+        return len(self.e)
+
+
+def reduce_repeats(readings: Readings, stated: bool = False) -> Cells:
+    """Cells of the readings; weighted by the stated covariances if `stated`, else plainly."""
+    cell = readings.cell
+    n_cells = int(cell.max()) + 1
+    first = np.unique(cell, return_index=True)[1]
+    repeats = np.bincount(cell, minlength=n_cells)
+    size = readings.size
+    if stated:
+        require(readings.stated is not None, "no noise is stated that could be used")
+        S = np.asarray(readings.stated)
+        P = np.linalg.inv(S)
+        unit = np.linalg.inv(_sum(P, cell, n_cells)).astype(np.float64)
+        offset = np.linalg.slogdet(S)[1].sum() - np.linalg.slogdet(unit)[1].sum()
+        share = unit[cell] @ P
+        e = _sum((share @ readings.e[:, :, None])[..., 0], cell, n_cells)
+        B = _sum(share @ readings.B, cell, n_cells)
+        deviation = readings.e - e[cell]
+        squares = np.einsum("ni,nij,nj->n", deviation, P, deviation)
+        scatter = np.bincount(cell, squares, n_cells)[:, None, None] * np.eye(size) / size
+    else:
+        unit = np.eye(size) / repeats[:, None, None]
+        offset = size * np.log(repeats).sum()
+        e = _sum(readings.e, cell, n_cells) / repeats[:, None]
+        B = _sum(readings.B, cell, n_cells) / repeats[:, None, None]
+        deviation = readings.e - e[cell]
+        scatter = _sum(deviation[:, :, None] * deviation[:, None, :], cell, n_cells)
+    return Cells(
+        B, e, unit, repeats, (repeats - 1).astype(float), scatter, float(offset),
+        readings.configuration[first], readings.load[first], readings.marker[first],
+        None if readings.sight is None else readings.sight[first],
+        None if readings.reach is None else readings.reach[first],
+    )  # fmt: skip
+
+
+def _sum(values: Array, cell: IntArray, n_cells: int) -> Array:
+    total = np.zeros((n_cells, *values.shape[1:]))
+    np.add.at(total, cell, values)
+    return total
+
+
+# How the noise of a single reading may be built: one variance, or several.
+#
+# Besides the built-in structures there are those that a `NoiseModel` of the user's own describes.
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Covariance of one reading in cell c: Σ_l θ[index[c, l]] · matrix[c, l].
+
+    `index` (C, L) into the `names` of the variances θ, in m² (rad²); `matrix` (C, L, size, size)
+    for a single reading.  The cell's mean has that covariance with `mean_matrix` in its place.
+    `shrunk` says that the variances are many and share a prior (see shrinkage).
+    """
+
+    name: str
+    description: str
+    names: tuple[str, ...]
+    cells: Cells
+    index: IntArray
+    matrix: Array
+    mean_matrix: Array
+    shrunk: bool = False
+
+
+def independent(readings: Readings) -> Structure:
+    """One variance for all readings (positions, and one for rotations)."""
+    size = readings.size
+    kinds = [range(3), range(3, 6)] if size == 6 else [range(size)]
+    names = ("position", "rotation")[: len(kinds)] if size > 1 else ("distance",)
+    return _diagonal(
+        readings, "independent", "one variance for all readings", names,
+        [np.isin(np.arange(size), kind) for kind in kinds],
+    )  # fmt: skip
+
+
+def by_axis(readings: Readings) -> Structure:
+    """One variance for each component of a reading."""
+    size = readings.size
+    names = ("x", "y", "z", "rx", "ry", "rz")[:size] if size > 1 else ("distance",)
+    return _diagonal(
+        readings, "axis", "one variance per axis", names, [row == 1 for row in np.eye(size)]
+    )
+
+
+def by_marker(readings: Readings) -> Structure:
+    """One variance for each marker."""
+    require(readings.size == 3, "variances per marker are for positions and deflections")
+    cells = readings.cells
+    labels, index = np.unique(cells.marker, return_inverse=True)
+    matrix = np.tile(np.eye(3), (len(cells), 1, 1, 1))
+    return Structure(
+        "marker", "one variance per marker", tuple(f"marker {m}" for m in labels), cells,
+        index.reshape(-1, 1), matrix, matrix / cells.repeats[:, None, None, None],
+    )  # fmt: skip
+
+
+def by_group(readings: Readings) -> Structure:
+    """One variance for each configuration (under each load) in each direction.
+
+    The group of Klimchik et al. 2013, section 4: its markers and repeats share one σ.
+    """
+    cells = readings.cells
+    size = readings.size
+    key = np.column_stack([cells.configuration, cells.load])
+    groups, number = np.unique(key, axis=0, return_inverse=True)
+    index = number.ravel()[:, None] * size + np.arange(size)
+    parts = np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
+    matrix = np.tile(parts, (len(cells), 1, 1, 1))
+    names = tuple(
+        f"configuration {c}, load {load}, component {a}" for c, load in groups for a in range(size)
+    )
+    return Structure(
+        "groups", "a variance per configuration and direction, shrunk towards the others", names,
+        cells, index, matrix, matrix / cells.repeats[:, None, None, None], shrunk=True,
+    )  # fmt: skip
+
+
+def polar(readings: Readings, angular: bool | None = None) -> Structure:
+    """Variances along the line of sight, across it, and across it growing with the distance.
+
+    Σ = θ_r u uᵀ + (θ_t + θ_a d²)(I − u uᵀ) with u the line of sight and d its length in m: range
+    noise, transverse noise of the target, angular noise of the tracker.  `angular` says whether
+    θ_a is there; by default where the distances differ enough to tell it from θ_t.
+    """
+    require(
+        readings.sight is not None and readings.size == 3,
+        "polar noise needs positions and the tracker's position",
+    )
+    cells = readings.cells
+    u, d = np.asarray(cells.sight)[:, 0, :], np.asarray(cells.reach)
+    along = u[:, :, None] * u[:, None, :]
+    across = np.eye(3) - along
+    matrix = np.stack([along, across], axis=1)
+    names: tuple[str, ...] = ("range", "transverse")
+    if angular is None:
+        angular = bool(np.ptp(d) > 0.2 * d.mean())
+    if angular:
+        matrix = np.concatenate([matrix, (across * d[:, None, None] ** 2)[:, None]], axis=1)
+        names = (*names, "angular")
+    index = np.tile(np.arange(len(names)), (len(cells), 1))
+    return Structure(
+        "polar", "range and transverse variances of the tracker", names, cells, index, matrix,
+        matrix / cells.repeats[:, None, None, None],
+    )  # fmt: skip
+
+
+def as_stated(readings: Readings) -> Structure:
+    """The stated noise times one factor, which the residuals tell."""
+    cells = reduce_repeats(readings, stated=True)
+    matrix = np.tile(np.eye(readings.size), (len(cells), 1, 1, 1))
+    return Structure(
+        "stated", "the stated noise times one factor", ("factor",), cells,
+        np.zeros((len(cells), 1), dtype=np.int64), matrix, cells.unit[:, None],
+    )  # fmt: skip
+
+
+def _diagonal(
+    readings: Readings, name: str, text: str, names: tuple[str, ...], parts: list[NDArray[np.bool_]]
+) -> Structure:
+    cells = readings.cells
+    each = np.array([np.diag(part.astype(float)) for part in parts])
+    matrix = np.tile(each, (len(cells), 1, 1, 1))
+    index = np.tile(np.arange(len(parts)), (len(cells), 1))
+    return Structure(
+        name, text, names, cells, index, matrix, matrix / cells.repeats[:, None, None, None]
+    )
+
+
+STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
+    "independent": independent,
+    "axis": by_axis,
+    "marker": by_marker,
+    "groups": by_group,
+    "polar": polar,
+    "stated": as_stated,
+}
+SHARED = "+configuration"
+
+
+class NoiseModel:
+    """A noise model of one's own: the variances that the noise of a reading is made of.
+
+    The covariance of reading i is Σ_l θ_l S_l,i with unknown variances θ_l ≥ 0, which restricted
+    likelihood finds, and what `components` says of S_l.  It is tried with and without deviations
+    that the readings of a configuration share, and taken where the information criterion is smaller
+    than those of the built-in models.
+    """
+
+    name: ClassVar[str]
+    description: ClassVar[str]
+
+    def components(self, readings: Readings) -> Mapping[str, Array]:
+        """The name of each variance → S, (N,) times the identity or (N, size, size), of N readings.
+
+        θ is in m² (rad² of rotations) where S is a plain number.  A group of readings with a
+        variance of its own has S = 1 for its members and 0 for the others.  Repeats of a reading
+        share one S, the mean of theirs.  The names are the same for any part of the readings.
+        """
+        raise NotImplementedError
+
+    def supports(self, readings: Readings) -> bool:
+        """Whether these readings have what the model needs; where not, it is not tried."""
+        return True
+
+    def structure(self, readings: Readings) -> Structure:
+        """The model for the likelihood; InputError where `components` are not as they should be."""
+        found = self.components(readings)
+        require(bool(found), f"the noise model '{self.name}' has no components")
+        whole = np.stack([self._matrices(name, S, readings) for name, S in found.items()], axis=1)
+        cells, cell = readings.cells, readings.cell
+        matrix = np.zeros((len(cells), *whole.shape[1:]))
+        np.add.at(matrix, cell, whole)
+        matrix /= cells.repeats[:, None, None, None]
+        smallest = np.linalg.eigvalsh(matrix.sum(axis=1))[:, 0]
+        require(
+            bool((smallest > 0).all()),
+            f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
+            "components add up to a singular matrix",
+        )
+        index = np.tile(np.arange(len(found)), (len(cells), 1))
+        return Structure(
+            self.name, self.description, tuple(found), cells, index, matrix,
+            matrix / cells.repeats[:, None, None, None],
+        )  # fmt: skip
+
+    def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
+        """S (N, size, size) of one component, checked."""
+        n, size = len(readings), readings.size
+        S = np.asarray(S, dtype=np.float64)
+        where = f"component '{name}' of the noise model '{self.name}'"
+        require(
+            S.shape in ((n,), (n, size, size)),
+            f"{where} is {S.shape}; a number per reading, ({n},), or a matrix, "
+            f"({n}, {size}, {size}), is needed",
+        )
+        require(bool(np.isfinite(S).all()), f"{where} is not finite")
+        full = S[:, None, None] * np.eye(size) if S.ndim == 1 else S
+        require(np.allclose(full, full.transpose(0, 2, 1)), f"{where} is not symmetric")
+        smallest, largest = np.linalg.eigvalsh(full)[:, [0, -1]].T
+        require(
+            bool((smallest >= -1e-9 * largest).all()),
+            f"{where} has a negative variance in some direction",
+        )
+        return full
+
+
+REGISTERED: dict[str, NoiseModel] = {}
+
+
+def register(model: NoiseModel) -> None:
+    """Add a noise model to STRUCTURES.
+
+    Raises InputError where it is none, says too little, or has the name of another one; the same
+    class takes the place of its former self.
+    """
+    if isinstance(model, type) and issubclass(model, NoiseModel):
+        raise InputError(f"register a noise model, {model.__name__}(), not its class")
+    if not isinstance(model, NoiseModel):
+        raise InputError(
+            "a noise model is an object of a class derived from NoiseModel; "
+            f"found {type(model).__name__}"
+        )
+    kind = type(model)
+    name, text = getattr(model, "name", None), getattr(model, "description", None)
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise InputError(
+            f"{kind.__name__}.name takes lower-case letters, digits and underscores, as in "
+            f'"by_day"; found {name!r}'
+        )
+    require(isinstance(text, str) and bool(text), f"{kind.__name__}.description takes a short text")
+    require(kind.components is not NoiseModel.components, f"{kind.__name__} lacks components")
+    known = REGISTERED.get(name)
+    same = known is not None and (type(known).__module__, type(known).__qualname__) == (
+        kind.__module__, kind.__qualname__,
+    )  # fmt: skip
+    require(
+        same or name not in (*STRUCTURES, "auto"),
+        f"there is a noise model '{name}' already; choose another name",
+    )
+    REGISTERED[name] = model
+    STRUCTURES[name] = model.structure
+
+
+def noise_models() -> tuple[str, ...]:
+    """Every name that `noise` takes: auto, the structures, and those with shared deviations."""
+    return ("auto", *STRUCTURES, *(name + SHARED for name in STRUCTURES))
+
+
+# Random effects: what readings of a configuration have in common besides the model.
+
+PARTITIONS = (
+    ("configuration",),
+    ("configuration", "load"),
+    ("configuration", "marker"),
+    ("configuration", "load", "marker"),
+)
+
+
+@dataclass(frozen=True)
+class SharedEffect:
+    """A deviation common to all cells of one `unit` (C,): covariance τ² diag(`axes`).
+
+    Cells are of one unit where they agree in the labels `by`.
+    """
+
+    name: str
+    by: tuple[str, ...]
+    unit: IntArray
+    axes: Array
+
+
+def shared_effects(cells: Cells, size: int, wanted: bool = True) -> tuple[SharedEffect, ...]:
+    """The shared effects that these readings can tell apart.
+
+    An arm does not come back to quite the same place: a deviation per configuration; per
+    configuration and load; per configuration and marker; and per cell, common to its repeats.
+    One is left out where it would coincide with another or with the noise of single readings.
+    Rotations, in rad, have variances of their own.
+    """
+    if not wanted:
+        return ()
+    kept: dict[tuple[str, ...], IntArray] = {}
+    for by in PARTITIONS:
+        unit = np.unique(
+            np.column_stack([getattr(cells, label) for label in by]), axis=0, return_inverse=True
+        )[1].ravel()
+        # Alone in its unit and not repeated, a reading's own noise covers it.
+        observed = np.bincount(unit, cells.repeats)
+        if (observed < 2).all() or any(np.array_equal(unit, other) for other in kept.values()):
+            continue
+        kept[by] = unit
+    position = np.where(np.arange(size) < 3, 1.0, 0.0)
+    names = {by: " and ".join([", ".join(by[:-1]), by[-1]] if by[1:] else by) for by in kept}
+    found = [SharedEffect(names[by], by, unit, position) for by, unit in kept.items()]
+    if size == 6:
+        found += [
+            SharedEffect(f"{names[by]} (rotation)", by, unit, 1.0 - position)
+            for by, unit in kept.items()
+        ]
+    return tuple(found)

@@ -1,0 +1,628 @@
+"""Variances by restricted maximum likelihood, and an estimate that knows they are estimated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, sparse, special
+
+from elastocal.errors import InsufficientDataError
+from elastocal.identification.noise_structure import Cells, SharedEffect, Structure
+from elastocal.units import Array, BoolArray, IntArray
+
+# Clusters of correlated cells, stacked by size so that linear algebra runs on whole stacks.
+
+MOST_NUMBERS = 4_000_000  # in a temporary array of a stack
+
+
+@dataclass(frozen=True)
+class Stack:
+    """G clusters of n rows each: B (G, n, p), e (G, n) and V = Σ_l θ[index[g, l]] part[g, l].
+
+    `index` (G, L) into the K variances, `part` (G, L, n, n); unused places of a cluster hold
+    index 0 and a zero part.
+    """
+
+    cells: IntArray  # (G, cells per cluster)
+    B: Array
+    e: Array
+    index: IntArray
+    part: Array
+    K: int
+
+    @cached_property
+    def uniform(self) -> bool:
+        """Whether all clusters have the same variances at the same places."""
+        return bool((self.index == self.index[0]).all())
+
+    @cached_property
+    def pairs(self) -> IntArray:
+        """Place (G·L·L,) of each pair of a cluster's variances in a flat (K, K) matrix."""
+        return (self.index[:, :, None] * self.K + self.index[:, None, :]).ravel()
+
+    @cached_property
+    def gather(self) -> sparse.csr_array:
+        """(K, G·L): sums per variance what is given per cluster and place."""
+        flat = self.index.ravel()
+        ones = np.ones(len(flat))
+        return sparse.csr_array((ones, (flat, np.arange(len(flat)))), shape=(self.K, len(flat)))
+
+
+def stacks(structure: Structure, shared: tuple[SharedEffect, ...]) -> list[Stack]:
+    """The clusters of a structure: a configuration where effects are shared, else a cell."""
+    cells = structure.cells
+    label = cells.configuration if shared else np.arange(len(cells))
+    _, cluster, count = np.unique(label, return_inverse=True, return_counts=True)
+    order = np.argsort(cluster, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(count)[:-1]])
+    found = []
+    size, p = cells.e.shape[1], cells.B.shape[2]
+    for m in np.unique(count):
+        groups = np.flatnonzero(count == m)
+        n, parts = int(m) * size, structure.index.shape[1] * int(m) + len(shared)
+        step = max(1, MOST_NUMBERS // (parts * n * (n + p) + parts * p * p))
+        for first in range(0, len(groups), step):
+            members = order[starts[groups[first : first + step], None] + np.arange(m)]
+            found.append(_stack(structure, shared, members))
+    return found
+
+
+def _stack(structure: Structure, shared: tuple[SharedEffect, ...], members: IntArray) -> Stack:
+    cells = structure.cells
+    G, m = members.shape
+    size, p = cells.e.shape[1], cells.B.shape[2]
+    index, part = _own(structure, members)
+    n_own = len(structure.names)
+    for k, effect in enumerate(shared):
+        unit = effect.unit[members]
+        same = (unit[:, :, None] == unit[:, None, :]).astype(float)
+        block = same[:, :, None, :, None] * np.diag(effect.axes)[None, None, :, None, :]
+        part = np.concatenate([part, block.reshape(G, 1, m * size, m * size)], axis=1)
+        index = np.concatenate([index, np.full((G, 1), n_own + k)], axis=1)
+    B = cells.B[members].reshape(G, m * size, p)
+    e = cells.e[members].reshape(G, m * size)
+    return Stack(members, B, e, index, part, n_own + len(shared))
+
+
+def _own(structure: Structure, members: IntArray) -> tuple[IntArray, Array]:
+    """Own variances of each cluster, each once: index (G, L) and part (G, L, n, n)."""
+    G, m = members.shape
+    size = structure.cells.e.shape[1]
+    index = structure.index[members].reshape(G, -1)  # (G, m * L)
+    if (index.reshape(G, m, -1) == index.reshape(G, m, -1)[:, :1]).all():
+        place = np.tile(np.arange(index.shape[1] // m), m)[None].repeat(G, axis=0)
+        distinct = index[:, : index.shape[1] // m]
+    else:
+        distinct, place = _distinct(index)
+    L = distinct.shape[1]
+    blocks = structure.mean_matrix[members]  # (G, m, L0, size, size)
+    part = np.zeros((G, L, m, size, m, size))
+    place = place.reshape(G, m, -1)
+    g = np.arange(G)
+    for cell in range(m):
+        for j in range(place.shape[2]):
+            part[g, place[:, cell, j], cell, :, cell, :] += blocks[:, cell, j]
+    return distinct, part.reshape(G, L, m * size, m * size)
+
+
+def _distinct(index: IntArray) -> tuple[IntArray, IntArray]:
+    """Different entries of each row (G, L), padded with 0, and where each entry stands in it."""
+    rows = [np.unique(row, return_inverse=True) for row in index]
+    L = max(len(values) for values, _ in rows)
+    distinct = np.array([np.pad(values, (0, L - len(values))) for values, _ in rows])
+    return distinct, np.array([place.ravel() for _, place in rows])
+
+
+# Restricted likelihood of variances, its slope and information, and the estimate under them.
+#
+# For e = B Δx + noise with V = Σ_k θ_k V_k (Patterson and Thompson 1971; Harville 1977):
+#
+#     −2 ℓ_R = log|V| + log|BᵀV⁻¹B| + eᵀPe + (rows − p) log 2π,   P = V⁻¹ − V⁻¹BΦBᵀV⁻¹
+#     ∂ℓ/∂θ_k = ½ (eᵀP V_k P e − tr P V_k),   E[−∂²ℓ/∂θ_k∂θ_l] = ½ tr(P V_k P V_l)
+#
+# with Φ = (BᵀV⁻¹B)⁻¹.  Repeats enter as cell means, and their scatter as Wishart terms.
+
+LEAST_TOLD = 1e-9  # of the information on θ_k that there would be if Δx were known
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """A stack under V = R Rᵀ: R⁻¹ (G, n, n), A_l = R⁻¹ V_l R⁻ᵀ (G, L, n, n), R⁻¹B, R⁻¹e, log|V|."""
+
+    stack: Stack
+    inverse: Array
+    A: Array
+    B: Array
+    e: Array
+    log_det: float
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything at one θ (K,): estimate Δx (p,), Φ (p, p), `log_likelihood`, and what it took."""
+
+    theta: Array
+    x: Array
+    Phi: Array
+    log_likelihood: float
+    whitened: list[Whitened]
+    inner: Array  # (repeated cells, size, size): inverse covariance of a single reading
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Score (K,), expected and observed information (K, K) of θ; `C` (K, p, p): BᵀV⁻¹V_kV⁻¹B.
+
+    `told` (K,): whether the readings say anything of θ_k, which they do not where the parameters
+    explain all that it could cause.
+    """
+
+    score: Array
+    information: Array
+    observed: Array
+    C: Array
+    told: BoolArray
+
+
+def evaluate(structure: Structure, stacked: list[Stack], theta: Array) -> State:
+    """State at θ.  Raises LinAlgError where V is not positive definite.
+
+    InsufficientDataError where B has dependent columns.
+    """
+    cells = structure.cells
+    p, size = cells.B.shape[2], cells.e.shape[1]
+    whitened = [_whiten(stack, theta) for stack in stacked]
+    normal = sum((np.tensordot(w.B, w.B, ((0, 1), (0, 1))) for w in whitened), np.zeros((p, p)))
+    right = sum((np.tensordot(w.B, w.e, ((0, 1), (0, 1))) for w in whitened), np.zeros(p))
+    try:
+        factor = linalg.cholesky(normal, lower=True)
+    except linalg.LinAlgError:
+        raise InsufficientDataError(
+            "the columns of B depend on each other under this noise model; measure more poses"
+        ) from None
+    x = linalg.cho_solve((factor, True), right)
+    Phi = linalg.cho_solve((factor, True), np.eye(p))
+    squares = sum(float(w.e.ravel() @ w.e.ravel()) for w in whitened) - float(right @ x)
+    repeated = cells.dof > 0
+    single = np.einsum("cl,clij->cij", theta[structure.index[repeated]], structure.matrix[repeated])
+    inner = np.linalg.inv(single)
+    log_det = np.linalg.slogdet(single)[1]
+    within = float(cells.dof[repeated] @ log_det) + float(np.vdot(inner, cells.scatter[repeated]))
+    rows = int(cells.repeats.sum()) * size
+    total = (
+        sum(w.log_det for w in whitened) + 2 * float(np.log(np.diag(factor)).sum()) + squares
+        + within + cells.log_offset + (rows - p) * np.log(2 * np.pi)
+    )  # fmt: skip
+    return State(theta, x, Phi, -0.5 * total, whitened, inner)
+
+
+def slope(structure: Structure, state: State) -> Slope:
+    """Score and information of θ at a state."""
+    K, p = len(state.theta), len(state.x)
+    score, summed, D = np.zeros(K), np.zeros((K, p * p)), np.zeros((K, p))
+    known = np.zeros(K)
+    twice_expected, product = np.zeros(K * K), np.zeros(K * K)
+    half = linalg.cholesky(state.Phi, lower=True)
+    for w in state.whitened:
+        G, L = w.stack.index.shape
+        flat = w.stack.index.ravel()
+        z = w.e - w.B @ state.x
+        AB = w.A @ w.B[:, None]  # (G, L, n, p)
+        Az = (w.A @ z[:, None, :, None])[..., 0]  # (G, L, n)
+        if w.stack.uniform:
+            whole = AB.transpose(1, 0, 2, 3).reshape(L, -1, p)
+            np.add.at(summed, flat[:L], (w.B.reshape(-1, p).T @ whole).reshape(L, -1))
+        else:
+            summed += w.stack.gather @ (w.B.transpose(0, 2, 1)[:, None] @ AB).reshape(G * L, -1)
+        D += w.stack.gather @ (Az @ w.B).reshape(-1, p)
+        squares = (Az @ z[:, :, None])[..., 0]
+        trace = np.trace(w.A, axis1=2, axis2=3)
+        score += np.bincount(flat, 0.5 * (squares - trace).ravel(), K)
+        spread, whole = (AB @ half).reshape(G, L, -1), w.A.reshape(G, L, -1)
+        known += np.bincount(flat, 0.5 * (whole**2).sum(axis=2).ravel(), K)
+        local = whole @ whole.transpose(0, 2, 1) - 2 * spread @ spread.transpose(0, 2, 1)
+        twice_expected += np.bincount(w.stack.pairs, local.ravel(), K * K)
+        product += np.bincount(w.stack.pairs, (Az @ Az.transpose(0, 2, 1)).ravel(), K * K)
+    C = summed.reshape(K, p, p)
+    score += 0.5 * summed @ state.Phi.ravel()
+    rotated = (half.T @ C @ half).reshape(K, -1)
+    information = 0.5 * (twice_expected.reshape(K, K) + rotated @ rotated.T)
+    # −∂²ℓ/∂θ_k∂θ_l = eᵀP V_k P V_l P e − ½ tr(P V_k P V_l)
+    Dh = D @ half
+    observed = product.reshape(K, K) - Dh @ Dh.T - information
+    _within(structure, state, score, information, observed)
+    return Slope(score, information, observed, C, np.diag(information) > LEAST_TOLD * known)
+
+
+def _within(
+    structure: Structure, state: State, score: Array, information: Array, observed: Array
+) -> None:
+    """Add what the scatter of repeats says: Wishart terms of each cell."""
+    cells, K = structure.cells, len(score)
+    repeated = np.flatnonzero(cells.dof > 0)
+    if not len(repeated):
+        return
+    dof, index = cells.dof[repeated], structure.index[repeated]
+    n, L = index.shape
+    S = state.inner[:, None] @ structure.matrix[repeated]  # (C, L, size, size)
+    W = state.inner @ cells.scatter[repeated]
+    flat = S.reshape(n, L, -1)
+    other = S.transpose(0, 1, 3, 2).reshape(n, L, -1)
+    squares = (flat @ W.transpose(0, 2, 1).reshape(n, -1, 1))[..., 0]
+    trace = np.trace(S, axis1=2, axis2=3)
+    score += np.bincount(index.ravel(), 0.5 * (squares - dof[:, None] * trace).ravel(), K)
+    pairs = (index[:, :, None] * K + index[:, None, :]).ravel()
+    expected = 0.5 * dof[:, None, None] * (flat @ other.transpose(0, 2, 1))
+    product = flat @ (W[:, None] @ S).transpose(0, 1, 3, 2).reshape(n, L, -1).transpose(0, 2, 1)
+    product = (product + product.transpose(0, 2, 1)) / 2
+    information += np.bincount(pairs, expected.ravel(), K * K).reshape(K, K)
+    observed += np.bincount(pairs, (product - expected).ravel(), K * K).reshape(K, K)
+
+
+def _whiten(stack: Stack, theta: Array) -> Whitened:
+    G, L, n, _ = stack.part.shape
+    V = (theta[stack.index][:, None] @ stack.part.reshape(G, L, -1)).reshape(G, n, n)
+    R = np.linalg.cholesky(V)
+    inverse = np.linalg.inv(R)
+    A = inverse[:, None] @ stack.part @ inverse.transpose(0, 2, 1)[:, None]
+    e = (inverse @ stack.e[:, :, None])[..., 0]
+    log_det = 2 * float(np.log(np.diagonal(R, axis1=1, axis2=2)).sum())
+    return Whitened(stack, inverse, A, inverse @ stack.B, e, log_det)
+
+
+# Variances by restricted maximum likelihood: Newton and Fisher steps, variances kept ≥ 0.
+
+STEPS = 60
+DECREMENT = 1e-18  # gain in ℓ that a step still promises: variances exact to about nine digits
+VISIBLE = 1e-7  # gains below this drown in the rounding of ℓ, those of the score do not
+SMALLEST = 1e-10  # of the start: a variance that falls below this (σ by 1e5) stays there
+# A variance that goes to zero falls by e with every Newton step in its logarithm, and the gain with
+# it.  Once no step promises more than this, one step takes it all the way.
+LITTLE = 1e-3
+TINY = 1e-100  # stands for the variance of perfect data: its square is still a number
+
+
+@dataclass(frozen=True)
+class LogPrior:
+    """Gaussian prior on log θ of the structure's own variances: mean (K,), precision (K, K)."""
+
+    mean: Array
+    precision: Array
+
+    @cached_property
+    def log_constant(self) -> float:
+        """log of the normalising constant."""
+        log_det = float(np.linalg.slogdet(self.precision)[1])
+        return 0.5 * log_det - 0.5 * len(self.mean) * float(np.log(2 * np.pi))
+
+    def value(self, theta: Array) -> float:
+        """log density at log θ."""
+        d = np.log(theta) - self.mean
+        return self.log_constant - 0.5 * float(d @ self.precision @ d)
+
+
+@dataclass(frozen=True)
+class Reml:
+    """Variances θ (own ones first, then shared), state there, their covariance (K, K) of θ̂.
+
+    `log_likelihood` is the restricted one, and with a prior the marginal one by Laplace's method.
+    """
+
+    structure: Structure
+    shared: tuple[SharedEffect, ...]
+    state: State
+    slope: Slope
+    covariance: Array
+    log_likelihood: float
+    converged: bool
+
+    @property
+    def own(self) -> Array:
+        return self.state.theta[: len(self.structure.names)]
+
+    @property
+    def common(self) -> Array:
+        return self.state.theta[len(self.structure.names) :]
+
+
+def reml(
+    structure: Structure,
+    shared: tuple[SharedEffect, ...],
+    prior: LogPrior | None = None,
+    start: Array | None = None,
+) -> Reml:
+    """Maximise the restricted likelihood (times the prior of log θ, where there is one).
+
+    Own variances are stepped in log θ, shared ones in θ, each with a bound (zero for shared ones,
+    next to nothing for own ones): one that the likelihood pushes below it stays there.
+    """
+    stacked = stacks(structure, shared)
+    own = len(structure.names)
+    theta = usual_start(structure, shared) if start is None else start.copy()
+    bound = np.zeros(len(theta))
+    bound[:own] = SMALLEST * float(theta[:own].max())
+    state = evaluate(structure, stacked, theta)
+    at = slope(structure, state)
+    if not at.told[own:].all():  # shared, and the parameters could explain all of it
+        theta[own:] *= at.told[own:]
+        state = evaluate(structure, stacked, theta)
+        at = slope(structure, state)
+    value, converged, last = _objective(state, prior, own), False, np.inf
+    for _ in range(STEPS):
+        score, step = _step(at, state.theta, prior, own, bound)
+        gain = float(score @ step)
+        if gain < DECREMENT or VISIBLE > gain >= last:
+            converged = True
+            break
+        if gain < VISIBLE:
+            state, last = evaluate(structure, stacked, _moved(state.theta, step, own, bound)), gain
+        else:
+            moved = _vanished(structure, stacked, state, value, gain, step, prior, own, bound)
+            if moved is None:
+                moved = _line_search(structure, stacked, state, value, step, prior, own, bound)
+            if moved is None:
+                converged = gain < 1e-4  # as good as rounding allows
+                break
+            state, value = moved
+        at = slope(structure, state)
+    _, H, chain = _working(at, state.theta, prior, own)
+    covariance = np.zeros_like(H)
+    kept = np.flatnonzero((state.theta > bound) & at.told)
+    # A variance at its bound is taken for zero, not for uncertain (the convention of mixed-model
+    # software): counting it widens intervals that are wide enough already.
+    if kept.size:
+        covariance[np.ix_(kept, kept)] = _inverse(H[np.ix_(kept, kept)])
+    covariance = chain[:, None] * covariance * chain
+    likelihood = state.log_likelihood
+    if prior is not None:
+        log_det = np.linalg.slogdet(H[:own, :own])[1]
+        likelihood += prior.value(state.theta[:own]) + 0.5 * own * np.log(2 * np.pi) - 0.5 * log_det
+    return Reml(structure, shared, state, at, covariance, likelihood, converged)
+
+
+def _objective(state: State, prior: LogPrior | None, own: int) -> float:
+    return state.log_likelihood + (0.0 if prior is None else prior.value(state.theta[:own]))
+
+
+def _working(
+    at: Slope, theta: Array, prior: LogPrior | None, own: int
+) -> tuple[Array, Array, Array]:
+    """Score and expected information in the stepping variables, and dθ/d(variable)."""
+    chain = np.ones(len(theta))
+    chain[:own] = theta[:own]
+    score, H = chain * at.score, chain[:, None] * at.information * chain
+    if prior is not None:
+        score[:own] -= prior.precision @ (np.log(theta[:own]) - prior.mean)
+        H[:own, :own] += prior.precision
+    return score, H, chain
+
+
+def _step(
+    at: Slope, theta: Array, prior: LogPrior | None, own: int, bound: Array
+) -> tuple[Array, Array]:
+    """Score and step in the stepping variables.
+
+    Newton's step where the objective is concave, else Fisher's.
+    """
+    score, expected, chain = _working(at, theta, prior, own)
+    free = ((theta > bound) | (score > 0)) & at.told
+    curvature = chain[:, None] * (at.observed - at.information) * chain
+    curvature[np.arange(own), np.arange(own)] -= (chain * at.score)[:own]
+    step = np.zeros(len(theta))
+    if not free.any():
+        return score, step
+    inside = np.ix_(free, free)
+    try:
+        step[free] = _solve((expected + curvature)[inside], score[free])
+    except np.linalg.LinAlgError:
+        step[free] = _solve(expected[inside], score[free])
+    return score, step
+
+
+def _solve(H: Array, score: Array) -> Array:
+    """H⁻¹ score.  Raises LinAlgError unless H is positive definite."""
+    diagonal = np.diag(H)
+    if diagonal.min() <= 0:
+        raise np.linalg.LinAlgError
+    scale = np.sqrt(diagonal)
+    # A trace of ridge: variances that the data cannot separate share the step.
+    factor = linalg.cho_factor(H / np.outer(scale, scale) + 1e-9 * np.eye(len(H)), lower=True)
+    return np.asarray(linalg.cho_solve(factor, score / scale)) / scale
+
+
+def _inverse(H: Array) -> Array:
+    """Inverse of the information; the pseudo-inverse where variances cannot be told apart."""
+    scale = np.sqrt(np.diag(H))
+    scaled = H / np.outer(scale, scale)
+    factor, failed = linalg.lapack.dpotrf(scaled, lower=True)
+    if failed or np.diag(factor).min() < 1e-6:
+        inverse = np.linalg.pinv(scaled, hermitian=True)
+    else:
+        inverse = linalg.cho_solve((factor, True), np.eye(len(H)))
+    return np.asarray(inverse / np.outer(scale, scale))
+
+
+def _moved(theta: Array, step: Array, own: int, bound: Array) -> Array:
+    """θ after a step, own variances in their logarithm, none below its bound."""
+    moved = theta + step
+    moved[:own] = theta[:own] * np.exp(step[:own])
+    return np.maximum(moved, bound)
+
+
+def _vanished(
+    structure: Structure,
+    stacked: list[Stack],
+    state: State,
+    value: float,
+    gain: float,
+    step: Array,
+    prior: LogPrior | None,
+    own: int,
+    bound: Array,
+) -> tuple[State, float] | None:
+    """The step that takes variances on their way to zero to their bound; None where there are
+    none or that costs."""
+    falling = np.zeros(len(step), dtype=bool)
+    falling[:own] = np.abs(step[:own] + 1.0) < 0.1
+    if gain > LITTLE or not falling.any():
+        return None
+    theta = _moved(state.theta, step, own, bound)
+    theta[falling] = bound[falling]
+    try:
+        trial = evaluate(structure, stacked, theta)
+    except np.linalg.LinAlgError:
+        return None
+    found = _objective(trial, prior, own)
+    return (trial, found) if found > value else None
+
+
+def _line_search(
+    structure: Structure,
+    stacked: list[Stack],
+    state: State,
+    value: float,
+    step: Array,
+    prior: LogPrior | None,
+    own: int,
+    bound: Array,
+) -> tuple[State, float] | None:
+    """The first of ever shorter steps that raises the objective; None where none does."""
+    largest = float(np.abs(step[:own]).max(initial=0.0))
+    length = min(1.0, 2.0 / largest) if largest > 0 else 1.0
+    for _ in range(30):
+        try:
+            trial = evaluate(structure, stacked, _moved(state.theta, length * step, own, bound))
+        except np.linalg.LinAlgError:
+            length /= 2
+            continue
+        found = _objective(trial, prior, own)
+        if found > value:
+            return trial, found
+        length /= 2
+    return None
+
+
+def usual_start(structure: Structure, shared: tuple[SharedEffect, ...]) -> Array:
+    """Own variances from the scatter of repeats where there is any, else from all residuals."""
+    cells = structure.cells
+    size = cells.e.shape[1]
+    # Variance of one reading that θ = 1 would give: 1, but for noise that is stated.
+    unit = np.trace(structure.mean_matrix.sum(axis=1), axis1=1, axis2=2) * cells.repeats / size
+    own = float(np.median((cells.e**2).mean(axis=1) * cells.repeats / unit))
+    if cells.dof.sum() > 0:
+        squares = float(np.trace(cells.scatter, axis1=1, axis2=2).sum())
+        own = max(squares / (float(cells.dof.sum()) * size), 1e-9 * own)
+    # Shared effects start above zero, from where they are free to go there.
+    share = max(0.1 * float((cells.e**2).mean()), TINY)
+    return np.concatenate(
+        [np.full(len(structure.names), max(own, TINY)), np.full(len(shared), share)]
+    )
+
+
+# Covariance and degrees of freedom of an estimate whose weights were estimated too.
+#
+# Kenward and Roger 1997 (Biometrics 53, 983): with W = cov(θ̂), P_k = −BᵀV⁻¹V_kV⁻¹B and
+# Q_kl = BᵀV⁻¹V_kV⁻¹V_lV⁻¹B,
+#
+#     Φ_A = Φ + 2 Φ [Σ_kl W_kl (Q_kl − P_k Φ P_l)] Φ
+#
+# Φ alone is too small twice over: estimated weights cost accuracy, and Φ̂ does not see it.  (Their
+# term in ∂²V/∂θ² is zero, V being linear in θ.)  A combination c of the parameters has
+# Satterthwaite's degrees of freedom 2 (cᵀΦc)² / (gᵀWg), g_k = cᵀΦBᵀV⁻¹V_kV⁻¹BΦc, which is what
+# theirs are for one contrast.
+
+
+def kenward_roger(fit: Reml, combinations: Array | None = None) -> tuple[Array, Array]:
+    """Adjusted covariance (k, k) of `combinations` (k, p) of Δx, default each parameter.
+
+    And the degrees of freedom (k,) of each; infinite where no estimated variance matters.
+    """
+    Phi, C, W = fit.state.Phi, fit.slope.C, fit.covariance
+    p = len(Phi)
+    middle = np.zeros((p, p))
+    for w in fit.state.whitened:
+        index = w.stack.index
+        G, L = index.shape
+        AB = w.A @ w.B[:, None]  # (G, L, n, p)
+        weight = W[index[:, :, None], index[:, None, :]]
+        mixed = (weight @ AB.reshape(G, L, -1)).reshape(AB.shape)
+        middle += np.tensordot(AB, mixed, ((0, 1, 2), (0, 1, 2)))
+    mixed = (W @ C.reshape(len(W), -1)).reshape(C.shape)
+    middle -= (C @ Phi @ mixed).sum(axis=0)
+    # No less than zero but for rounding, which shows where variances differ by many powers of ten.
+    values, vectors = np.linalg.eigh((middle + middle.T) / 2)
+    more = Phi @ (vectors * np.sqrt(2 * np.maximum(values, 0.0)))
+    adjusted = Phi + more @ more.T
+    rows = np.eye(p) if combinations is None else combinations
+    plain = rows @ Phi
+    variance = (plain * rows).sum(axis=1)
+    g = ((plain @ C) * plain).sum(axis=2)  # (K, k)
+    spread = (g * (W @ g)).sum(axis=0)
+    told = spread > 0
+    dof = np.divide(2 * variance**2, spread, out=np.full(len(rows), np.inf), where=told)
+    covariance = rows @ adjusted @ rows.T
+    return (covariance + covariance.T) / 2, dof
+
+
+# Many variances from few readings each: shrink their logarithms towards one another.
+#
+# Empirical Bayes in the spirit of Smyth 2004 (Stat. Appl. Genet. Mol. Biol. 3, 3), with a lognormal
+# prior that knows direction and configuration: log θ_ca = μ_a + u_c + v_ca, where u ~ N(0, ω_u) and
+# v ~ N(0, ω_v).  A sample variance s² on f degrees of freedom has log s² = log θ + ψ(f/2) −
+# log(f/2) plus scatter of variance ψ'(f/2), from which an analysis of variance finds μ, ω_u and
+# ω_v.
+
+FEWEST = 2.0  # degrees of freedom of a group, at the median, below which there is nothing to shrink
+NARROWEST = 1e-3  # variance of log θ: equal to within 3 %
+
+
+def prior_of_groups(structure: Structure, residual: Array) -> LogPrior:
+    """Prior of the group variances from the scatter of a group's cells about their own mean.
+
+    `residual` (C, size): cell means less a fit.  What all cells of a group share, an effect of
+    its configuration, is taken out with the mean.  Raises InsufficientDataError where the groups
+    hold too few readings.
+    """
+    cells = structure.cells
+    size = residual.shape[1]
+    K = len(structure.names)
+    s2, f = _sample_variances(cells, structure.index, residual, K)
+    if np.median(f) < FEWEST or 3 * size > K:
+        raise InsufficientDataError(
+            "the groups of a configuration and a direction hold too few readings for variances of "
+            "their own; repeat readings, or choose another noise model"
+        )
+    # A lucky group of (near) equal readings says little about its variance, not minus infinity.
+    s2 = np.maximum(s2, max(1e-6 * float(np.median(s2)), TINY))
+    z = np.log(s2) - special.digamma(f / 2) + np.log(f / 2)
+    noise = special.polygamma(1, f / 2)
+    table, scatter = z.reshape(-1, size), float(noise.mean())
+    configurations = len(table)
+    mean = np.average(table, axis=0, weights=1 / noise.reshape(-1, size))
+    between = table - mean
+    u = between.mean(axis=1)
+    within = ((between - u[:, None]) ** 2).sum()
+    if size > 1:
+        omega_v = float(within / ((configurations - 1) * (size - 1))) - scatter
+        omega_u = float((u**2).sum() / (configurations - 1)) - (max(omega_v, 0) + scatter) / size
+    else:
+        omega_v, omega_u = float((u**2).sum() / (configurations - 1)) - scatter, 0.0
+    block = max(omega_u, 0.0) * np.ones((size, size)) + max(omega_v, NARROWEST) * np.eye(size)
+    precision = np.kron(np.eye(configurations), np.linalg.inv(block)).astype(np.float64)
+    return LogPrior(np.tile(mean, configurations), precision)
+
+
+def _sample_variances(
+    cells: Cells, index: NDArray[np.int64], residual: Array, K: int
+) -> tuple[Array, Array]:
+    """Variance of a single reading within each group (K,), and its degrees of freedom (K,)."""
+    weight = np.repeat(cells.repeats[:, None], residual.shape[1], axis=1).ravel()
+    group, e = index.ravel(), residual.ravel()
+    mean = np.bincount(group, weight * e, K) / np.bincount(group, weight, K)
+    squares = np.bincount(group, weight * (e - mean[group]) ** 2, K)
+    squares += np.bincount(group, np.diagonal(cells.scatter, axis1=1, axis2=2).ravel(), K)
+    dof = np.bincount(group, weight, K) - 1.0
+    return squares / np.maximum(dof, 1.0), np.maximum(dof, 0.5)

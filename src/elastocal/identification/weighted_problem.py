@@ -1,0 +1,535 @@
+"""The weighted problem: Σ and W with WᵀW = Σ⁻¹; B and e in parts, reduced to their R factor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, sparse
+
+from elastocal.cell.arm_description import Tracker
+from elastocal.errors import InputError, option
+from elastocal.model.manipulator import Model, Regression
+from elastocal.model.observations import Observations, alone, subset
+from elastocal.tracker_noise import available_noise, need, position_covariance
+from elastocal.units import Array, IntArray
+
+# Measurement noise: covariance of the observations and the weights W with W Σ = I.
+#
+# Weights as in Klimchik et al. 2013, eq. (9) to (13), generalised from a diagonal Σ to blocks:
+# a polar tracker's errors are correlated in x, y, z, and deflections that share an unloaded
+# reading are correlated with each other.
+
+WeightKind = Literal["auto", "none", "rows", "axis", "polar", "covariance"]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """`whiten` (rows, rows) with whiten · Σ · whitenᵀ = I, or None for unit weights.
+
+    `absolute` says whether Σ is stated in m² (then a whitened residual has expected size 1)
+    or holds only up to a common factor, which the residual must tell.
+    """
+
+    kind: str
+    whiten: sparse.csr_array | None
+    absolute: bool
+    description: str
+
+    def apply(self, rows: Array) -> Array:
+        """Whiten a vector (rows,) or matrix (rows, k)."""
+        return rows if self.whiten is None else self.whiten @ rows
+
+
+def weights_for(
+    observed: Observations,
+    tracker: Tracker,
+    kind: WeightKind = "auto",
+    covariance: Array | None = None,
+) -> Weights:
+    """Weights for the observations; "auto" takes the table's sigmas, else the cell's, else none.
+
+    "rows" uses the table's sigma columns (Cartesian or polar), "axis" the cell's `sigma_um`,
+    "polar" the cell's range and transverse noise, "covariance" the matrix (rows, rows) given.
+    Raises InputError where the noise that `kind` names is not there.
+    """
+    chosen = _available(observed, tracker) if kind == "auto" and covariance is None else kind
+    if covariance is not None or chosen == "covariance":
+        return _given(observed, covariance)
+    if chosen == "none":
+        return Weights("none", None, False, "unit weights (ordinary least squares)")
+    blocks, text = stated_covariance(observed, tracker, chosen)
+    kind_used = "axis" if observed.kind == "distance" else chosen
+    if observed.kind != "deflection":  # every observation is a reading of its own
+        return Weights(kind_used, block_diagonal(inverse_factor(blocks)), True, text)
+    mix = sparse.kron(observed.combine, sparse.eye_array(observed.size), format="csr")
+    covariance_rows = sparse.csr_array(mix @ block_diagonal(blocks) @ mix.T)
+    return Weights(kind_used, whitener(covariance_rows), True, text)
+
+
+def stated_covariance(observed: Observations, tracker: Tracker, kind: str) -> tuple[Array, str]:
+    """Stated covariance (n_rows, size, size) of every table row, and where it comes from.
+
+    Raises InputError where the cell or the table does not state what this needs.
+    """
+    if observed.kind == "distance":
+        need(tracker.distance_sigma is not None, "distances need [tracker] distance_um")
+        sigma = float(tracker.distance_sigma or 1.0)
+        text = f"distance sigma {sigma * 1e6:.3g} µm from the cell"
+        return np.full((len(observed.table), 1, 1), sigma**2), text
+    blocks, text = position_covariance(observed.table, tracker, kind)
+    if observed.kind == "pose":
+        need(tracker.rotation_sigma is not None, "poses need [tracker] rotation_urad")
+        full = np.zeros((len(observed.table), 6, 6))
+        full[:, :3, :3] = blocks
+        full[:, 3:, 3:] = np.eye(3) * float(tracker.rotation_sigma or 1.0) ** 2
+        blocks = full
+    return blocks, text
+
+
+def scaled_by_component(observed: Observations, sigma: Array) -> Weights:
+    """Weights from one sigma per component (size,), known up to a common factor.
+
+    For full poses without stated noise: positions in m and rotations in rad need a relative
+    weight, which is estimated from the residuals of a first fit.
+    """
+    diagonal = np.tile(1.0 / sigma, len(observed.lead))
+    text = "position and rotation weighted by the spread of their residuals in a first fit"
+    return Weights("component", sparse.csr_array(sparse.diags_array(diagonal)), False, text)
+
+
+def _available(observed: Observations, tracker: Tracker) -> str:
+    if observed.kind == "distance":
+        return "none" if tracker.distance_sigma is None else "axis"
+    if observed.kind == "pose" and tracker.rotation_sigma is None:
+        return "none"
+    return available_noise(observed.table, tracker)
+
+
+def _given(observed: Observations, covariance: Array | None) -> Weights:
+    need(covariance is not None, f"weights 'covariance' need a matrix ({option('covariance')})")
+    matrix = np.asarray(covariance, dtype=float)
+    n = len(observed.value)
+    need(
+        matrix.shape == (n, n),
+        f"the covariance is {matrix.shape}, but there are {n} rows (observations × components)",
+    )
+    need(
+        bool(np.isfinite(matrix).all()) and np.allclose(matrix, matrix.T, rtol=1e-9),
+        "the covariance must be finite and symmetric",
+    )
+    return Weights("covariance", whitener(sparse.csr_array(matrix)), True, "given covariance")
+
+
+def block_diagonal(blocks: Array) -> sparse.csr_array:
+    """Blocks (n, d, d) along the diagonal; their zeros are not stored."""
+    n, d, _ = blocks.shape
+    block, i, j = np.nonzero(blocks)
+    counts = np.bincount(block * d + i, minlength=n * d)
+    indptr = np.concatenate([[0], np.cumsum(counts)])
+    return sparse.csr_array((blocks[block, i, j], block * d + j, indptr), shape=(n * d, n * d))
+
+
+def inverse_factor(blocks: Array) -> Array:
+    """L⁻¹ of each block (n, d, d) = L Lᵀ."""
+    try:
+        factor = np.linalg.cholesky(blocks)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "the noise covariance is not positive definite; check sigmas and covariance"
+        ) from None
+    return np.linalg.solve(factor, np.broadcast_to(np.eye(blocks.shape[1]), factor.shape))
+
+
+def whitener(covariance: sparse.csr_array) -> sparse.csr_array:
+    """L⁻¹ of the Cholesky factor, block by block over groups of correlated rows."""
+    count, label = sparse.csgraph.connected_components(covariance, directed=False)
+    order = np.argsort(label, kind="stable")
+    sizes = np.bincount(label, minlength=count)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    rows, columns, values = [], [], []
+    for size in np.unique(sizes):
+        groups = np.flatnonzero(sizes == size)
+        members = order[starts[groups][:, None] + np.arange(size)]
+        i, j = members[:, :, None], members[:, None, :]
+        i, j = np.broadcast_arrays(i, j)
+        dense = np.asarray(covariance[i.ravel(), j.ravel()]).reshape(i.shape)
+        inverse = inverse_factor(dense)
+        keep = np.tril(np.ones((size, size), dtype=bool))
+        rows.append(i[:, keep].ravel())
+        columns.append(j[:, keep].ravel())
+        values.append(inverse[:, keep].ravel())
+    triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csr_array(triplets, shape=covariance.shape)
+
+
+# A table in parts: small enough to work on, cut where nothing is correlated.
+
+Span = tuple[int, int]
+
+# Numbers in B (rows × parameters): from LARGE on a fit works in parts of at most PART.  16 MB a
+# part keeps the evaluation of B at full speed, and the copies that QR makes small.
+LARGE = 2**21
+PART = 2**21
+OF_A_MARKER = 30  # observations of each marker at least, where there are as many, in a sample
+
+
+def is_large(observed: Observations, n_parameters: int) -> bool:
+    """Whether B of all parameters is too large to be formed at once."""
+    return len(observed.value) * n_parameters > LARGE
+
+
+@dataclass(frozen=True)
+class Part:
+    """The observations `index` (n,) of a table, whitened by `weights` on their own.
+
+    `rows` (n·size,) are their rows among those of all observations.
+    """
+
+    index: IntArray
+    rows: IntArray
+    observations: Observations
+    weights: Weights
+
+
+@dataclass(frozen=True)
+class Partition:
+    """All observations in `groups` of spans of `order` (None: as they stand in the table).
+
+    Correlated observations share a span, and observations of one configuration share a group.
+    A group is one span, unless a configuration is larger than a part.
+    """
+
+    observed: Observations
+    weights: Weights
+    order: IntArray | None
+    groups: tuple[tuple[Span, ...], ...]
+
+    @cached_property
+    def blocks(self) -> IntArray | None:
+        """Number of the block (observations,) that each observation is correlated within.
+
+        None where every observation is on its own.
+        """
+        return _correlated(self.observed, self.weights)
+
+    @property
+    def spans(self) -> list[Span]:
+        return [span for group in self.groups for span in group]
+
+    def part(self, span: Span) -> Part:
+        """The observations of a span, in the table's order."""
+        if len(self.groups) == 1 and len(self.groups[0]) == 1:
+            n, rows = len(self.observed.lead), len(self.observed.value)
+            return Part(np.arange(n), np.arange(rows), self.observed, self.weights)
+        index = np.arange(*span) if self.order is None else np.sort(self.order[slice(*span)])
+        return part_of(self.observed, self.weights, index)
+
+
+def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
+    """Observations `index` (n,), ascending, with the weights of these alone.
+
+    Exact where what is correlated is in `index` together.
+    """
+    rows = (index[:, None] * observed.size + np.arange(observed.size)).ravel()
+    if observed.kind == "deflection":
+        chosen = np.zeros(len(observed.lead), dtype=bool)
+        chosen[index] = True
+        own = subset(observed, chosen)
+    else:
+        value = observed.value[_run(rows)]
+        table = observed.table.take(_run(observed.lead[index]))
+        own = Observations(observed.kind, value, alone(len(index)), np.arange(len(index)), table)
+    if weights.whiten is None:
+        return Part(index, rows, own, weights)
+    inside = weights.whiten[_run(rows)][:, _run(rows)]
+    return Part(index, rows, own, replace(weights, whiten=inside))
+
+
+def _run(index: IntArray) -> IntArray | slice:
+    """`index` (n,) as a slice where it counts up by one: arrays are then seen and not copied."""
+    if len(index) and index[-1] - index[0] == len(index) - 1 and (np.diff(index) == 1).all():
+        return slice(int(index[0]), int(index[-1]) + 1)
+    return index
+
+
+def sample(parts: Partition, n: int, seed: int = 0) -> Part:
+    """About n observations at random, some of every marker, correlated ones together."""
+    observed, blocks = parts.observed, parts.blocks
+    order = np.random.default_rng(seed).permutation(len(observed.lead))
+    if blocks is not None:  # each brings the others of its block with it
+        n = -(-n * (int(blocks.max()) + 1) // len(blocks))
+    marker = observed.table.marker[observed.lead[order]]
+    some = [order[marker == code][:OF_A_MARKER] for code in np.unique(marker)]
+    chosen = np.unique(np.concatenate([order[:n], *some]))
+    if blocks is not None:
+        chosen = np.flatnonzero(np.isin(blocks, blocks[chosen]))
+    return part_of(observed, parts.weights, chosen)
+
+
+def partition(observed: Observations, weights: Weights, n_parameters: int) -> Partition:
+    """Cut the observations so that B of `n_parameters` has at most PART numbers in each part.
+
+    A table that is not large stays in one part; so do observations that are all correlated.
+    """
+    n = len(observed.lead)
+    if not is_large(observed, n_parameters):
+        return Partition(observed, weights, None, (((0, n),),))
+    blocks = _correlated(observed, weights)
+    limit = max(PART // (observed.size * n_parameters), 1)
+    unit = _units(observed.configuration, blocks)
+    order = np.lexsort((unit,) if blocks is None else (blocks, unit))
+    inner = np.arange(1, n + 1) if blocks is None else _ends(blocks[order])
+    groups: list[tuple[Span, ...]] = []
+    for start, stop in _packed(_ends(unit[order]), 0, limit):
+        if stop - start <= limit:
+            groups.append(((start, stop),))
+        else:
+            inside = inner[(inner > start) & (inner <= stop)]
+            groups.append(tuple(_packed(inside, start, limit)))
+    in_order = bool((np.diff(order) == 1).all())
+    return Partition(observed, weights, None if in_order else order, tuple(groups))
+
+
+def _correlated(observed: Observations, weights: Weights) -> IntArray | None:
+    whiten = weights.whiten
+    if whiten is None:
+        return None
+    row = np.repeat(np.arange(whiten.shape[0], dtype=np.int32), np.diff(whiten.indptr))
+    row //= observed.size
+    column = whiten.indices // observed.size
+    if np.array_equal(row, column):
+        return None
+    n = len(observed.lead)
+    graph = sparse.csr_array((np.ones(len(row), dtype=bool), (row, column)), shape=(n, n))
+    return sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def _units(configuration: IntArray, blocks: IntArray | None) -> IntArray:
+    """Number of the unit (observations,): configurations, joined where a block spans several."""
+    if blocks is None:
+        return configuration
+    of_block = np.zeros(blocks.max() + 1, dtype=np.int64)
+    of_block[blocks] = configuration
+    if np.array_equal(of_block[blocks], configuration):
+        return configuration
+    shape = (int(configuration.max()) + 1, len(of_block))
+    links = sparse.coo_array((np.ones(len(blocks)), (configuration, blocks)), shape=shape)
+    graph = sparse.block_array([[None, links], [links.T, None]], format="csr")
+    return sparse.csgraph.connected_components(graph, directed=False)[1][configuration]
+
+
+def _ends(sorted_codes: IntArray) -> IntArray:
+    """Where each run of equal codes ends (exclusive)."""
+    return np.append(np.flatnonzero(np.diff(sorted_codes)) + 1, len(sorted_codes))
+
+
+def _packed(ends: IntArray, start: int, limit: int) -> list[Span]:
+    """Consecutive runs that end at `ends`, as many to a span as keep it within `limit`.
+
+    A run that is longer than that is a span of its own.
+    """
+    spans, k = [], 0
+    while k < len(ends):
+        k = max(int(np.searchsorted(ends, start + limit, side="right")), k + 1)
+        spans.append((start, int(ends[k - 1])))
+        start = spans[-1][1]
+    return spans
+
+
+# A least-squares problem of any length as a triangle: what is left of B and e after QR.
+#
+#     [B e] = Q [R z; 0 ρ],   |e − B x|² = |z − R x|² + ρ²
+#
+# R (p, p), z = Qᵀe (p,) and ρ decide everything that a fit asks of the rows: steps, rank,
+# covariance, sum of squares.  Triangles of parts of the rows are merged by the QR of one on top of
+# the other (TSQR; Demmel, Grigori, Hoemmen and Langou 2012, SIAM J. Sci. Comput. 34), which is
+# backward stable like a QR of all rows at once: the condition number enters once, not squared as
+# in BᵀB.
+
+# Numbers of [B e] formed and factorised at once where there are more rows: 2 MB, and in these the
+# rows of a leaf, 16 for every column.  A leaf stays in the second level of cache, where LAPACK's
+# panels, which go over all rows column by column, take half the time (docs/performance.md).
+BLOCK = 2**18
+LEAF, SMALLEST_LEAF = 16, 512
+
+
+@dataclass(frozen=True)
+class RFactor:
+    """`augmented` (p + 1, p + 1) upper triangular: the R factor of [B e]; `rows` of B."""
+
+    augmented: Array
+    rows: int
+
+    @classmethod
+    def of(cls, B: Array, e: Array) -> RFactor:
+        """The triangle of the whitened B (rows, p) and residual e (rows,)."""
+        step = _leaf(B.shape[1] + 1, BLOCK)
+        if len(e) <= step:
+            return cls(_factor(np.column_stack([B, e])), len(e))
+        blocks = (slice(first, first + step) for first in range(0, len(e), step))
+        leaves = [_leaves(np.column_stack([B[block], e[block]])) for block in blocks]
+        return cls(_factor(np.vstack(leaves)), len(e))
+
+    def merged(self, other: RFactor) -> RFactor:
+        """The triangle of the rows of both."""
+        stacked = np.vstack([self.augmented, other.augmented])
+        return RFactor(_factor(stacked), self.rows + other.rows)
+
+    def of_columns(self, chosen: NDArray[np.integer]) -> RFactor:
+        """The triangle of the columns `chosen` of B and the same e."""
+        return RFactor(_factor(self.augmented[:, [*chosen, self.columns]]), self.rows)
+
+    @property
+    def columns(self) -> int:
+        return self.augmented.shape[1] - 1
+
+    @property
+    def R(self) -> Array:
+        """(p, p) with RᵀR = BᵀB."""
+        return self.augmented[:-1, :-1]
+
+    @property
+    def projected(self) -> Array:
+        """z = Qᵀe (p,), so that Rᵀz = Bᵀe."""
+        return self.augmented[:-1, -1]
+
+    @property
+    def rest(self) -> float:
+        """ρ: length of the part of e outside the span of B."""
+        return float(abs(self.augmented[-1, -1]))
+
+    @property
+    def rss(self) -> float:
+        """|e|²."""
+        return float(self.augmented[:, -1] @ self.augmented[:, -1])
+
+    def scaled(self, scale: Array) -> RFactor:
+        """The triangle of B with its columns multiplied by `scale` (p,)."""
+        return RFactor(self.augmented * np.append(scale, 1.0), self.rows)
+
+    def step(self, scale: Array) -> Array:
+        """Minimiser (p,) of |e − B x|², of least length in x/scale where several are.
+
+        `scale` (p,) are typical sizes; the rank is judged with columns multiplied by them.
+        """
+        cond = max(self.rows, self.columns) * np.finfo(float).eps
+        return scale * linalg.lstsq(self.R * scale, self.projected, cond=cond)[0]
+
+    def cofactor(self, scale: Array) -> Array:
+        """(BᵀB)⁻¹ (p, p) of a B with full column rank."""
+        inverse = linalg.solve_triangular(self.R * scale, np.eye(self.columns))
+        return (inverse @ inverse.T) * np.outer(scale, scale)
+
+
+def merge(triangles: Iterable[RFactor]) -> RFactor:
+    """The triangle of all rows, merged in the order given."""
+    return reduce(RFactor.merged, triangles)
+
+
+def _leaf(k: int, numbers: int = 0) -> int:
+    """Rows of a leaf of `k` columns, or of as many leaves as `numbers` take."""
+    rows = max(LEAF * k, SMALLEST_LEAF)
+    return max(numbers // (rows * k), 1) * rows
+
+
+def _leaves(rows: Array) -> Array:
+    """The R factors of the leaves of `rows` (n, k) on top of each other."""
+    k = rows.shape[1]
+    leaf = _leaf(k)
+    whole = len(rows) // leaf * leaf
+    if not whole:
+        return rows
+    triangles = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, leaf, k), mode="r"))
+    return np.vstack([triangles.reshape(-1, k), rows[whole:]])
+
+
+def _factor(rows: Array) -> Array:
+    """R factor (k, k) of `rows` (n, k), filled up with zeros where n < k."""
+    k = rows.shape[1]
+    while rows.size > BLOCK and len(rows) >= 2 * _leaf(k):
+        rows = _leaves(rows)
+    # Not scipy's qr, whose R has all n rows: kept in a triangle it would hold a part of the table.
+    R = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
+    return R if len(R) == k else np.vstack([R, np.zeros((k - len(R), k))])
+
+
+# Passes over a table in parts: B is formed, used and dropped, one part at a time.
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# Two parts at a time: one is evaluated while the other is factorised (measured: a third one only
+# waits for the interpreter, and each costs the memory of a part).
+AT_ONCE = 2
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Residual (rows,), observed minus predicted and raw, and the triangle of whitened B and it.
+
+    `wide` is the triangle of more columns, where they were evaluated with it.
+    """
+
+    residual: Array
+    r_factor: RFactor
+    wide: RFactor | None = None
+
+
+def evaluate(model: Model, parts: Partition, x: Array, columns: NDArray[np.integer]) -> Evaluation:
+    """B of the `columns` at x and the residual, whitened and reduced to a triangle.
+
+    Raises ElastocalError where a reading has no static equilibrium at x.
+    """
+    residual = np.empty(len(parts.observed.value))
+
+    def reduced(part: Part) -> RFactor:
+        at = regressor(model, part, x, columns)
+        residual[part.rows] = at.residual
+        return RFactor.of(part.weights.apply(at.B), part.weights.apply(at.residual))
+
+    return Evaluation(residual, merge(each(parts, reduced)))
+
+
+def residual_at(model: Model, parts: Partition, x: Array) -> Array:
+    """Observed minus predicted (rows,) at x; NaN in readings without equilibrium."""
+    residual = np.empty(len(parts.observed.value))
+
+    def predicted(part: Part) -> None:
+        observed = part.observations
+        residual[part.rows] = observed.value - model.predict(observed.table, x, observed)
+
+    for _ in each(parts, predicted):
+        pass
+    return residual
+
+
+def regressor(model: Model, part: Part, x: Array, columns: NDArray[np.integer]) -> Regression:
+    """B of a part, raw."""
+    return model.regressor(part.observations.table, x, columns, part.observations)
+
+
+def each(parts: Partition, work: Callable[[Part], Result]) -> Iterator[Result]:
+    """`work` on every part, results in order."""
+    return in_order(parts.spans, lambda span: work(parts.part(span)))
+
+
+def in_order(items: Sequence[Item], work: Callable[[Item], Result]) -> Iterator[Result]:
+    """`work` on every item, AT_ONCE at a time; results in the order of the items.
+
+    What the results add up to so does not depend on which item is done first.  The first item is
+    done alone: it builds what the others share (the model's tapes).
+    """
+    yield work(items[0])
+    if len(items) == 1:
+        return
+    pool = ThreadPoolExecutor(AT_ONCE)
+    try:
+        yield from pool.map(work, items[1:])
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,26 @@
+"""The symbolic manipulator: nominal chain, effects on it, exact B_i for whole tables."""
+
+from elastocal import loaded_on_demand
+
+ROOMS = {
+    "arm": "Arm Parameter ParameterSpec Setting row_inputs",
+    "c_engine": "find_compiler",
+    "calibrated": "CalibratedArm nominal_flange_rows read_calibrated",
+    "chain": "Chain Joint LinkMass finite_ranges joint_index joint_limits",
+    "choice": "choose_effects load_chain",
+    "dh": "read_dh",
+    "effects": "effect_of register",
+    "evaluate": (
+        "BackendReport BatchFunction Work chosen_backend row_blocks run_blocks "
+        "set_default_backend summary thread_count"
+    ),
+    "function_cache": "HashedFunction cache_folder content_key fetch store",
+    "inverse_kinematics": "Postures",
+    "manipulator": "Model",
+    "observations": "Observations observe pair_loaded_with_unloaded subset",
+    "rigid": "nominal_flange",
+    "symbolic": "SymbolicArm configuration_rows",
+    "urdf": "check_urdf read_urdf",
+}
+__all__ = [name for names in ROOMS.values() for name in names.split()]
+__getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

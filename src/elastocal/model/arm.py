@@ -1,0 +1,288 @@
+"""The chain under construction: parameters, what effects change, and what a table row brings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError, option
+from elastocal.measurements import Measurements
+from elastocal.model import rigid
+from elastocal.model.chain import Chain
+
+# Parameters: what an effect brings into the model, with name, unit, nominal value and size.
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """A parameter as its effect declares it, before it has a place.
+
+    `typical` is the size one expects of the deviation from nominal; columns of B
+    are scaled by it before any rank is judged, so that metres and rad/(N m) compare.
+    None means that no size is known beforehand (a compliance without a nominal value):
+    `Model.sizes` then finds one from what moves the readings.
+    """
+
+    key: str
+    unit: str
+    nominal: float
+    typical: float | None
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A constant inside an effect's expression that is set, not fitted: an order, a time.
+
+    The amplitude of the effect vanishes at nominal, and with it every derivative with respect to
+    such a constant, so a fit cannot find it; a search over `lower` to `upper` can.  The value
+    comes from `[model.nominal.settings.PLACE]`, else `default`; None: there is none, and the
+    model asks for it.  `key` carries the unit, as table columns do ("jump_time_s").
+
+    `kind` says which values a diagnosis tries: "order" periods in one turn of the joint,
+    "change_time" moments between two visits, "time_constant" some that the campaign can tell
+    apart, "range" values at equal distances from `lower` to `upper`, which are finite then.
+    """
+
+    key: str
+    kind: Literal["order", "change_time", "time_constant", "range"]
+    default: float | None
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of the model, at its place: `name` is "joint2.compliance"."""
+
+    name: str
+    effect: str
+    where: str
+    unit: str
+    nominal: float
+    typical: float | None
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+# The chain under construction: what effects change, and how it is put together.
+#
+#     commanded joints → transmission → links → loads → compliance → tool/markers → tracker
+#
+# All fields are CasADi expressions in the arm's inputs (what the table says of one row), its
+# parameters and the elastic deflections θ.  Positions and forces are in the data's frame
+# (tracker frame, z vertical).
+
+
+@dataclass(frozen=True)
+class Spring:
+    """One elastic degree of freedom: a small joint inserted into the chain.
+
+    `site` is "base" (between base frame and joint 1's placement), "jointN" (just before joint
+    N moves, fixed to the proximal link) or "linkN" (at link N's distal end); `kind` and `axis`
+    as for a joint, in the frame of the site.  `law` gives the deflection as a function of the
+    generalised force that the loads exert on it: θ = law(τ).
+    """
+
+    name: str
+    site: str
+    kind: str
+    axis: tuple[float, float, float]
+    law: Callable[[ca.SX], ca.SX]
+
+    @classmethod
+    def linear(cls, name: str, site: str, kind: str, axis: Any, compliance: ca.SX) -> Spring:
+        """A spring with θ = k τ, k in rad/(N m) or m/N."""
+        x, y, z = (float(a) for a in axis)
+        return cls(name, site, kind, (x, y, z), lambda tau: compliance * tau)
+
+
+class Arm:
+    """Builder handed from effect to effect; `assemble` turns its pieces into positions."""
+
+    def __init__(self, chain: Chain, cell: Cell) -> None:
+        n = chain.n_joints
+        self.chain, self.cell = chain, cell
+        self.inputs: dict[str, ca.SX] = {}
+        self.q_commanded = self.input("q", n)
+        self.q = [self.q_commanded[i] for i in range(n)]
+        distal = [joint.placement for joint in chain.joints[1:]] + [chain.flange_placement]
+        self.links = [rigid.constant(T) for T in distal]
+        nominal = cell.model.nominal
+        self.T_tracker_base = rigid.transform(
+            None if nominal.base_rotation is None else rigid.constant(nominal.base_rotation),
+            None if nominal.base_position is None else rigid.constant(nominal.base_position),
+        )
+        self.markers = {
+            name: rigid.constant(position) for name, position in cell.tool.markers.items()
+        }
+        self.marker_rotation = {name: ca.SX.eye(3) for name in self.markers}
+        anchor = cell.tracker.anchor
+        self.anchor = ca.SX.zeros(3) if anchor is None else rigid.constant(anchor)
+        self.length_offset = ca.SX(0)
+        self.springs: list[Spring] = []
+        self.potential = ca.SX(0)
+        self.theta = ca.SX.zeros(0, 1)
+        self.T_tracker_link: list[ca.SX] = []
+        self.T_tracker_flange = ca.SX.eye(4)
+        self.reading: dict[str, ca.SX] = {}
+
+    def input(self, name: str, size: int) -> ca.SX:
+        """The row's value of a table quantity ("q", "force", "time", …), declared on first use."""
+        if name not in self.inputs:
+            self.inputs[name] = ca.SX.sym(name, size)
+        return self.inputs[name]
+
+    def add_spring(self, spring: Spring) -> None:
+        self.springs.append(spring)
+
+    def add_force(self, point: ca.SX, force: Any) -> None:
+        """Dead force (3,) N at a point (3,) that moves with the arm: V = −f·p."""
+        self.potential -= ca.dot(ca.SX(force), point)
+
+    def add_potential(self, potential: ca.SX) -> None:
+        """Potential energy in J of a conservative load."""
+        self.potential += potential
+
+    def joint_angle(self, i: int) -> ca.SX:
+        """Joint i's angle (0-based) with the deflection of its own springs about its axis."""
+        axis = tuple(float(a) for a in self.chain.joints[i].axis)
+        own = [
+            self.theta[k]
+            for k, s in enumerate(self.springs)
+            if s.site == f"joint{i + 1}" and s.axis == axis
+        ]
+        return self.q[i] + sum(own)
+
+    def assemble(self) -> None:
+        """Compose base, springs, joints and links into frames and marker positions."""
+        self.theta = ca.SX.sym("theta", len(self.springs))
+        T = self.T_tracker_base @ self._deflection("base")
+        T = T @ rigid.constant(self.chain.joints[0].placement)
+        for i, joint in enumerate(self.chain.joints):
+            motion = rigid.joint_motion(joint.kind, joint.axis, self.q[i])
+            T = T @ self._deflection(f"joint{i + 1}") @ motion
+            self.T_tracker_link.append(T)
+            T = T @ self.links[i] @ self._deflection(f"link{i + 1}")
+        self.T_tracker_flange = T
+        chosen = self._one_hot_sum(self.markers)
+        self.reading["position"] = rigid.point(T, chosen)
+        reach = self.reading["position"] - self.anchor
+        self.reading["distance"] = ca.sqrt(ca.sumsqr(reach)) + self.length_offset
+        self.reading["rotation"] = T[:3, :3] @ self._one_hot_sum(self.marker_rotation)
+
+    def _deflection(self, site: str) -> ca.SX:
+        T = ca.SX.eye(4)
+        for k, spring in enumerate(self.springs):
+            if spring.site == site:
+                T = T @ rigid.joint_motion(spring.kind, spring.axis, self.theta[k])
+        return T
+
+    def _one_hot_sum(self, choices: dict[str, ca.SX]) -> ca.SX:
+        # One marker per row: the table's marker enters as a 0/1 input per name.
+        if len(choices) == 1:
+            return next(iter(choices.values()))
+        chosen = self.input("marker", len(choices))
+        return sum((chosen[k] * value for k, value in enumerate(choices.values())), ca.SX(0))
+
+    def generalised_forces(self) -> ca.SX:
+        """τ = −∂V/∂θ: the load's force on every spring, at the deflected pose."""
+        return -ca.gradient(self.potential, self.theta)
+
+    def deflection_laws(self, tau: ca.SX) -> ca.SX:
+        """θ = law(τ) of every spring, stacked."""
+        return ca.vertcat(*[s.law(tau[k]) for k, s in enumerate(self.springs)])
+
+
+# What the symbolic arm asks of a table row, as arrays.
+
+COLUMNS = {
+    "q": "q1_deg …",
+    "force": "force_x_N …",
+    "torque": "torque_1_Nm …",
+    "rotation": "rx_deg … or qw …",
+    "time": "time_s or time_min",
+    "approach": "approach_1 …",
+    "temperature": "temperature_C",
+}
+# A row belongs to a level of a split joint when it is this close to it (rad or m).
+LEVEL_TOLERANCE = 0.01
+
+
+def row_inputs(arm: Arm, table: Measurements) -> list[NDArray]:
+    """One (n, size) array per input the arm declared, in its order.
+
+    Raises InputError where the table lacks a column, or a row lies at none of a joint's levels.
+    """
+    codes = _marker_codes(arm, table)
+    return [_one(arm, table, name, codes) for name in arm.inputs]
+
+
+def _one(arm: Arm, table: Measurements, name: str, marker: NDArray) -> NDArray:
+    if name == "marker":
+        return _one_hot(marker, len(arm.markers))
+    if name.startswith("level:"):
+        return _levels(arm, table, name.removeprefix("level:"))
+    value = getattr(table, name)
+    if value is None:
+        raise InputError(
+            f"{table.source}: the model needs the column {COLUMNS[name]}, which the table lacks"
+        )
+    return value[:, None] if value.ndim == 1 else value
+
+
+def _one_hot(codes: NDArray, size: int) -> NDArray:
+    return np.eye(size)[codes]
+
+
+def _marker_codes(arm: Arm, table: Measurements) -> NDArray:
+    known = {name: k for k, name in enumerate(arm.markers)}
+    missing = [name for name in table.marker_names if name not in known]
+    if missing:
+        used = {table.marker_names[k] for k in np.unique(table.marker)}
+        if used & set(missing):
+            raise InputError(
+                f"{table.source}: marker '{sorted(used & set(missing))[0]}' is not one of the "
+                f"cell's markers: {', '.join(known)}"
+            )
+    return np.array([known.get(name, 0) for name in table.marker_names])[table.marker]
+
+
+def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
+    levels = np.array(arm.cell.model.compliance_levels[joint])
+    q = table.q[:, int(joint.removeprefix("joint")) - 1]
+    distance = np.abs(q[:, None] - levels[None, :])
+    nearest = distance.argmin(axis=1)
+    off = distance.min(axis=1) > LEVEL_TOLERANCE
+    if off.any():
+        i = int(np.flatnonzero(off)[0])
+        raise InputError(
+            f"{table.source}, line {table.row[i]}: {joint} stands at {np.degrees(q[i]):.3f}°, "
+            "which is none of its levels in [model.compliance_levels]; add the level or drop the "
+            "row"
+        )
+    return _one_hot(nearest, len(levels))
+
+
+def given_force(load: ArrayLike | None) -> NDArray[np.float64] | None:
+    """The option `load` as a force (3,) in N, None where it is not given.
+
+    Raises InputError unless it is three finite numbers.
+    """
+    if load is None:
+        return None
+    try:
+        force = np.asarray(load, dtype=float)
+    except (TypeError, ValueError):
+        force = np.zeros(0)
+    if force.shape != (3,) or not np.isfinite(force).all():
+        found = " ".join(f"{v:g}" for v in force) if force.ndim == 1 and len(force) else load
+        raise InputError(f"{option('load')} takes three finite numbers in N; found {found}")
+    return force

@@ -1,0 +1,246 @@
+"""A calibrated arm: the cell's model with the parameter values that an identification wrote."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from elastocal.above import Saved
+from elastocal.errors import InputError
+from elastocal.files import read_text
+from elastocal.model.chain import Chain
+from elastocal.model.choice import cell_of
+from elastocal.model.manipulator import Model
+from elastocal.model.rigid import nominal_flange
+from elastocal.units import Array
+
+SCHEMA = "elastocal/identification/1"
+SAME = 1e-6  # m, and of directions: two arms of one design differ by nothing
+MOST_BYTES = 200_000_000  # a covariance of 3000 parameters
+
+
+@dataclass(frozen=True, repr=False)
+class CalibratedArm(Saved):
+    """A calibrated arm: a model and the parameter values that it predicts with.
+
+    `Calibration.arm` is one, in memory; `read_calibrated` reads one from the files of an earlier
+    identification.  `compensate` commands it, `save` writes it for other programs.
+
+    Attributes:
+        model: The `Model`.
+        x: Values (parameters,) in SI units.  What the data did not determine is held at the value
+            the identification predicted with.
+        determined: Names of the parameters that the data determined.
+        covariance: (determined, determined), theirs.
+        source: What it came from: the result file, or the table it was identified with.
+        entries: What identify says of each parameter, as in its JSON, in the model's order.
+
+    Examples:
+        >>> arm = ec.identify("cell.toml", "data.csv").arm
+        >>> arm.pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600]).shape
+        (4, 4)
+        >>> arm.values["joint3.compliance"]
+        4.1...e-07
+    """
+
+    model: Model
+    x: Array
+    determined: tuple[str, ...]
+    covariance: Array
+    source: str
+    entries: tuple[Mapping[str, Any], ...] = ()
+
+    def __repr__(self) -> str:
+        return (
+            f"<CalibratedArm {self.model.chain.name}: {len(self.determined)} of {len(self.x)} "
+            f"parameters determined, from {self.source}>"
+        )
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Name → value in SI units."""
+        return dict(zip(self.model.names, map(float, self.x), strict=True))
+
+    def pose(self, q: ArrayLike, force: ArrayLike | None = None) -> NDArray:
+        """The flange's pose in the data's frame, deflections included.
+
+        Args:
+            q: Commanded joints (joints,) or (n, joints), in rad or m.
+            force: Forces (3,) or (n, 3) in N at the load point, in the data's frame; default none.
+
+        Returns:
+            T_tracker_flange (4, 4), or (n, 4, 4) where q has rows; NaN without an equilibrium.
+
+        Raises:
+            InputError: A shape does not fit, or an effect needs more than joints and force.
+
+        Examples:
+            >>> arm = ec.identify("cell.toml", "data.csv").arm
+            >>> q = [0.0, -1.0, 1.0, 0.0, 0.5, 0.0]
+            >>> sag = arm.pose(q, force=[0, 0, -2600])[2, 3] - arm.pose(q)[2, 3]
+            >>> bool(-0.01 < sag < 0)
+            True
+        """
+        return self.model.pose(q, self.x, force)
+
+
+def read_calibrated(cell_path: str | Path, result_path: str | Path) -> CalibratedArm:
+    """The arm that an earlier identification wrote.
+
+    Args:
+        cell_path: The cell file that it was run with.
+        result_path: Its result (`Calibration.save`, or the command identify).
+
+    Raises:
+        InputError: A file is invalid, or the result belongs to another model than the cell
+            describes; the message names the parameters that differ.
+
+    Examples:
+        >>> ec.identify("cell.toml", "data.csv").save("result.json")
+        >>> ec.read_calibrated("cell.toml", "result.json")
+        <CalibratedArm kuka_kr270_2: 9 of 10 parameters determined, from result.json>
+    """
+    cell = cell_of(cell_path)
+    result = _read_result(Path(result_path))
+    held = _held(result, result_path)
+    # A cell that lists no markers took them from the table; their names stand in the parameters.
+    markers = tuple(
+        dict.fromkeys(
+            where.removeprefix("marker:")
+            for where in (name.rpartition(".")[0] for name in held)
+            if where.startswith("marker:")
+        )
+    )
+    model = Model(cell, markers)
+    _check_same(model, held, cell_path, result_path)
+    _check_robot(model, result.get("nominal_flange"), cell_path, result_path)
+    determined, covariance = _covariance(result, held, result_path)
+    entries = {str(entry["name"]): entry for entry in result["parameters"]}
+    return CalibratedArm(
+        model,
+        np.array([held[name] for name in model.names]),
+        determined,
+        covariance,
+        str(result_path),
+        tuple(entries[name] for name in model.names),
+    )
+
+
+def nominal_flange_rows(chain: Chain) -> list[list[float]]:
+    """Upper rows (3, 4) of T_base_flange of the nominal arm, all joints at 0.5 rad or 0.5 m.
+
+    It stands in every result, so that one is told apart from that of another robot, whose
+    parameters have the same names.
+    """
+    q = ca.SX(np.full(chain.n_joints, 0.5))
+    T = np.asarray(ca.evalf(nominal_flange(chain, q)), dtype=float)
+    return [[round(float(v), 9) + 0.0 for v in row] for row in T[:3]]
+
+
+def _check_robot(model: Model, stated: Any, cell: str | Path, result: str | Path) -> None:
+    """Results that state no nominal flange, as older ones, are believed."""
+    if stated is None:
+        return
+    here = np.array(nominal_flange_rows(model.chain))
+    try:
+        there = np.array(stated, dtype=float)
+    except (TypeError, ValueError):
+        there = np.zeros(0)
+    if there.shape != here.shape or not np.isfinite(there).all():
+        raise InputError(
+            f"{result}: nominal_flange is no table of 3 rows with 4 numbers; "
+            "write the result anew with identify"
+        )
+    if np.abs(here - there).max() > SAME:
+        off = np.linalg.norm(here[:, 3] - there[:, 3])
+        raise InputError(
+            f"{result} was not identified with {cell}: the nominal robot is another one (with "
+            f"every joint at 0.5 rad the flange is {off * 1e3:.4g} mm away); give the cell that "
+            "identify was run with, or identify anew"
+        )
+
+
+def _read_result(path: Path) -> dict[str, Any]:
+    try:
+        result = json.loads(read_text(path, "result of identify", MOST_BYTES))
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"{path}, line {error.lineno}: not JSON ({error.msg}); "
+            "give the file that identify wrote"
+        ) from None
+    except RecursionError:
+        raise InputError(
+            f"{path}: lists within lists without end; give the file that identify wrote"
+        ) from None
+    found = result.get("schema") if isinstance(result, dict) else None
+    if found != SCHEMA:
+        raise InputError(
+            f"{path}: schema is {found!r}, and {SCHEMA!r} is needed; "
+            "give the file that identify wrote"
+        )
+    return dict(result)
+
+
+def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
+    entries = result.get("parameters")
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: key parameters is no list; write the result with identify")
+    held = {}
+    for k, entry in enumerate(entries):
+        try:
+            name, value = str(entry["name"]), float(entry["held"])
+        except (TypeError, KeyError, ValueError):
+            raise InputError(
+                f"{path}: parameters[{k}] needs a name and a number under held; "
+                "write the result anew with identify"
+            ) from None
+        if not np.isfinite(value):
+            raise InputError(f"{path}: parameters[{k}] '{name}' holds {value}, no finite number")
+        if name in held:
+            raise InputError(f"{path}: parameter '{name}' is listed twice")
+        held[name] = value
+    return held
+
+
+def _covariance(
+    result: dict[str, Any], held: dict[str, float], path: str | Path
+) -> tuple[tuple[str, ...], Array]:
+    """Names of what was determined, and its covariance (determined, determined)."""
+    names, rows = result.get("covariance_of", []), result.get("covariance", [])
+    try:
+        determined = tuple(map(str, names))
+        covariance = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{path}: covariance is no table of numbers, or covariance_of no list of names; "
+            "write the result anew with identify"
+        ) from None
+    if not set(determined) <= set(held) or covariance.size != len(determined) ** 2:
+        raise InputError(
+            f"{path}: covariance of {covariance.size} numbers for {len(determined)} names "
+            "in covariance_of; write the result anew with identify"
+        )
+    return determined, covariance.reshape(len(determined), len(determined))
+
+
+def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:
+    absent = [name for name in model.names if name not in held]
+    surplus = [name for name in held if name not in set(model.names)]
+    if absent or surplus:
+        told = [
+            f"{what} {', '.join(names[:4])}{' …' if len(names) > 4 else ''}"
+            for what, names in (("the result lacks", absent), ("the cell has no", surplus))
+            if names
+        ]
+        raise InputError(
+            f"{result} was not identified with {cell}: {'; '.join(told)}; "
+            "give the cell that identify was run with"
+        )

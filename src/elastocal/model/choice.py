@@ -1,0 +1,115 @@
+"""What the cell asks for: which robot, which effects, at which places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import casadi as ca
+
+from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.errors import InputError
+from elastocal.model.chain import Chain
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.base import Effect
+from elastocal.text import did_you_mean, listed
+
+
+def cell_of(cell: Cell | str | Path) -> Cell:
+    """The cell itself, or that of a cell file; InputError where the file is wrong."""
+    if isinstance(cell, Cell):
+        return cell
+    return read_cell(cell, known_effects=tuple(CATALOGUE))
+
+
+def load_chain(cell: Cell) -> Chain:
+    """The nominal chain of the cell's robot, from its URDF or its DH table."""
+    from elastocal.model.dh import read_dh
+    from elastocal.model.urdf import read_urdf
+
+    robot = cell.robot
+    if robot.urdf is not None:
+        return read_urdf(robot.urdf, base=robot.base, flange=robot.flange)
+    if robot.dh is not None:
+        return read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
+    raise InputError(f"{cell.path}: [robot] needs urdf or dh")
+
+
+def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
+    """(effect, place) for everything active, in the catalogue's order.
+
+    The table's force always acts (`payload`); link weights act where `link_gravity` says so.
+    Raises InputError for an unknown effect, place or setting, with the nearest valid one, and
+    for an effect that has no place on this arm.
+    """
+    check_settings(chain, cell)
+    wanted: dict[str, list[str | None]] = {
+        name: [None] for name, effect in CATALOGUE.items() if effect.acts_unasked(cell)
+    }
+    for choice in cell.model.effects:
+        if choice.name not in CATALOGUE:
+            raise InputError(_unknown("effects", "effect", choice.name, list(CATALOGUE), cell))
+        wanted.setdefault(choice.name, []).append(choice.where)
+    chosen = []
+    for name, effect in CATALOGUE.items():
+        places = effect.places(chain, cell)
+        asked = wanted.get(name, [])
+        if asked and not places:
+            raise InputError(
+                f"{cell.path or cell.name}: [model] effects: {name} has no place on robot "
+                f"'{chain.name}' with observe = \"{cell.model.observe}\"; leave it out"
+            )
+        for where in asked:
+            if where is not None and where not in places:
+                raise InputError(_unknown("effects", f"place of {name}", where, list(places), cell))
+        chosen += [(effect, place) for place in places if None in asked or place in asked]
+    return chosen
+
+
+def check_settings(chain: Chain, cell: Cell) -> None:
+    """InputError where the cell sets what no effect of the catalogue has on this arm."""
+    given = cell.model.nominal.settings
+    if not given:
+        return
+    known: dict[str, list[str]] = {}
+    for effect in CATALOGUE.values():
+        for place in effect.places(chain, cell):
+            keys = [setting.key for setting in effect.settings(place, chain, cell)]
+            if keys:
+                known.setdefault(place, []).extend(keys)
+    for place, values in given.items():
+        if place not in known:
+            raise InputError(_unknown("nominal.settings", "place", place, list(known), cell))
+        for key in values:
+            if key not in known[place]:
+                what = f"setting of {place}"
+                raise InputError(_unknown("nominal.settings", what, key, known[place], cell))
+
+
+def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[str, ca.SX]:
+    """Values of the effect's settings at a place: the cell's, else their defaults.
+
+    Raises InputError where one has neither, or lies outside its range.
+    """
+    given = cell.model.nominal.settings.get(place, {})
+    values = {}
+    for setting in effect.settings(place, chain, cell):
+        value = given.get(setting.key, setting.default)
+        where = f"{cell.path or cell.name}: [model.nominal.settings.{place}] {setting.key}"
+        if value is None:
+            raise InputError(
+                f"{where} is missing, which {effect.name} at {place} needs; `elastocal diagnose` "
+                "searches for it"
+            )
+        if not setting.lower <= value <= setting.upper:
+            raise InputError(
+                f"{where} takes {setting.lower:g} to {setting.upper:g}; found {value:g}"
+            )
+        values[setting.key] = ca.SX(value)
+    return values
+
+
+def _unknown(key: str, what: str, found: str, valid: list[str], cell: Cell) -> str:
+    return (
+        f"{cell.path or cell.name}: [model] {key}: unknown {what} '{found}'"
+        f"{did_you_mean(found, valid)}; valid: {listed(valid)}"
+    )

@@ -1,0 +1,189 @@
+"""What every effect is: its parameters, its places in the chain, its expression, its traits."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+
+import casadi as ca
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError
+from elastocal.model.arm import ParameterSpec, Setting
+from elastocal.model.chain import Chain
+from elastocal.text import listed
+
+if TYPE_CHECKING:
+    from elastocal.model.arm import Arm
+
+Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "tracker"]
+# Kinds of file that can hold an effect: of a rigid arm (URDF, DH table), or with springs (MJCF).
+Format = Literal["rigid", "elastic"]
+Symbols = Mapping[str, ca.SX]
+NEEDS = ("time", "approach", "temperature", "load")
+REVOLUTE = "revolute"
+
+# Ranks of parameters: where a choice is free, a minimal complete set takes low ones first.
+STIFFNESS, STATION, MARKER, OFFSET, ORDINARY, LINK = range(6)
+
+# What tells an effect from others where no further pose does.
+MEASURE_MONUMENTS = (
+    "measure fixed reflectors (monuments) on the floor and on the robot's foot along with the "
+    "arm: they tell the tracker's motion, the base's and a joint's apart"
+)
+MEASURE_SCALE = (
+    "measure a reference length (scale bar) or set the tracker up in a second place: that "
+    "tells its errors from the arm's"
+)
+RECORD_TORQUES = (
+    "record the joints' torques or motor currents, which a wrong weight or spring changes "
+    "and a gear error does not"
+)
+WEIGH_LOAD = "weigh the load and measure its hook"
+
+
+class Effect:
+    """One physical effect on the chain.  It knows nothing about estimation.
+
+    A subclass states `name` and `stage`, the places where it can act, the
+    parameters it has at a place, and overrides the one hook its stage calls for:
+
+    - `shape`: changes joint motion, link transforms, springs, markers, base frame;
+      called before the chain is put together.
+    - `load`: adds forces or potentials; called when every point's position is known
+      as a function of the elastic deflections.
+    - `read`: changes what the instrument reports; called last.
+
+    Parameter symbols arrive as a mapping from the keys of `parameters` and `settings` to CasADi
+    scalars.
+
+    The traits say what other parts of the toolkit ask of an effect, so that none of them lists
+    effects by name.  Their defaults suit an effect of which nothing more is known.
+    """
+
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+    # What the table must say for the effect to show, of "time", "approach", "temperature", "load".
+    needs: ClassVar[tuple[str, ...]] = ()
+
+    # Traits.
+    # Found by placing the nominal arm on the readings: base, markers, anchor.  It belongs to the
+    # set-up, so plans and diagnoses do not count it as an error of the arm.
+    registered: ClassVar[bool] = False
+    # A linear compliance: without a load it deflects nothing.
+    elastic: ClassVar[bool] = False
+    # `typical` is the size of the value itself, not that of its deviation from nominal.
+    sized_by_value: ClassVar[bool] = False
+    # Its place in the choice of a minimal complete set, STIFFNESS to LINK.
+    rank: ClassVar[int] = ORDINARY
+    # The kinds of file that can hold it; what none can hold is exported as an error with its cost.
+    formats: ClassVar[tuple[Format, ...]] = ()
+    # What to measure besides more poses where those do not tell it from other effects.
+    remedy: ClassVar[str] = ""
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        """Every place where this effect makes sense on this arm, e.g. ("joint1", …)."""
+        raise NotImplementedError
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        """The parameters at one place; loads may have none."""
+        return ()
+
+    def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
+        """Values of some parameters from which to look for the others, where nominal ones say
+        nothing about this arm."""
+        return ()
+
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        """Constants of the expression at one place that are set or searched, not fitted."""
+        return ()
+
+    def needed(self, cell: Cell) -> tuple[str, ...]:
+        """`needs` for this cell: what shows an effect may depend on the model around it."""
+        return self.needs
+
+    @property
+    def of_the_measurement(self) -> bool:
+        """Whether it belongs to one campaign and its instrument, and is no part of the arm."""
+        return self.stage == "tracker"
+
+    def acts_unasked(self, cell: Cell) -> bool:
+        """Whether it acts though `[model] effects` does not list it."""
+        return False
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        """Whether a diagnosis of this cell's data may suspect it."""
+        return True
+
+    def unphysical(self, values: Mapping[str, float], chain: Chain, cell: Cell) -> str:
+        """Why no spring or body has these `values` (by parameter name); "" where one may."""
+        return ""
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        """Change the pieces of the chain before it is assembled."""
+
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
+        """Add forces or potentials once points are known."""
+
+    def read(self, arm: Arm, place: str, p: Symbols) -> None:
+        """Change the instrument's reading."""
+
+
+def check(effect: object) -> None:
+    """InputError where `effect` cannot stand in the catalogue, and what it lacks."""
+    if isinstance(effect, type) and issubclass(effect, Effect):
+        raise InputError(f"register an effect, {effect.__name__}(), not its class")
+    if not isinstance(effect, Effect):
+        raise InputError(
+            f"an effect is an object of a class derived from Effect; found {type(effect).__name__}"
+        )
+    kind = type(effect)
+    name, stage = getattr(effect, "name", None), getattr(effect, "stage", None)
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise InputError(
+            f"{kind.__name__}.name takes lower-case letters, digits and underscores, as in "
+            f'"joint_offset"; found {name!r}'
+        )
+    if stage not in get_args(Stage):
+        raise InputError(f"{kind.__name__}.stage takes {listed(get_args(Stage))}; found {stage!r}")
+    if not set(effect.formats) <= set(get_args(Format)):
+        raise InputError(
+            f"{kind.__name__}.formats takes {listed(get_args(Format))}; found {effect.formats!r}"
+        )
+    for need in effect.needs:
+        if need not in NEEDS:
+            raise InputError(f"{kind.__name__}.needs takes {listed(NEEDS)}; found {need!r}")
+    hooks = ("shape", "load", "read")
+    lacking = [] if kind.places is not Effect.places else ["places"]
+    lacking += [] if any(getattr(kind, h) is not getattr(Effect, h) for h in hooks) else ["a hook"]
+    if lacking:
+        raise InputError(
+            f"{kind.__name__} lacks {' and '.join(lacking)}; it states where it can act (places) "
+            f"and what it does there ({listed(hooks)})"
+        )
+
+
+def joints(chain: Chain) -> tuple[str, ...]:
+    """Places "joint1" … "jointN"."""
+    return tuple(f"joint{i + 1}" for i in range(chain.n_joints))
+
+
+def turning_joints(chain: Chain) -> tuple[str, ...]:
+    """Those of `joints` that are revolute."""
+    return tuple(j for j, kind in zip(joints(chain), chain.kinds, strict=True) if kind == REVOLUTE)
+
+
+def motion_unit(place: str, chain: Chain) -> str:
+    """Unit of the motion of "jointN": rad, or m where it slides."""
+    return "rad" if chain.kinds[index(place)] == REVOLUTE else "m"
+
+
+def links(chain: Chain) -> tuple[str, ...]:
+    """Places "link1" … "linkN"; link i is the body that joint i moves."""
+    return tuple(f"link{i + 1}" for i in range(chain.n_joints))
+
+
+def index(place: str) -> int:
+    """0-based index of "joint3" or "link3"."""
+    return int(place.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1

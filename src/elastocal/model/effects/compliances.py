@@ -1,0 +1,310 @@
+"""What yields under load: joints, bearings, links and base, and how large torques get."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import require
+from elastocal.model.arm import Arm, ParameterSpec, Spring
+from elastocal.model.chain import Chain
+from elastocal.model.effects.base import (
+    STIFFNESS,
+    Effect,
+    Symbols,
+    index,
+    joints,
+    links,
+    turning_joints,
+)
+from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.model.effects.placements import SHORTEST, link_ends
+from elastocal.units import Array
+
+
+class LoadedEffect(Effect):
+    """An effect that shows only under load: the table's force, or the links' weights."""
+
+    def needed(self, cell: Cell) -> tuple[str, ...]:
+        return self.needs if cell.model.link_gravity else (*self.needs, "load")
+
+
+class TorqueEffect(LoadedEffect):
+    """A `LoadedEffect` about a joint's own axis, by `add_deflection`: a measured torque will do."""
+
+    def needed(self, cell: Cell) -> tuple[str, ...]:
+        return self.needs if cell.model.torque == "measured" else super().needed(cell)
+
+
+def add_deflection(arm: Arm, i: int, name: str, law: Callable[[ca.SX], ca.SX]) -> None:
+    """Joint i (0-based) yields along its own axis by law(τ), τ the load's torque on it.
+
+    With `torque = "measured"` τ is the table's and the deflection is explicit; else it is a
+    spring of the equilibrium.
+    """
+    if arm.cell.model.torque == "measured":
+        arm.q[i] += law(arm.input("torque", arm.chain.n_joints)[i])
+        return
+    joint = arm.chain.joints[i]
+    x, y, z = (float(a) for a in joint.axis)
+    arm.add_spring(Spring(name, f"joint{i + 1}", joint.kind, (x, y, z), law))
+
+
+def nominal_compliance(chain: Chain, cell: Cell) -> tuple[float, ...] | None:
+    """The cell's nominal compliances, one per joint; InputError where their number is another."""
+    given = cell.model.nominal.joint_compliance
+    require(
+        given is None or len(given) == chain.n_joints,
+        f"[model.nominal] joint_compliance has {len(given or ())} values, "
+        f"but the arm has {chain.n_joints} joints; give one per joint",
+    )
+    return given
+
+
+class JointCompliance(TorqueEffect):
+    """δq_j = k_j τ_j, k_j in rad/(N m) (m/N for a prismatic joint).
+
+    τ_j is the load's torque about the joint axis, either computed at the deflected pose from
+    the load, link weights and compensator, or taken from the table (`torque = "measured"`:
+    the torque that the load exerts on the joint, positive along +q).
+
+    Where the cell splits a joint by levels (`[model.compliance_levels]`), the compliance is
+    one independent value k_ji per level, as in Klimchik et al. 2013, section 5.
+    """
+
+    name = "joint_compliance"
+    stage = "compliance"
+    elastic = True
+    sized_by_value = True
+    rank = STIFFNESS
+    formats = ("elastic",)
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return joints(chain)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        i = index(place)
+        unit = "rad/(N*m)" if chain.kinds[i] == "revolute" else "m/N"
+        given = nominal_compliance(chain, cell)
+        nominal = 0.0 if given is None else float(given[i])
+        typical = abs(nominal) or None
+        levels = cell.model.compliance_levels.get(place)
+        if levels is None:
+            return (ParameterSpec("compliance", unit, nominal, typical, lower=0.0),)
+        return tuple(
+            ParameterSpec(f"compliance_level{n + 1}", unit, nominal, typical, lower=0.0)
+            for n in range(len(levels))
+        )
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        i = index(place)
+        levels = arm.cell.model.compliance_levels.get(place)
+        if levels is None:
+            k = p["compliance"]
+        else:
+            chosen = arm.input(f"level:{place}", len(levels))
+            values = ca.vertcat(*[p[f"compliance_level{n + 1}"] for n in range(len(levels))])
+            k = ca.dot(chosen, values)
+        add_deflection(arm, i, place, lambda tau: k * tau)
+
+
+RATED_WIND_UP = 3e-3  # rad; what a drive yields by at its largest torque, small or large
+WRIST_SHARE = 1 / 8  # of the strongest joint's torque, in common six- and seven-axis arms
+UNRATED = 1e3  # N m, where nothing tells
+
+
+def weight_torque(chain: Chain, i: int) -> float:
+    """Bound in N m on the torque of the links' weights about revolute joint i (0-based).
+
+    τ ≤ g Σ_j m_j r_j over the bodies j that the joint carries, r_j the length of the chain from
+    the joint's axis to the body's centre of mass; whatever the pose and the mounting.  0 where
+    masses are unknown.
+    """
+    axis = chain.joints[i].axis
+    ends = [T[:3, 3] for T in link_ends(chain)]
+
+    def off_axis(point: Array) -> float:
+        return float(np.linalg.norm(np.cross(axis, point)))
+
+    moment, reach = 0.0, 0.0
+    for j, body in enumerate(chain.masses[i:], start=i):
+        # Only the joint's own link keeps its direction to the axis in every pose.
+        length = off_axis if j == i else np.linalg.norm
+        moment += body.mass * (reach + float(length(body.com)))
+        reach += float(length(ends[j]))
+    return STANDARD_GRAVITY * moment
+
+
+def rated_torque(chain: Chain, cell: Cell, i: int) -> float | None:
+    """Size in N m of the largest torque on revolute joint i (0-based); None where nothing tells.
+
+    The largest of the weights' torque on it, an eighth of that on the strongest joint, and the
+    torque that winds the joint up by 3 mrad with its nominal compliance: payloads, which the cell
+    does not state, load a wrist far more than its own weight does.
+    """
+    given = nominal_compliance(chain, cell)
+    wound = RATED_WIND_UP / given[i] if given and given[i] > 0 else 0.0
+    turning = [j for j, kind in enumerate(chain.kinds) if kind == "revolute"]
+    strongest = max(weight_torque(chain, j) for j in turning)
+    return max(weight_torque(chain, i), WRIST_SHARE * strongest, wound) or None
+
+
+def torque_scale(chain: Chain, cell: Cell, i: int) -> float:
+    """τ_s in N m: torques below it are so small that friction and play blur their sign.
+
+    A thousandth of the rated torque: a true dead zone turns over at once, and a wrist seldom sees
+    more than a few per cent of its rating.
+    """
+    return 1e-3 * (rated_torque(chain, cell, i) or UNRATED)
+
+
+class JointHardening(TorqueEffect):
+    """δq = k₃ τ³ besides the linear k τ; k₃ in rad/(N m)³, negative where the joint stiffens.
+
+    Teeth and bearings carry more of their surface the harder they are pressed (Hertz: the
+    contact's deflection grows with a power below one of the load), so that strain-wave and
+    cycloidal gears stiffen with torque; the cubic is the first odd term after the linear one.
+    Typical: 20 % of the linear deflection at the rated torque.
+    """
+
+    name = "joint_hardening"
+    stage = "compliance"
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return turning_joints(chain)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        given = nominal_compliance(chain, cell)
+        rated = rated_torque(chain, cell, index(place))
+        typical = 0.2 * given[index(place)] / rated**2 if given and rated else None
+        return (ParameterSpec("hardening", "rad/(N*m)^3", 0.0, typical or None),)
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        k3 = p["hardening"]
+        add_deflection(arm, index(place), f"{place}.hardening", lambda tau: k3 * tau**3)
+
+
+def transverse_axes(axis: Array) -> tuple[Array, Array]:
+    """Two unit axes x, y with x × y = axis; the frame's own x and y where the axis is z.
+
+    x is the coordinate axis farthest from the joint axis that comes first, made orthogonal.
+    """
+    start = np.eye(3)[int(np.argmin(np.abs(axis).round(9)))]
+    x = start - axis * (axis @ start)
+    x /= np.linalg.norm(x)
+    return x, np.cross(axis, x)
+
+
+class OffAxisCompliance(LoadedEffect):
+    """Tilt of the joint about its two transverse axes, θ_x = k_x M_x and θ_y = k_y M_y.
+
+    M_x, M_y are the transverse moments of the load at the joint; the axes are fixed to the
+    proximal link (the bearing's housing).  Typical: 5 to 20 % of the drive's compliance.
+    """
+
+    name = "off_axis_compliance"
+    stage = "compliance"
+    elastic = True
+    sized_by_value = True
+    rank = STIFFNESS
+    formats = ("elastic",)
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return joints(chain)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        given = nominal_compliance(chain, cell)
+        typical = 0.2 * given[index(place)] if given else None
+        return tuple(
+            ParameterSpec(f"off_axis_compliance_{a}", "rad/(N*m)", 0.0, typical, lower=0.0)
+            for a in "xy"
+        )
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        axes = transverse_axes(arm.chain.joints[index(place)].axis)
+        for name, axis in zip("xy", axes, strict=True):
+            k = p[f"off_axis_compliance_{name}"]
+            arm.add_spring(Spring.linear(f"{place}.{name}", place, "revolute", axis, k))
+
+
+def link_axes(chain: Chain, i: int) -> dict[str, Array]:
+    """Unit axes (3,) of link i's (0-based) torsion and bending, in the frame at its distal end.
+
+    Torsion is about the line from the link's joint frame to its distal frame, or about the
+    joint's axis where the link has no length.
+    """
+    T = link_ends(chain)[i]
+    length = np.linalg.norm(T[:3, 3])
+    along = T[:3, 3] / length if length > SHORTEST else chain.joints[i].axis
+    along = T[:3, :3].T @ along
+    y, z = transverse_axes(along)
+    return {"torsion": along, "bending_y": y, "bending_z": z}
+
+
+class LinkBending(LoadedEffect):
+    """θ = k M at the link's distal end: bending about two transverse axes, torsion about its own.
+
+    M are the load's moments there, about axes fixed to the link; k in rad/(N m).  For a uniform
+    beam of length L, k = L/(E I) in bending and L/(G J) in torsion (the rotation of its end under
+    an end moment; Timoshenko); the deflection by a transverse force at the end itself is of
+    higher order in L over the lever arm and left out.  Typical: 15 % of the compliance of the
+    joint that moves the link.
+    """
+
+    name = "link_bending"
+    stage = "compliance"
+    elastic = True
+    formats = ("elastic",)
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return links(chain)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        given = nominal_compliance(chain, cell)
+        turning = given is not None and chain.kinds[index(place)] == "revolute"
+        typical = 0.15 * given[index(place)] or None if given and turning else None
+        return tuple(
+            ParameterSpec(key, "rad/(N*m)", 0.0, typical, lower=0.0)
+            for key in ("bending_y", "bending_z", "torsion")
+        )
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        for key, axis in link_axes(arm.chain, index(place)).items():
+            arm.add_spring(Spring.linear(f"{place}.{key}", place, "revolute", axis, p[key]))
+
+
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0)}
+
+
+class BaseCompliance(LoadedEffect):
+    """Tilt of the base about its x and y axes, θ = k M, M the load's moment at the base origin.
+
+    Pedestals, anchor bolts and floors give way under the overturning moment; k in rad/(N m).
+    Typical: 10 % of the compliance of joint 1.
+    """
+
+    name = "base_compliance"
+    stage = "compliance"
+    elastic = True
+    sized_by_value = True
+    rank = STIFFNESS
+    formats = ("elastic",)
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return ("base",)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        given = nominal_compliance(chain, cell)
+        typical = 0.1 * given[0] or None if given and chain.kinds[0] == "revolute" else None
+        return tuple(
+            ParameterSpec(f"tilt_compliance_{a}", "rad/(N*m)", 0.0, typical, lower=0.0)
+            for a in AXES
+        )
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        for name, axis in AXES.items():
+            k = p[f"tilt_compliance_{name}"]
+            arm.add_spring(Spring.linear(f"base.{name}", "base", "revolute", axis, k))

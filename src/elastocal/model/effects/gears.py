@@ -1,0 +1,174 @@
+"""What the gears make of the commanded joints: offsets, scales, harmonics, couplings."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import casadi as ca
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import require
+from elastocal.model.arm import Arm, ParameterSpec, Setting
+from elastocal.model.chain import Chain
+from elastocal.model.effects.base import (
+    OFFSET,
+    Effect,
+    Symbols,
+    index,
+    joints,
+    motion_unit,
+    turning_joints,
+)
+from elastocal.model.effects.driven import DrivenEffect, JointMotion
+
+
+class JointOffset(Effect):
+    """δq = a: the joint's zero differs from nominal by a (rad, or m for a prismatic joint)."""
+
+    name = "joint_offset"
+    stage = "transmission"
+    rank = OFFSET
+    formats = ("rigid", "elastic")
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return joints(chain)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        return (ParameterSpec("offset", motion_unit(place, chain), 0.0, 1e-3),)
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        arm.q[index(place)] += p["offset"]
+
+
+class EncoderScale(DrivenEffect):
+    """δq = a·q with the commanded joint value q; a is dimensionless."""
+
+    name = "encoder_scale"
+    stage = "transmission"
+    entry = JointMotion()
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        return (ParameterSpec("encoder_scale", "1", 0.0, 3e-4),)
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        return p["encoder_scale"] * arm.q_commanded[index(place)]
+
+
+class GearHarmonic(DrivenEffect):
+    """δq = a sin Nq + b cos Nq with the commanded joint angle q; a and b in rad.
+
+    A subclass states the order N, the prefix of its two parameters' keys and their typical size.
+    """
+
+    stage = "transmission"
+    entry = JointMotion()
+    prefix: ClassVar[str]
+    typical: ClassVar[float]
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return turning_joints(chain)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        return tuple(
+            ParameterSpec(f"{self.prefix}_{part}", "rad", 0.0, self.typical)
+            for part in ("sin", "cos")
+        )
+
+    def order(self, p: Symbols) -> ca.SX:
+        """N: periods of the error in one turn of the joint."""
+        raise NotImplementedError
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        phase = self.order(p) * arm.q_commanded[index(place)]
+        return p[f"{self.prefix}_sin"] * ca.sin(phase) + p[f"{self.prefix}_cos"] * ca.cos(phase)
+
+
+class GearEccentricity(GearHarmonic):
+    """δq = a sin q + b cos q with the commanded joint angle q; a and b in rad.
+
+    The last gear wheel of a drive, or the disc of an encoder behind it, turns about a point at
+    distance e from its own centre: the joint runs ahead by e/r and behind by as much once per
+    turn, r the radius of the pitch circle or of the graduation.  √(a² + b²) = e/r, and
+    atan2(b, a) is where the eccentricity points.  Source: Whitney, Lozinski and Rourke 1986,
+    "Industrial robot forward calibration method and results" (the first-order gear error).
+    """
+
+    name = "gear_eccentricity"
+    prefix = "eccentricity"
+    typical = 1e-4
+
+    def order(self, p: Symbols) -> ca.SX:
+        return ca.SX(1)
+
+
+class GearSecondHarmonic(GearHarmonic):
+    """δq = a sin 2q + b cos 2q with the commanded joint angle q; a and b in rad.
+
+    An oval wheel, a strain-wave gear whose flexible spline is pressed against a circular spline
+    that is not round, two reading heads of an encoder with an oval disc or a shaft that wobbles
+    in a universal joint: ahead and behind twice per turn.
+    """
+
+    name = "gear_second_harmonic"
+    prefix = "harmonic2"
+    typical = 5e-5
+
+    def order(self, p: Symbols) -> ca.SX:
+        return ca.SX(2)
+
+
+class GearRipple(GearHarmonic):
+    """δq = a sin Nq + b cos Nq with the commanded joint angle q; a and b in rad.
+
+    N is a number of teeth, the ratio of a stage (an eccentric input wheel turns N times per turn
+    of the joint) or a product of both, and need not be whole: the transmission error of spur,
+    cycloidal and strain-wave gears.  The orders come from `[model] gear_ripple_orders`, one per
+    joint or a single one for all, or from `settings.jointN = { ripple_order = … }`.
+    """
+
+    name = "gear_ripple"
+    prefix = "ripple"
+    typical = 5e-5
+
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        orders = cell.model.gear_ripple_orders
+        require(
+            len(orders) in (0, 1, chain.n_joints),
+            f"{cell.path or cell.name}: [model] gear_ripple_orders has {len(orders)} values, but "
+            f"the arm has {chain.n_joints} joints; give one per joint, or a single one for all",
+        )
+        default = orders[index(place) % len(orders)] if orders else None
+        return (Setting("ripple_order", "order", default, 0.5, 1000.0),)
+
+    def order(self, p: Symbols) -> ca.SX:
+        return p["ripple_order"]
+
+
+class WristCoupling(DrivenEffect):
+    """δq₅ = a q₄, δq₆ = b q₄ + c q₅ of six joints; of n, the last three.
+
+    Drives of a wrist sit in the forearm and reach their joints through hollow shafts, so that
+    turning one joint turns those behind it, which the controller undoes with its coupling
+    ratios.  a, b and c (dimensionless) are the errors of those ratios.
+    """
+
+    name = "wrist_coupling"
+    stage = "transmission"
+    entry = JointMotion()
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        turning = chain.n_joints >= 6 and set(chain.kinds[-3:]) == {"revolute"}
+        return ("wrist",) if turning else ()
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        return tuple(ParameterSpec(f"coupling_{k}", "1", 0.0, 2e-4) for k in "abc")
+
+    def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
+        return joints(chain)[-2:]
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        n = arm.chain.n_joints
+        first, second = arm.q_commanded[n - 3], arm.q_commanded[n - 2]
+        return ca.vertcat(
+            p["coupling_a"] * first, p["coupling_b"] * first + p["coupling_c"] * second
+        )

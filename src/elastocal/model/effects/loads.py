@@ -1,0 +1,231 @@
+"""What pulls at the arm: the payload, the weights of the links, the compensator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import require
+from elastocal.model import rigid
+from elastocal.model.arm import Arm, ParameterSpec
+from elastocal.model.chain import Chain
+from elastocal.model.effects.base import (
+    RECORD_TORQUES,
+    STIFFNESS,
+    WEIGH_LOAD,
+    Effect,
+    Symbols,
+    index,
+    joints,
+    links,
+)
+
+
+class Payload(Effect):
+    """f = (force_x, force_y, force_z) of the row, acting at `load_point_m` of the tool.
+
+    The force is constant in the tracker frame (a hanging weight, a rope over a pulley) and its
+    point moves with the arm: V = −f·p_load(θ).  No parameters.
+    """
+
+    name = "payload"
+    stage = "load"
+    formats = ("elastic",)
+
+    def acts_unasked(self, cell: Cell) -> bool:
+        return True
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        return False
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return ("load",)
+
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
+        point = rigid.point(arm.T_tracker_flange, rigid.constant(arm.cell.tool.load_point))
+        arm.add_force(point, arm.input("force", 3))
+
+
+class PayloadError(Effect):
+    """The row's force f acts as (1 + s) f at `load_point_m` + d; s (1), d (3,) m, flange frame.
+
+    The weight was not weighed, or the hook hangs elsewhere than drawn.  Adds to the declared
+    load's potential −f·p(θ) what is missing: V = −f·(s p + (1 + s) R d), R the flange's rotation.
+    """
+
+    name = "payload_error"
+    stage = "load"
+    formats = ("elastic",)
+    remedy = WEIGH_LOAD
+    needs = ("load",)
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return ("load",)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        return (
+            ParameterSpec("payload_scale", "1", 0.0, 0.02),
+            *(ParameterSpec(f"load_point_{k}", "m", 0.0, 0.01) for k in "xyz"),
+        )
+
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
+        force, T = arm.input("force", 3), arm.T_tracker_flange
+        scale = p["payload_scale"]
+        shift = ca.vertcat(*[p[f"load_point_{k}"] for k in "xyz"])
+        arm.add_force(rigid.point(T, rigid.constant(arm.cell.tool.load_point)), scale * force)
+        arm.add_potential(-(1 + scale) * ca.dot(force, T[:3, :3] @ shift))
+
+
+STANDARD_GRAVITY = 9.80665  # m/s², along −z of the tracker frame, which is vertical
+
+
+class LinkGravity(Effect):
+    """Weight m g of each link at its centre of mass: V = m g z_com(θ).  No parameters.
+
+    Masses and centres of mass are the URDF's (or the DH robot's table of masses).
+    """
+
+    name = "link_gravity"
+    stage = "load"
+    formats = ("elastic",)
+
+    def acts_unasked(self, cell: Cell) -> bool:
+        return cell.model.link_gravity
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        return False
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return links(chain)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        require(
+            bool(chain.masses),
+            f"link_gravity is on, but robot '{chain.name}' has no masses: give <inertial> "
+            'elements in the URDF, or [robot] masses = "links.csv" for a DH robot, '
+            "or set [model] link_gravity = false",
+        )
+        return ()
+
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
+        i = index(place)
+        body = arm.chain.masses[i]
+        com = rigid.point(arm.T_tracker_link[i], rigid.constant(body.com))
+        arm.add_force(com, ca.vertcat(0, 0, -body.mass * STANDARD_GRAVITY))
+
+
+DISPLACED = 0.02  # m; typical error of a centre of mass
+
+
+class LinkMassError(Effect):
+    """V = g (m z + (R s)_z): mass m (kg) and first moment s (3,) (kg m) missing from a link.
+
+    z is the height of the link's joint frame and R its rotation; s is taken in that frame.  A
+    mass error δm with its centre at c is m = δm, s = δm c; a centre of mass displaced by δc is
+    s = m₀ δc.  Cables, hoses and gear oil are in no CAD file.  Where `link_gravity` is off, all
+    of the link's weight is missing, and the typical sizes are the URDF's own.  Places: links
+    whose mass the robot's file gives.
+    """
+
+    name = "link_mass_error"
+    stage = "load"
+    formats = ("elastic",)
+    remedy = RECORD_TORQUES
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        pairs = zip(links(chain), chain.masses, strict=False)
+        return tuple(link for link, body in pairs if body.mass > 0)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        body = chain.masses[index(place)]
+        share = 0.1 if cell.model.link_gravity else 1.0
+        moment = body.mass * (share * float(np.linalg.norm(body.com)) + DISPLACED)
+        return (
+            ParameterSpec("mass_error", "kg", 0.0, share * body.mass),
+            *(ParameterSpec(f"moment_{k}", "kg*m", 0.0, moment) for k in "xyz"),
+        )
+
+    def unphysical(self, values: Mapping[str, float], chain: Chain, cell: Cell) -> str:
+        reason = ""
+        for link, own in zip(links(chain), chain.masses, strict=False):
+            error = values.get(f"{link}.mass_error")
+            nominal = own.mass if cell.model.link_gravity else 0.0
+            if error is not None and nominal + error <= 0:
+                reason = f"the mass of {link} would be {nominal + error:.3g} kg"
+        return reason
+
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
+        T = arm.T_tracker_link[index(place)]
+        moment = ca.vertcat(*[p[f"moment_{k}"] for k in "xyz"])
+        height = p["mass_error"] * T[2, 3] + T[2, :3] @ moment
+        arm.add_potential(STANDARD_GRAVITY * height)
+
+
+# Rough geometry of a KR 270 compensator: an example to start from, to be identified.
+EXAMPLE: dict[str, Any] = {
+    "stiffness_N_per_m": 0.0,
+    "anchor_m": (0.686, 0.120),
+    "arm_m": 0.185,
+    "free_length_m": 0.458,
+}
+
+
+class GravityCompensator(Effect):
+    """Spring of stiffness K_c and free length s₀ acting at arm L, anchored at (a_x, a_y).
+
+    s² = a² + L² + 2 a L cos(α − q), a = |(a_x, a_y)|, α = atan2(a_y, a_x), V = ½ K_c (s − s₀)²,
+    hence the torque M = −K_c (1 − s₀/s) a L sin(α − q) about the joint, taken at the deflected
+    angle (Klimchik et al. 2013, section 5).  Geometry comes from `[model.nominal]
+    gravity_compensator`; without it an example geometry and zero stiffness are the start.
+    """
+
+    name = "gravity_compensator"
+    stage = "load"
+    rank = STIFFNESS
+    formats = ("elastic",)
+    remedy = RECORD_TORQUES
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        given = cell.model.nominal.gravity_compensator
+        return joints(chain)[1:2] if given is None else (str(given["joint"]),)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        given = EXAMPLE | (cell.model.nominal.gravity_compensator or {})
+        anchor_x, anchor_y = given["anchor_m"]
+        stiffness = float(given["stiffness_N_per_m"])
+        return (
+            ParameterSpec("compensator_stiffness", "N/m", stiffness, abs(stiffness) or None),
+            ParameterSpec("compensator_anchor_x", "m", float(anchor_x), 1e-2),
+            ParameterSpec("compensator_anchor_y", "m", float(anchor_y), 1e-2),
+            ParameterSpec("compensator_arm", "m", float(given["arm_m"]), 1e-2),
+            ParameterSpec("compensator_free_length", "m", float(given["free_length_m"]), 1e-2),
+        )
+
+    def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
+        if cell.model.nominal.gravity_compensator is not None:
+            return ()
+        x, y = EXAMPLE["anchor_m"]
+        turns = np.radians(np.arange(0, 360, 30))
+        return tuple(
+            {
+                "compensator_anchor_x": float(np.cos(t) * x - np.sin(t) * y),
+                "compensator_anchor_y": float(np.sin(t) * x + np.cos(t) * y),
+            }
+            for t in turns
+        )
+
+    def unphysical(self, values: Mapping[str, float], chain: Chain, cell: Cell) -> str:
+        keys = (".compensator_stiffness", ".compensator_free_length")
+        negative = any(v < 0 for name, v in values.items() if name.endswith(keys))
+        return "negative stiffness or free length" if negative else ""
+
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
+        q = arm.joint_angle(index(place))
+        ax, ay, L = p["compensator_anchor_x"], p["compensator_anchor_y"], p["compensator_arm"]
+        s = ca.sqrt(ax**2 + ay**2 + L**2 + 2 * L * (ax * ca.cos(q) + ay * ca.sin(q)))
+        stretch = s - p["compensator_free_length"]
+        arm.add_potential(p["compensator_stiffness"] * stretch**2 / 2)

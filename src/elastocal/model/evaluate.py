@@ -1,0 +1,324 @@
+"""Batch evaluation: a list of expressions on all rows of a table at once, behind one call."""
+
+from __future__ import annotations
+
+import contextvars
+import os
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.errors import InputError
+from elastocal.model.c_engine import (
+    HOW_TO_GET_ONE,
+    Compiled,
+    NoCompiler,
+    compile_function,
+    find_compiled,
+)
+from elastocal.model.function_cache import HashedFunction
+from elastocal.model.numpy_engine import NumpyFunction
+from elastocal.text import did_you_mean
+
+# Threads over blocks of rows: how many, how rows are cut, and running them.
+
+
+def thread_count() -> int:
+    """OMP_NUM_THREADS where that is a positive number, else the cores this process may use."""
+    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    if asked.isdigit() and int(asked) > 0:
+        return int(asked)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))  # a container's or a batch system's share
+    return os.cpu_count() or 1
+
+
+def row_blocks(n: int, size: int) -> list[slice]:
+    """`n` rows as contiguous blocks of at most `size`, equal to within one row.
+
+    They depend on n and size alone, so no result can depend on the number of threads.
+    """
+    count = -(-n // max(size, 1))
+    edges = [n * k // count for k in range(count + 1)] if count else [0]
+    return [slice(a, b) for a, b in pairwise(edges)]
+
+
+def run_blocks(
+    work: Callable[[Sequence[slice]], None], blocks: Sequence[slice], threads: int
+) -> None:
+    """`work` on contiguous shares of `blocks`, one share per thread; what one raises is raised.
+
+    Every thread runs in a copy of the caller's context, which holds `numpy.errstate`.
+    """
+    threads = max(1, min(threads, len(blocks)))
+    if threads == 1:
+        work(blocks)
+        return
+    shares = [blocks[s] for s in row_blocks(len(blocks), -(-len(blocks) // threads))]
+    with ThreadPoolExecutor(threads, thread_name_prefix="rows") as pool:
+        running = [pool.submit(contextvars.copy_context().run, work, share) for share in shares]
+        for future in running:
+            future.result()
+
+
+# Which engine evaluates a tape: numpy's replay or compiled C, asked for and reported.
+#
+# "auto" rents before it buys: a tape is replayed until replaying it has cost about as much more
+# than compiled code as compiling costs, and compiled then.  What has been compiled before is used
+# as soon as replaying has cost more than looking for it.  Both are counted in calls and rows and
+# never timed, so that the same work with the same cache is evaluated by the same engine.
+
+BACKENDS = ("auto", "numpy", "compiled")
+VARIABLE = "ELASTOCAL_BACKEND"
+
+# Seconds, on one core of a 2023 server.  Replay costs a numpy call per instruction and block and
+# is then bound by the second-level cache; compiled code keeps most operands in registers.
+REPLAY_CALL = 0.3e-6  # per instruction and block
+REPLAY_ROW = 0.15e-9  # per instruction and row, above compiled code
+COMPILE_START, COMPILE_INSTRUCTION = 0.2, 1.2e-4  # one run of the compiler
+LOOKUP_START, LOOKUP_INSTRUCTION = 0.02, 1e-6  # hash, verify and load a library
+
+_default: str | None = None
+
+
+def checked(name: str, source: str) -> str:
+    """`name` where it is a backend; InputError that says where it comes from otherwise."""
+    if name not in BACKENDS:
+        raise InputError(
+            f"{source}: unknown backend '{name}'{did_you_mean(name, list(BACKENDS))}; "
+            f"valid: {', '.join(BACKENDS)}"
+        )
+    return name
+
+
+def set_default_backend(name: str | None) -> None:
+    """What tapes use that were not told otherwise; None: ELASTOCAL_BACKEND, else "auto".
+
+    Raises InputError for an unknown name.
+    """
+    global _default
+    _default = None if name is None else checked(name, "backend")
+
+
+def chosen_backend(name: str | None = None) -> str:
+    """`name`, else the default set here, else ELASTOCAL_BACKEND, else "auto".
+
+    Raises InputError for an unknown name.
+    """
+    if name is not None:
+        return checked(name, "backend")
+    if _default is not None:
+        return _default
+    return checked(os.environ.get(VARIABLE, "").strip() or "auto", f"{VARIABLE} in the environment")
+
+
+@dataclass
+class Work:
+    """Seconds that replaying a tape of `instructions` has cost above compiled code, estimated."""
+
+    instructions: int
+    wasted: float = 0.0
+
+    def add(self, rows: int, blocks: int) -> None:
+        """One more call of `rows` rows in `blocks` blocks."""
+        self.wasted += self.instructions * (REPLAY_CALL * blocks + REPLAY_ROW * rows)
+
+    @property
+    def pays_to_look(self) -> bool:
+        """A library that exists already pays by now."""
+        return self.wasted >= LOOKUP_START + LOOKUP_INSTRUCTION * self.instructions
+
+    @property
+    def pays_to_compile(self) -> bool:
+        """Compiling would have paid by now."""
+        return self.wasted >= COMPILE_START + COMPILE_INSTRUCTION * self.instructions
+
+
+@dataclass(frozen=True)
+class BackendReport:
+    """What evaluated a tape last.
+
+    `backend` "numpy" or "compiled" ("none" before the first call), `compiler` its path and version
+    where compiled, `threads` used, `cached` True where the library was found and
+    not compiled by this process, `reason` why it is not compiled.
+    """
+
+    backend: str
+    compiler: str | None = None
+    threads: int = 1
+    cached: bool = False
+    reason: str = ""
+
+    def __str__(self) -> str:
+        cores = f"{self.threads} thread{'s' if self.threads > 1 else ''}"
+        if self.backend == "compiled":
+            return f"compiled ({self.compiler}; {cores})"
+        why = f"; {self.reason}" if self.reason else ""
+        return f"{self.backend} ({cores}{why})"
+
+
+def summary(reports: Iterable[BackendReport]) -> str:
+    """One line for a report: every engine that was used, and by how many of the tapes."""
+    groups: dict[tuple[str, str | None, str], list[BackendReport]] = {}
+    for report in reports:
+        if report.backend != "none":
+            key = (report.backend, report.compiler, report.reason)
+            groups.setdefault(key, []).append(report)
+    total = sum(len(group) for group in groups.values())
+    lines = []
+    for group in groups.values():
+        threads = max(r.threads for r in group)
+        share = f"{len(group)} of {total} expressions: " if len(groups) > 1 else ""
+        lines.append(f"{share}{replace(group[0], threads=threads)}")
+    return "; ".join(lines) or "nothing evaluated yet"
+
+
+# Batch evaluation: a list of expressions on all rows of a table at once, behind one call.
+
+CHUNK = 8192  # rows at a time: registers stay in cache, numpy's call overhead is spread
+COMPILED_CHUNK = 1024  # compiled code has no overhead to spread; small pieces share out evenly
+LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
+# Compiled code takes about 0.15 ns per instruction and row; a thread must have 0.5 ms to do.
+WORK_OF_A_THREAD = 3_000_000  # instructions × rows
+
+
+class BatchFunction:
+    """An `SX` expression list, evaluated row by row on arrays.
+
+    `inputs` and `outputs` are lists of SX vectors / matrices.  Calling the tape takes one array
+    per input: (n, size) for a quantity that varies by row, (size,) for one that is the same in
+    every row; it returns one array (n, rows, columns) per output, float64, or complex where an
+    input is.  `backend` is "auto", "numpy" or "compiled"; None follows `set_default_backend`.
+    Complex numbers are always replayed.
+
+    `whole`, where given, is a tape of the same inputs and outputs whose last output has more
+    columns, and `columns` says which of them this one's are: where its instructions are known
+    already, they serve here too.
+
+    A call raises NotImplementedError where it replays an operation that numpy lacks, ValueError
+    for arrays of other shapes, InputError where `backend` is "compiled" and nothing can compile.
+    """
+
+    def __init__(
+        self,
+        inputs: Sequence[ca.SX],
+        outputs: Sequence[ca.SX],
+        backend: str | None = None,
+        whole: BatchFunction | None = None,
+        columns: Sequence[int] = (),
+    ) -> None:
+        self._asked = None if backend is None else checked(backend, "backend")
+        self._function = HashedFunction(inputs, outputs)
+        self.shapes = self._function.shapes
+        self._sizes = self._function.sizes
+        self.n_instructions = self._function.n_instructions
+        self._forget()
+        self._whole, self._columns = whole, tuple(columns)
+
+    _whole: BatchFunction | None
+    _columns: tuple[int, ...]
+
+    def _forget(self) -> None:
+        self._lock = threading.Lock()
+        self._whole, self._columns = None, ()
+        self._work = Work(self.n_instructions)
+        self._compiled: Compiled | None = None
+        self._looked = False
+        self._refused = ""
+        self._report = BackendReport("none")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Expressions only: libraries, locks and instructions are found again where it goes."""
+        kept = ("_asked", "_function", "shapes", "_sizes", "n_instructions")
+        return {key: self.__dict__[key] for key in kept}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._forget()
+
+    @cached_property
+    def _replay(self) -> NumpyFunction:
+        known = None if self._whole is None else self._whole.__dict__.get("_replay")
+        return NumpyFunction(self._function, known, self._columns)
+
+    @property
+    def report(self) -> BackendReport:
+        """What evaluated the last call."""
+        return self._report
+
+    def __call__(self, *inputs: NDArray, chunk: int = CHUNK) -> list[NDArray]:
+        arrays, n = self._rows(inputs)
+        dtype = np.result_type(np.float64, *arrays)
+        results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
+        engine = self._engine(dtype, n, -(-n // max(chunk, 1)))
+        if isinstance(engine, Compiled):
+            blocks = row_blocks(n, min(chunk, COMPILED_CHUNK))
+            threads = 1 + n * self.n_instructions // WORK_OF_A_THREAD
+        else:
+            width = engine.n_registers + sum(r * c for r, c in self.shapes)
+            blocks = row_blocks(n, min(chunk, max(LARGEST_BUFFER // max(width, 1), 1)))
+            threads = len(blocks)
+        threads = min(threads, len(blocks), _threads_here())
+        self._note(engine, threads)
+        run_blocks(lambda share: engine.evaluate(arrays, results, share), blocks, threads)
+        return results
+
+    def _rows(self, inputs: Sequence[NDArray]) -> tuple[list[NDArray], int]:
+        """The inputs as arrays of the right shapes, and the number of rows."""
+        arrays = [np.asarray(a) for a in inputs]
+        arrays = [a if a.dtype.kind == "c" else a.astype(np.float64, copy=False) for a in arrays]
+        n = max((len(a) for a in arrays if a.ndim == 2), default=1)
+        shapes = [a.shape for a in arrays]
+        per_row, common = [(n, size) for size in self._sizes], [(size,) for size in self._sizes]
+        fit = [s in pair for s, *pair in zip(shapes, per_row, common, strict=False)]
+        if len(shapes) != len(self._sizes) or not all(fit):
+            raise ValueError(f"inputs of shapes {shapes}; this tape takes {self._sizes} per row")
+        return arrays, n
+
+    def _engine(self, dtype: np.dtype, rows: int, blocks: int) -> NumpyFunction | Compiled:
+        backend = chosen_backend(self._asked)
+        if backend == "numpy" or dtype != np.float64:
+            return self._replay
+        with self._lock:
+            if self._compiled is None and backend == "compiled":
+                try:
+                    self._compiled = compile_function(self._function)
+                except NoCompiler as error:
+                    raise InputError(f"backend compiled: {error}; {HOW_TO_GET_ONE}") from None
+            if self._compiled is None and not self._refused:
+                self._compiled = self._where_it_pays(rows, blocks)
+            return self._compiled or self._replay
+
+    def _where_it_pays(self, rows: int, blocks: int) -> Compiled | None:
+        """Compiled code under "auto", this call counted; None where replaying is still cheaper."""
+        self._work.add(rows, blocks)
+        try:
+            if self._work.pays_to_compile:
+                return compile_function(self._function)
+            if self._work.pays_to_look and not self._looked:
+                self._looked = True
+                return find_compiled(self._function)
+        except NoCompiler as error:
+            self._refused = str(error)
+        return None
+
+    def _note(self, engine: NumpyFunction | Compiled, threads: int) -> None:
+        threads = max(threads, 1)
+        if isinstance(engine, Compiled):
+            compiler = str(engine.compiler)
+            self._report = BackendReport("compiled", compiler, threads, engine.cached)
+        else:
+            self._report = BackendReport("numpy", threads=threads, reason=self._refused)
+
+
+def _threads_here() -> int:
+    """One in a thread of the caller's own: who started it has shared the work out already."""
+    return thread_count() if threading.current_thread() is threading.main_thread() else 1

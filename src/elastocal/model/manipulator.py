@@ -1,0 +1,427 @@
+"""The model: nominal chain plus effects, and its regressor B for a whole table at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from elastocal.cell.arm_description import EffectChoice
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import ElastocalError, require
+from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
+from elastocal.model.arm import Parameter, row_inputs
+from elastocal.model.chain import Chain
+from elastocal.model.choice import cell_of, load_chain
+from elastocal.model.effects.base import Effect
+from elastocal.model.evaluate import summary
+from elastocal.model.observations import Observations, observe
+from elastocal.model.symbolic import SymbolicArm
+from elastocal.text import listed
+from elastocal.units import Array
+
+
+@dataclass(frozen=True)
+class Regression:
+    """B (rows, parameters) = ∂prediction/∂parameters, prediction (rows,) and what was observed.
+
+    Rows are observations × components in the table's order; units are m (and rad) per unit of
+    the parameter.
+    """
+
+    B: Array
+    prediction: Array
+    observations: Observations
+
+    @property
+    def residual(self) -> Array:
+        """Observed minus predicted (rows,)."""
+        return self.observations.value - self.prediction
+
+
+class Model:
+    """p_i = h(q_i, f_i, …; X) for an arm with effects; CasADi differentiates it exactly.
+
+    Attributes:
+        cell: The `Cell` that it models.
+        chain: The nominal kinematic chain of the robot.
+        parameters: `Parameter`s of all active effects, in the order of every vector x and of the
+            columns of B.
+        names: Their names.
+        nominal: Their nominal values x (parameters,), in SI units.
+        observe: What a reading is: "position", "deflection", "pose" or "distance".
+
+    Args:
+        cell: A cell file (TOML), or a `Cell` built in Python.
+        markers: The markers' names where the cell lists none; default one, "M1".  Every verb
+            takes them from the table where neither says them.
+        backend: What evaluates it: "auto", "numpy" or "compiled"; None follows
+            `set_default_backend` and the environment variable ELASTOCAL_BACKEND.
+
+    Raises:
+        InputError: The cell, or a file that it names, is wrong; the message says where.
+
+    Examples:
+        >>> model = ec.Model("cell.toml")
+        >>> model
+        <Model ...: kuka_kr270_2, 6 joints, 10 parameters of joint_compliance; observes deflection>
+        >>> model.names[:2]
+        ('joint1.compliance', 'joint2.compliance_level1')
+        >>> plan = model.read_plan("plan.csv")
+        >>> model.pose(plan.q[0])[:3, 3].round(3)
+        array([...])
+        >>> model.B(model.read("data.csv")).shape
+        (810, 10)
+    """
+
+    def __init__(
+        self,
+        cell: Cell | str | Path,
+        markers: Sequence[str] = (),
+        backend: str | None = None,
+    ) -> None:
+        cell = cell_of(cell)
+        self._markers_stated = bool(cell.tool.markers)
+        if not self._markers_stated:
+            cell = _with_markers(cell, tuple(markers) or (DEFAULT_MARKER,))
+        self._assemble(load_chain(cell), cell, (), backend)
+
+    @classmethod
+    def assembled(
+        cls,
+        chain: Chain,
+        cell: Cell,
+        extra: Sequence[tuple[Effect, str]] = (),
+        backend: str | None = None,
+    ) -> Model:
+        """The model of a chain that is there already; `cell` says all else.
+
+        `extra` effects with their places act besides those that the cell chooses.
+        """
+        model = cls.__new__(cls)
+        model._markers_stated = True
+        model._assemble(chain, cell, extra, backend)
+        return model
+
+    def _assemble(
+        self, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]], backend: str | None
+    ) -> None:
+        self.chain, self.cell = chain, cell
+        self.observe = cell.model.observe
+        self._symbolic = SymbolicArm(chain, cell, extra, backend)
+        self.parameters: tuple[Parameter, ...] = self._symbolic.parameters
+
+    def __repr__(self) -> str:
+        effects = listed(dict.fromkeys(p.effect for p in self.parameters), 6) or "no effect"
+        return (
+            f"<Model {self.cell.name}: {self.chain.name}, {self.chain.n_joints} joints, "
+            f"{len(self.parameters)} parameters of {effects}; observes {self.observe}>"
+        )
+
+    def read(self, path: str | Path) -> Measurements:
+        """The measurements of a CSV or Parquet file, in SI units.
+
+        Args:
+            path: The table; its columns are those that the model observes, units stand in the
+                header.
+
+        Raises:
+            InputError: The table is wrong; the message names file, line, column and the text.
+
+        Examples:
+            >>> data = ec.Model("cell.toml").read("data.csv")
+            >>> len(data), data.q.shape, data.marker_names
+            (540, (540, 6), ('M1', 'M2', 'M3'))
+        """
+        markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
+        return read_measurements(
+            path, joint_kinds=self.chain.kinds, marker_names=markers, observe=self.observe
+        )
+
+    def read_plan(self, path: str | Path) -> Measurements:
+        """The poses of a plan (CSV): configuration, q1_deg …, and forces where it states them.
+
+        Raises:
+            InputError: As `read` does.
+
+        Examples:
+            >>> len(ec.Model("cell.toml").read_plan("plan.csv"))
+            15
+        """
+        return read_plan(path, joint_kinds=self.chain.kinds)
+
+    def table(
+        self, q: ArrayLike, force: ArrayLike | None = None, position: ArrayLike | None = None
+    ) -> Measurements:
+        """A table of readings that no file states, one configuration per row, of one marker.
+
+        Args:
+            q: Commanded joints (n, joints) or (joints,), in rad or m.
+            force: Forces (n, 3) or (3,) in N at the load point, in the data's frame; default none.
+            position: Measured positions (n, 3) in m in the data's frame, where there are any.
+
+        Raises:
+            InputError: A shape does not fit.
+
+        Examples:
+            >>> model = ec.Model("cell.toml")
+            >>> table = model.table([0.1, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600])
+            >>> model.deflection(table).shape
+            (1, 6)
+        """
+        joints = np.atleast_2d(np.asarray(q, dtype=float))
+        n = len(joints)
+        require(
+            joints.shape == (n, self.chain.n_joints),
+            f"q takes {self.chain.n_joints} joints per row; found an array of shape {np.shape(q)}",
+        )
+        return Measurements(
+            source="table",
+            row=np.arange(1, n + 1),
+            q=joints,
+            configuration=np.arange(n),
+            configuration_labels=tuple(map(str, range(1, n + 1))),
+            repeat=np.zeros(n, dtype=np.int64),
+            marker=np.zeros(n, dtype=np.int64),
+            marker_names=tuple(self.cell.tool.markers)[:1] or (DEFAULT_MARKER,),
+            force=np.zeros((n, 3)) if force is None else _rows_of_three("force", force, n),
+            position=None if position is None else _rows_of_three("position", position, n),
+        )
+
+    def pose(
+        self, q: ArrayLike, x: ArrayLike | None = None, force: ArrayLike | None = None
+    ) -> NDArray:
+        """The flange's pose in the data's frame, T_tracker_flange, deflections included.
+
+        Args:
+            q: Commanded joints (joints,) or (n, joints), in rad or m.
+            x: Parameter values (parameters,) in SI units; default the nominal ones.
+            force: As for `table`.
+
+        Returns:
+            (4, 4), or (n, 4, 4) where q has rows; NaN where there is no static equilibrium.
+
+        Raises:
+            InputError: A shape does not fit, or an active effect needs more than joints and
+                force (a time, a temperature): then `flange_poses` takes a table.
+
+        Examples:
+            >>> ec.Model("cell.toml").pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0]).shape
+            (4, 4)
+        """
+        poses = self.flange_poses(self.table(q, force), None if x is None else np.asarray(x))
+        return poses[0] if np.ndim(q) == 1 else poses
+
+    def with_markers_of(self, *tables: Measurements) -> Model:
+        """This model with the markers of the tables, where the cell lists none."""
+        names = tuple(dict.fromkeys(name for t in tables for name in t.marker_names))
+        if self._markers_stated or not names or names == tuple(self.cell.tool.markers):
+            return self
+        cell = _with_markers(self.cell, names)
+        model = Model.assembled(self.chain, cell, backend=self._symbolic.backend)
+        model._markers_stated = False
+        return model
+
+    def with_effects(self, effects: tuple[EffectChoice, ...]) -> Model:
+        """The same arm with another choice of effects."""
+        spec = replace(self.cell.model, effects=effects)
+        return Model.assembled(
+            self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend
+        )
+
+    @cached_property
+    def rigid(self) -> Model:
+        """The nominal arm with no effect and its base at the data's origin, for registration."""
+        spec = self.cell.model
+        nominal = replace(spec.nominal, base_position=None, base_rotation=None)
+        spec = replace(spec, effects=(), observe="position", nominal=nominal, link_gravity=False)
+        return Model.assembled(
+            self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend
+        )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    def meant_by(self, name: str) -> list[int]:
+        """Indices of the parameters that a parameter's, place's or effect's name stands for."""
+        return [i for i, p in enumerate(self.parameters) if name in (p.name, p.where, p.effect)]
+
+    @property
+    def all_names(self) -> list[str]:
+        """Every name that `meant_by` understands."""
+        return sorted({v for p in self.parameters for v in (p.name, p.where, p.effect)})
+
+    def backend_report(self) -> str:
+        """What evaluates this model, for reports: engine, compiler, cached or not, threads."""
+        return summary(self._symbolic.backend_reports.values())
+
+    @property
+    def nominal(self) -> Array:
+        return np.array([p.nominal for p in self.parameters])
+
+    def sizes(self, B: Array) -> Array:
+        """Typical deviation (parameters,) of each parameter, in its unit.
+
+        Where none is known beforehand, one size for all parameters of that effect: ten times the
+        deviation that moves the readings behind `B` by 1 mm at the place they show most (a
+        wrist is about ten times as soft as a shoulder).
+        """
+        largest = np.abs(B).max(axis=0, initial=0.0)
+        moved = np.divide(1e-3, largest, out=np.full(len(largest), np.inf), where=largest > 0)
+        common: dict[tuple[str, str], float] = {}
+        for p, m in zip(self.parameters, moved, strict=True):
+            common[p.effect, p.unit] = min(common.get((p.effect, p.unit), np.inf), 10 * m)
+        common = {key: size if np.isfinite(size) else 1.0 for key, size in common.items()}
+        return np.array(
+            [common[p.effect, p.unit] if p.typical is None else p.typical for p in self.parameters]
+        )
+
+    def deflection(self, table: Measurements, x: Array | None = None) -> NDArray:
+        """Elastic deflections θ at static equilibrium.
+
+        Args:
+            table: Readings, or a plan: what a table says of joints and loads.
+            x: Parameter values (parameters,) in SI units; default the nominal ones.
+
+        Returns:
+            (n_rows, springs) in rad or m, one column per spring of the active effects; NaN where
+            no equilibrium is found.
+
+        Examples:
+            >>> model = ec.Model("cell.toml")
+            >>> loaded = model.table([0.1, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600])
+            >>> bool(abs(model.deflection(loaded)).max() < 0.01)
+            True
+        """
+        x = self.nominal if x is None else np.asarray(x)
+        return self._settle(row_inputs(self._symbolic.arm, table), x)
+
+    def _settle(self, inputs: list[NDArray], x: NDArray) -> NDArray:
+        if not self._symbolic.implicit:
+            return np.zeros((len(inputs[0]), len(self._symbolic.arm.springs)), dtype=x.dtype)
+        return self._symbolic.equilibrium.solve(inputs, x)[0]
+
+    def _rows(
+        self, table: Measurements, x: NDArray, columns: tuple[int, ...]
+    ) -> tuple[NDArray, NDArray]:
+        """Reading (n_rows, size) and B (n_rows, size, columns) of every table row."""
+        inputs = row_inputs(self._symbolic.arm, table)
+        if not self._symbolic.implicit:
+            h, B = self._symbolic.function("B", columns)(*inputs, x, self._settle(inputs, x))
+            return h[..., 0], B
+        theta, F_theta = self._symbolic.equilibrium.solve(inputs, x)
+        h_theta = self._symbolic.function("slopes")(*inputs, x, theta)[0]
+        adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), h_theta.transpose(0, 2, 1))
+        adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
+        h, B = self._symbolic.function("B", columns)(*inputs, x, theta, adjoint)
+        return h[..., 0], B
+
+    def predict(
+        self,
+        table: Measurements,
+        x: Array | None = None,
+        observations: Observations | None = None,
+    ) -> NDArray:
+        """Predicted observations.
+
+        Args:
+            table: Readings, or rows of `simulate`: what was commanded and how it was loaded.
+            x: Parameter values (parameters,) in SI units; default the nominal ones.
+            observations: What `observe` made of the table, which spares pairing it anew.
+
+        Returns:
+            (rows,), observations × components in m (rad), in the table's order; NaN where there
+            is no static equilibrium.
+
+        Examples:
+            >>> model = ec.Model("cell.toml")
+            >>> model.predict(model.read("data.csv")).shape
+            (810,)
+        """
+        x = self.nominal if x is None else np.asarray(x)
+        inputs = row_inputs(self._symbolic.arm, table)
+        h = self._symbolic.function("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
+        return (observations or observe(table, self.observe)).apply(h).ravel()
+
+    def B(self, table: Measurements, x: Array | None = None) -> NDArray:
+        """The regressor B = ∂prediction/∂X (eq. 4 of Klimchik et al. 2013) of a whole table.
+
+        Args:
+            table: Readings.
+            x: Parameter values (parameters,) at which to differentiate; default the nominal ones.
+
+        Returns:
+            (rows, parameters), in m (rad) per unit of each parameter.
+
+        Raises:
+            InputError: The table lacks a column that the model needs.
+            ElastocalError: A pose has no static equilibrium under its load.
+
+        Examples:
+            >>> model = ec.Model("cell.toml")
+            >>> model.B(model.read("data.csv")).shape
+            (810, 10)
+        """
+        return self.regressor(table, x).B
+
+    def regressor(
+        self,
+        table: Measurements,
+        x: Array | None = None,
+        columns: NDArray | None = None,
+        observations: Observations | None = None,
+    ) -> Regression:
+        """B_i = ∂prediction/∂X stacked over the whole table (eq. 4), and the prediction.
+
+        `columns` selects parameters by index (default all).  Raises InputError where the table
+        lacks a column the model needs, ElastocalError where a pose has no static equilibrium.
+        """
+        x = self.nominal if x is None else np.asarray(x)
+        chosen = tuple(range(len(x))) if columns is None else tuple(int(c) for c in columns)
+        observed = observations or observe(table, self.observe)
+        h, B = self._rows(table, x, chosen)
+        bad = np.flatnonzero(~np.isfinite(h).all(axis=1))
+        if len(bad):
+            raise ElastocalError(
+                f"{table.source}, line {table.row[bad[0]]}: no static equilibrium under this load "
+                f"({len(bad)} rows); the compliances are too large for the force: check force_*_N "
+                "and [model.nominal] joint_compliance, which is in rad/(N m)"
+            )
+        prediction = observed.apply(h).ravel()
+        return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
+
+    def flange_poses(self, table: Measurements, x: Array | None = None) -> NDArray:
+        """T_tracker_flange (n_rows, 4, 4) at parameter values x, deflections included."""
+        return self._frames(table, x)[0]
+
+    def target_poses(self, table: Measurements, x: Array | None = None) -> tuple[NDArray, NDArray]:
+        """Rotation (n_rows, 3, 3) and position (n_rows, 3) of each row's marker as the tracker
+        would report them, whatever the model observes.  Rows without an equilibrium are NaN."""
+        _, position, rotation = self._frames(table, x)
+        return rotation, position[..., 0]
+
+    def _frames(self, table: Measurements, x: Array | None) -> list[NDArray]:
+        x = self.nominal if x is None else np.asarray(x)
+        inputs = row_inputs(self._symbolic.arm, table)
+        return self._symbolic.function("frames")(*inputs, x, self._settle(inputs, x))
+
+
+def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
+    """The cell with these markers, all nominally at the flange's origin."""
+    return replace(cell, tool=replace(cell.tool, markers={name: np.zeros(3) for name in names}))
+
+
+def _rows_of_three(what: str, values: ArrayLike, n: int) -> Array:
+    """(n, 3) from one row or n of them."""
+    found = np.asarray(values, dtype=float)
+    require(
+        found.shape in ((3,), (n, 3)),
+        f"{what} takes three numbers, or three for each of {n} rows; found an array of shape "
+        f"{found.shape}",
+    )
+    return np.broadcast_to(found, (n, 3)).copy()

@@ -1,0 +1,142 @@
+"""From table rows to observed values: which rows are read, and how they combine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from elastocal.errors import InputError
+from elastocal.measurements import Measurements
+from elastocal.units import Array
+
+SIZE = {"position": 3, "deflection": 3, "pose": 6, "distance": 1}
+COMPONENTS = {
+    "position": ("x", "y", "z"),
+    "deflection": ("x", "y", "z"),
+    "pose": ("x", "y", "z", "rx", "ry", "rz"),
+    "distance": ("distance",),
+}
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N observations of `size` components each, as linear combinations of table rows.
+
+    `value` (N·size,) holds what was observed, row-major (all components of an observation
+    together); `combine` (N, n_rows) says which rows enter: the identity, or loaded minus mean
+    unloaded for deflections.  `lead` (N,) is the table row that names each observation.
+    """
+
+    kind: str
+    value: Array
+    combine: sparse.csr_array
+    lead: NDArray[np.int64]
+    table: Measurements
+
+    @property
+    def size(self) -> int:
+        return SIZE[self.kind]
+
+    @property
+    def configuration(self) -> NDArray[np.int64]:
+        return self.table.configuration[self.lead]
+
+    def apply(self, rows: NDArray) -> NDArray:
+        """Combine a per-row array (n_rows, size, …) to observations (N, size, …)."""
+        if self.kind != "deflection":
+            return rows
+        flat = self.combine @ rows.reshape(len(rows), -1)
+        return flat.reshape((len(self.lead), *rows.shape[1:]))
+
+
+def observe(table: Measurements, kind: str) -> Observations:
+    """The observed values of a table for `kind` in position, deflection, pose, distance.
+
+    A pose's rotation is observed relative to the measured one, so its value is zero and the
+    prediction is the rotation vector of R_measuredᵀ R_model.
+
+    Raises InputError where the table lacks what `kind` needs or a loaded row has no unloaded
+    partner.
+    """
+    n = len(table)
+    if kind == "deflection":
+        lead, combine = pair_loaded_with_unloaded(table)
+    else:
+        lead = np.arange(n)
+        combine = alone(n)
+    if kind == "distance":
+        value = _needed(table.distance, table, "distance_mm (or distance_m)", kind)[:, None]
+    else:
+        value = _needed(table.position, table, "x_mm, y_mm, z_mm", kind)
+        if kind == "pose":
+            _needed(table.rotation, table, "rx_deg, ry_deg, rz_deg or qw, qx, qy, qz", kind)
+            value = np.hstack([value, np.zeros((n, 3))])
+    if kind == "deflection":
+        value = np.asarray(combine @ value)
+    return Observations(kind, value.ravel(), combine, lead, table)
+
+
+def alone(n: int) -> sparse.csr_array:
+    """The combination (n, n) of n readings that are observations by themselves: the identity."""
+    places = np.arange(n + 1, dtype=np.int32)  # scipy's own takes 0.1 ms more
+    return sparse.csr_array((np.ones(n), places[:n], places), shape=(n, n))
+
+
+def subset(observed: Observations, chosen: NDArray[np.bool_]) -> Observations:
+    """The observations where `chosen` (N,) holds, with only the table rows they need."""
+    combine = observed.combine[chosen]
+    rows = np.unique(combine.indices)
+    value = observed.value.reshape(-1, observed.size)[chosen].ravel()
+    lead = np.searchsorted(rows, observed.lead[chosen])
+    return Observations(observed.kind, value, combine[:, rows], lead, observed.table.take(rows))
+
+
+def _needed(column: Array | None, table: Measurements, names: str, kind: str) -> Array:
+    if column is None:
+        raise InputError(
+            f"{table.source}: observe = '{kind}' needs the columns {names}, which the table lacks"
+        )
+    return column
+
+
+def pair_loaded_with_unloaded(
+    table: Measurements,
+) -> tuple[NDArray[np.int64], sparse.csr_array]:
+    """Pair every loaded row with its unloaded partner: same configuration, repeat and marker.
+
+    Where that repeat was not measured unloaded, the mean of all unloaded repeats of the same
+    configuration and marker serves.  Returns the loaded rows (N,) and the combination (N, n).
+
+    Raises InputError where a loaded row has no partner at all, or nothing is loaded.
+    """
+    loaded = np.any(table.force != 0, axis=1)
+    if not loaded.any():
+        raise InputError(
+            f"{table.source}: observe = 'deflection' needs loaded rows, but force_x_N, force_y_N, "
+            "force_z_N are zero or missing in every row"
+        )
+    exact: dict[tuple[int, ...], list[int]] = {}
+    shared: dict[tuple[int, ...], list[int]] = {}
+    for i in np.flatnonzero(~loaded):
+        c, r, m = (int(v[i]) for v in (table.configuration, table.repeat, table.marker))
+        exact.setdefault((c, r, m), []).append(int(i))
+        shared.setdefault((c, m), []).append(int(i))
+    lead = np.flatnonzero(loaded)
+    rows, columns, values = [], [], []
+    for k, i in enumerate(lead):
+        c, r, m = (int(v[i]) for v in (table.configuration, table.repeat, table.marker))
+        partners = exact.get((c, r, m)) or shared.get((c, m))
+        if not partners:
+            raise InputError(
+                f"{table.source}, line {table.row[i]}: the loaded reading of configuration "
+                f"{table.configuration_labels[c]}, marker {table.marker_names[m]} has no unloaded "
+                "reading to subtract; measure it without load, or use observe = 'position'"
+            )
+        rows += [k] * (1 + len(partners))
+        columns += [int(i), *partners]
+        values += [1.0] + [-1.0 / len(partners)] * len(partners)
+    combine = sparse.csr_array((values, (rows, columns)), shape=(len(lead), len(table)))
+    return lead, combine

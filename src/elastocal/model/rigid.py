@@ -1,0 +1,103 @@
+"""Rigid motions as CasADi expressions: the only place where kinematics is written down.
+
+Every function takes and returns CasADi `SX` (or numbers, which CasADi promotes).
+Homogeneous transforms are (4, 4), rotations (3, 3), vectors (3, 1).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+if TYPE_CHECKING:
+    from elastocal.model.chain import Chain
+
+# Added under square roots so that rotation-vector formulas are smooth at zero;
+# far below the rounding of any angle met in practice (1e-15 rad).
+TINY = 1e-30
+
+
+def skew(v: Any) -> ca.SX:
+    """Cross-product matrix: skew(v) w = v × w."""
+    v = ca.SX(v)
+    return ca.vertcat(
+        ca.horzcat(0, -v[2], v[1]),
+        ca.horzcat(v[2], 0, -v[0]),
+        ca.horzcat(-v[1], v[0], 0),
+    )
+
+
+def rotation_about(axis: Any, angle: Any) -> ca.SX:
+    """Rotation by `angle` about the constant unit `axis` (Rodrigues)."""
+    a = np.asarray(axis, dtype=float)
+    along = constant(np.outer(a, a))
+    across = constant(np.eye(3) - np.outer(a, a))
+    return along + ca.cos(angle) * across + ca.sin(angle) * constant(ca.DM(skew(a)))
+
+
+def rotation_from_vector(r: Any) -> ca.SX:
+    """exp([r]×) for a rotation vector r (3,) in rad, smooth at r = 0."""
+    r = ca.SX(r)
+    angle = ca.sqrt(ca.sumsqr(r) + TINY)
+    half = ca.sin(angle / 2) / angle
+    k = skew(r)
+    return ca.SX.eye(3) + ca.sin(angle) / angle * k + 2 * half**2 * (k @ k)
+
+
+def vector_from_rotation(R: Any) -> ca.SX:
+    """Rotation vector of R, smooth at R = I, for angles up to and including π."""
+    R = ca.SX(R)
+    trace = ca.trace(R)
+    # Quaternion (w, x, y, z) times 4 times its largest member (Shepperd 1978): no case divides
+    # by a small number.
+    skewed = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    best, largest = ca.vertcat(1 + trace, skewed), trace
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        members = [skewed[i], 0, 0, 0]
+        members[1 + i] = 1 + 2 * R[i, i] - trace
+        members[1 + j] = R[i, j] + R[j, i]
+        members[1 + k] = R[i, k] + R[k, i]
+        larger = R[i, i] > largest
+        best = ca.if_else(larger, ca.vertcat(*members), best)
+        largest = ca.fmax(largest, R[i, i])
+    unit = best / ca.sqrt(ca.sumsqr(best))
+    unit = ca.if_else(unit[0] < 0, -unit, unit)
+    s = ca.sqrt(ca.sumsqr(unit[1:]) + TINY)
+    return 2 * ca.atan2(s, unit[0]) / s * unit[1:]
+
+
+def transform(rotation: Any = None, translation: Any = None) -> ca.SX:
+    """Homogeneous transform (4, 4) from a rotation (3, 3) and a translation (3,)."""
+    T = ca.SX.eye(4)
+    if rotation is not None:
+        T[:3, :3] = rotation
+    if translation is not None:
+        T[:3, 3] = translation
+    return T
+
+
+def constant(T: Any) -> ca.SX:
+    """A numeric matrix as SX with exact zeros dropped, so that products stay small."""
+    return ca.SX(ca.sparsify(ca.DM(np.asarray(T, dtype=float))))
+
+
+def joint_motion(kind: str, axis: Any, value: Any) -> ca.SX:
+    """Motion of a revolute or prismatic joint by `value` (rad or m) along its unit axis."""
+    if kind == "revolute":
+        return transform(rotation=rotation_about(axis, value))
+    return transform(translation=ca.SX(ca.DM(np.asarray(axis, dtype=float))) * value)
+
+
+def point(T: ca.SX, p: Any) -> ca.SX:
+    """T applied to the point p (3,)."""
+    return T[:3, :3] @ ca.SX(p) + T[:3, 3]
+
+
+def nominal_flange(chain: Chain, q: ca.SX) -> ca.SX:
+    """T_base_flange (4, 4) of the nominal chain at joint values q (n,)."""
+    T = ca.SX.eye(4)
+    for i, joint in enumerate(chain.joints):
+        T = T @ constant(joint.placement) @ joint_motion(joint.kind, joint.axis, q[i])
+    return T @ constant(chain.flange_placement)

@@ -1,0 +1,486 @@
+"""All bodies of a cell: arm, tool, load, obstacles, what carries them, which must keep apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.cell.work_cell import Cell
+from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.errors import InputError
+from elastocal.model.chain import Chain
+from elastocal.text import did_you_mean, listed
+from elastocal.units import Array
+
+# What a solid is to geometry: its hull, its support function and its coal shape.
+
+CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
+
+
+def hull(solid: Solid) -> tuple[Array, float]:
+    """Points (k, 3) in the carrier's frame and a radius: the solid lies in their convex hull
+    grown by the radius.  Exact for sphere, capsule, box and mesh; a cylinder becomes the capsule
+    around it."""
+    if solid.shape == "mesh":
+        points, radius = mesh_hull(solid)[0], 0.0
+    elif solid.shape == "box":
+        points, radius = CORNERS * solid.size, 0.0
+    elif solid.shape == "sphere":
+        points, radius = np.zeros((1, 3)), float(solid.size[0])
+    else:
+        half = np.array([0.0, 0.0, solid.size[1] / 2])
+        points, radius = np.stack([-half, half]), float(solid.size[0])
+    return points @ solid.placement[:3, :3].T + solid.placement[:3, 3], radius
+
+
+def few_points(solid: Solid) -> tuple[Array, float]:
+    """As `hull`, but a mesh is the box around it, so that k ≤ 8."""
+    points, radius = hull(solid)
+    if len(points) > len(CORNERS):
+        low, high = points.min(axis=0), points.max(axis=0)
+        points = (low + high) / 2 + CORNERS * (high - low)
+    return points, radius
+
+
+def support(solid: Solid, direction: Array) -> float:
+    """max d·x over the solid, for a unit direction d (3,) in the carrier's frame, in m; exact."""
+    points, radius = hull(solid)
+    if solid.shape == "cylinder":
+        along = float(solid.placement[:3, 2] @ direction)
+        radius *= float(np.sqrt(max(1.0 - along**2, 0.0)))
+    return float((points @ direction).max()) + radius
+
+
+def touches(solid: Solid, point: Array, within: float) -> bool:
+    """True where the solid is at most `within` m from a point (3,) in the carrier's frame."""
+    import coal
+
+    there = coal.Transform3s(np.eye(3), np.array(point, dtype=float))
+    here = coal.Transform3s(solid.placement[:3, :3].copy(), solid.placement[:3, 3].copy())
+    request, result = coal.CollisionRequest(), coal.CollisionResult()
+    return bool(coal.collide(coal_shape(solid), here, coal.Sphere(within), there, request, result))
+
+
+def capsule_between(name: str, a: Array, b: Array, radius: float) -> Solid:
+    """The capsule with cap centres a and b (3,); a sphere where they coincide."""
+    length = float(np.linalg.norm(b - a))
+    placement = np.eye(4)
+    placement[:3, 3] = (a + b) / 2
+    if length < 1e-9:
+        return Solid(name, "sphere", np.array([radius]), placement)
+    placement[:3, :3] = rotation_to((b - a) / length)
+    return Solid(name, "capsule", np.array([radius, length]), placement)
+
+
+def rotation_to(z: Array) -> Array:
+    """Rotations (..., 3, 3) whose third column is the unit vector z (..., 3)."""
+    z = np.asarray(z, dtype=float)
+    across = np.where(np.abs(z[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    x = np.cross(across, z)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def coal_shape(solid: Solid) -> Any:
+    """The coal shape centred at the solid's placement; meshes are their convex hull.
+
+    The hull makes a mesh a solid body: a triangle surface would not see what lies inside it.
+    """
+    import coal
+
+    size = [float(s) for s in solid.size]
+    if solid.shape == "box":
+        return coal.Box(*size)
+    if solid.shape == "sphere":
+        return coal.Sphere(size[0])
+    if solid.shape == "cylinder":
+        return coal.Cylinder(size[0], size[1])
+    if solid.shape == "capsule":
+        return coal.Capsule(size[0], size[1])
+    points, triangles = mesh_hull(solid)
+    corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    for point in points:
+        corners.append(point)
+    for a, b, c in triangles:
+        faces.append(coal.Triangle(int(a), int(b), int(c)))
+    return coal.Convex(corners, faces)
+
+
+def mesh_hull(solid: Solid) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (k, 3) of the mesh's convex hull in the solid's own frame, and its triangles.
+
+    Raises InputError where the file is missing, cannot be read or encloses no volume.
+    """
+    if solid.mesh is None:
+        raise InputError(f"body '{solid.name}' is a mesh, but no file is given for it")
+    x, y, z = (float(s) for s in solid.size)
+    return _mesh_hull(solid.mesh, (x, y, z), solid.name)
+
+
+@lru_cache(maxsize=256)
+def _mesh_hull(
+    path: Path, scale: tuple[float, float, float], name: str
+) -> tuple[Array, NDArray[np.int64]]:
+    import coal
+    from scipy.spatial import ConvexHull, QhullError
+
+    if not path.is_file():
+        raise InputError(f"mesh '{path}' of body '{name}' does not exist")
+    try:
+        vertices = np.array(coal.MeshLoader().load(str(path), np.array(scale)).vertices())
+        found = ConvexHull(vertices)
+    except QhullError:
+        raise InputError(f"mesh '{path}' of body '{name}' is flat: it encloses no volume") from None
+    except Exception as error:  # assimp's failures surface as several kinds
+        raise InputError(
+            f"mesh '{path}' of body '{name}' cannot be read: {error}; STL, OBJ and DAE can"
+        ) from None
+    used, index = np.unique(found.simplices, return_inverse=True)
+    points, triangles = vertices[used], index.reshape(found.simplices.shape)
+    # coal wants every normal to point outwards; Qhull's simplices are in no order.
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), found.equations[:, :3]) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return points, triangles.astype(np.int64)
+
+
+# What carries a body that no joint moves; i ≥ 0 stands for the frame of joint i.
+
+WORLD = -1  # fixed in the data's frame
+HANGING = -2  # at the load point, axes parallel to the data's frame
+
+
+# The URDF's own collision geometry as solids carried by the chain's joints.
+
+PARENTS = 6  # directories above the URDF in which a ROS package may lie
+
+
+def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
+    """(solid, carrier) of every <collision> element; those on the base in the base's frame.
+
+    Joints off the chain stand still at their neutral position, as in the kinematics.  Mesh files
+    are looked for beside the URDF, and `package://` in the directories above it.  Raises
+    InputError for a robot without URDF, a mesh that is not there, or no geometry at all.
+    """
+    import pinocchio as pin
+
+    path = cell.robot.urdf
+    where = f'{cell.path or cell.name}: [workspace] geometry = "urdf"'
+    if path is None:
+        raise InputError(f"{where}, but the robot has no URDF; give link_radius_mm instead")
+    folders = [str(folder) for folder in path.resolve().parents[:PARENTS]]
+    try:
+        model = pin.buildModelFromUrdf(str(path))
+        geometry = pin.buildGeomFromUrdf(
+            model, str(path), pin.GeometryType.COLLISION, package_dirs=folders
+        )
+    except Exception as error:  # missing files and unreadable ones alike
+        raise InputError(
+            f"{where}: {path}: {' '.join(str(error).split())}; put the mesh files where the URDF "
+            "looks for them (beside it, or in a package directory above it), or give "
+            "link_radius_mm instead"
+        ) from None
+    if not geometry.ngeoms:
+        raise InputError(
+            f"{where}: {path} has no <collision> elements; give link_radius_mm instead"
+        )
+    moving = [joint.name for joint in chain.joints]
+    locked = pin.StdVec_Index()
+    for name in list(model.names)[1:]:
+        if name not in moving:
+            locked.append(model.getJointId(name))
+    model, geometry = pin.buildReducedModel(model, geometry, locked, pin.neutral(model))
+    base = cell.robot.base
+    T_root_base = pin.SE3.Identity() if base is None else _placement(model, base)
+    found = []
+    for item in geometry.geometryObjects:
+        on_base = item.parentJoint == 0
+        T = T_root_base.inverse() * item.placement if on_base else item.placement
+        carrier = WORLD if on_base else moving.index(model.names[item.parentJoint])
+        found.append((_solid(item, T.homogeneous, path), carrier))
+    return found
+
+
+def _placement(model: Any, link: str) -> Any:
+    import pinocchio as pin
+
+    return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement
+
+
+def _solid(item: Any, placement: np.ndarray, path: Path) -> Solid:
+    import coal
+
+    shape = item.geometry
+    if isinstance(shape, coal.Box):
+        return Solid(item.name, "box", 2 * np.array(shape.halfSide), placement)
+    if isinstance(shape, coal.Sphere):
+        return Solid(item.name, "sphere", np.array([shape.radius]), placement)
+    if isinstance(shape, coal.Cylinder | coal.Capsule):
+        kind = "cylinder" if isinstance(shape, coal.Cylinder) else "capsule"
+        size = np.array([shape.radius, 2 * shape.halfLength])
+        return Solid(item.name, kind, size, placement)  # type: ignore[arg-type]
+    if not item.meshPath:
+        raise InputError(f"{path}: collision element '{item.name}' is of an unknown shape")
+    scale = np.array(item.meshScale, dtype=float).reshape(3)
+    return Solid(item.name, "mesh", scale, placement, Path(item.meshPath))
+
+
+# All bodies of a cell in one list: arm, tool, hanging load, obstacles, each with its carrier.
+#
+# A body stands at frames[:, carrier] @ solid.placement in the data's frame (`frames.py`).  The
+# arm is rigid here, at its nominal geometry: clearances must cover deflections of a few mm.
+
+Kind = Literal["arm", "carried", "load", "rope", "obstacle"]
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Body:
+    """A solid and what moves it.
+
+    `carrier`: i ≥ 0 the frame of joint i (0-based, after its motion), WORLD or HANGING;
+    `solid.placement` is in that frame.  What sits on the flange is carried by the last joint.
+    """
+
+    solid: Solid
+    carrier: int
+    kind: Kind
+
+    @property
+    def name(self) -> str:
+        return self.solid.name
+
+    @property
+    def hangs(self) -> bool:
+        """There in loaded readings only."""
+        return self.carrier == HANGING
+
+
+def data_base(cell: Cell) -> Array:
+    """T_data_base (4, 4) of the nominal cell."""
+    nominal, T = cell.model.nominal, np.eye(4)
+    if nominal.base_rotation is not None:
+        T[:3, :3] = nominal.base_rotation
+    if nominal.base_position is not None:
+        T[:3, 3] = nominal.base_position
+    return T
+
+
+def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
+    """Every body of the cell: arm, carried bodies, hanging load and rope, obstacles.
+
+    Raises InputError where two bodies share a name, a body is carried by an unknown link, or
+    the URDF's own geometry is asked for and cannot be had.
+    """
+    workspace = cell.workspace
+    bodies = (
+        *_arm(cell, chain),
+        *(_carried(body, cell, chain) for body in workspace.bodies),
+        *(() if workspace.load is None else hanging(workspace.load)),
+        *(Body(solid, WORLD, "obstacle") for solid in workspace.obstacles),
+    )
+    observed: set[str] = set()
+    for body in bodies:
+        if body.name in observed:
+            raise InputError(
+                f"{cell.path or cell.name}: [workspace] has two bodies named '{body.name}'; "
+                "rename one (base, link1 … and rope are taken)"
+            )
+        observed.add(body.name)
+    return bodies
+
+
+def _arm(cell: Cell, chain: Chain) -> Iterator[Body]:
+    workspace = cell.workspace
+    where = f"{cell.path or cell.name}: [workspace]"
+    if workspace.urdf_geometry and workspace.link_radius:
+        raise InputError(
+            f'{where} gives link_radius and geometry = "urdf"; the arm can have only one'
+        )
+    if workspace.urdf_geometry:
+        for solid, carrier in urdf_bodies(cell, chain):
+            on_base = carrier == WORLD
+            placed = replace(solid, placement=data_base(cell) @ solid.placement)
+            yield Body(placed if on_base else solid, carrier, "arm")
+    elif workspace.link_radius:
+        yield from skeleton(chain, workspace.link_radius, data_base(cell), where)
+
+
+def skeleton(
+    chain: Chain, radius: tuple[float, ...], T_data_base: Array, where: str
+) -> Iterator[Body]:
+    """Capsules along the chain: link i from joint i's origin to joint i+1's at zero offset.
+
+    "base" reaches from the base's origin to joint 1 with the radius of link 1, the last link to
+    the flange.  `radius` is one per link, or one for all.  A link whose joints coincide is a
+    sphere; one of radius 0 has no body.
+    """
+    radius = radius * chain.n_joints if len(radius) == 1 else radius
+    if len(radius) != chain.n_joints:
+        raise InputError(
+            f"{where} link_radius has {len(radius)} values, but robot '{chain.name}' has "
+            f"{chain.n_joints} links"
+        )
+    ends = [T[:3, 3] for T in distal_placements(chain)]
+    foot, first = T_data_base[:3, 3], (T_data_base @ chain.joints[0].placement)[:3, 3]
+    if radius[0] > 0 and np.linalg.norm(first - foot) > 0:
+        yield Body(capsule_between("base", foot, first, radius[0]), WORLD, "arm")
+    for i, (end, r) in enumerate(zip(ends, radius, strict=True)):
+        if r > 0:
+            yield Body(capsule_between(f"link{i + 1}", np.zeros(3), end, r), i, "arm")
+
+
+def distal_placements(chain: Chain) -> list[Array]:
+    """What follows each joint (4, 4) in its frame: the next joint at zero, at last the flange."""
+    return [*(joint.placement for joint in chain.joints[1:]), chain.flange_placement]
+
+
+def _carried(body: CarriedBody, cell: Cell, chain: Chain) -> Body:
+    solid = body.solid
+    if body.on == "base":
+        return Body(_moved(data_base(cell), solid), WORLD, "carried")
+    if body.on == "flange":
+        return Body(_moved(chain.flange_placement, solid), chain.n_joints - 1, "carried")
+    links = [f"link{i + 1}" for i in range(chain.n_joints)]
+    if body.on not in links:
+        valid = ["base", *links, "flange"]
+        raise InputError(
+            f"{cell.path or cell.name}: [workspace] body '{solid.name}' is on '{body.on}'"
+            f"{did_you_mean(body.on, valid)}; valid: {listed(valid)}"
+        )
+    return Body(solid, links.index(body.on), "carried")
+
+
+def hanging(load: HangingLoad) -> Iterator[Body]:
+    """The rope, straight down from the load point, and the load, its top at the rope's end.
+
+    The load does not turn with the flange: its axes keep their direction in the data's frame.
+    """
+    if load.rope > 0:
+        foot = np.array([0.0, 0.0, -load.rope])
+        yield Body(capsule_between("rope", np.zeros(3), foot, load.rope_radius), HANGING, "rope")
+    lowered = np.eye(4)
+    lowered[2, 3] = -load.rope - support(load.solid, UP)
+    yield Body(_moved(lowered, load.solid), HANGING, "load")
+
+
+def _moved(T: Array, solid: Solid) -> Solid:
+    return replace(solid, placement=T @ solid.placement)
+
+
+# Which bodies must keep apart, and how far: the pairs that collision checks look at.
+
+Rule = Literal["keep_out", "load_height", "obstacle", "self_collision"]
+RULES: tuple[Rule, ...] = get_args(Rule)
+FLOOR = "min_height"  # name of the half-space under the hanging load
+TOUCH = 1e-6  # m: a body this near to the load point holds the hook
+
+
+@dataclass(frozen=True)
+class Pair:
+    """`body` must stay `margin` m away from `other`, or the pose breaks `rule`."""
+
+    body: Body
+    other: Body | HalfSpace
+    margin: float
+    rule: Rule
+
+    @property
+    def hangs(self) -> bool:
+        """Counts in loaded readings only."""
+        return self.body.hangs or (isinstance(self.other, Body) and self.other.hangs)
+
+    @property
+    def names(self) -> tuple[str, str]:
+        return self.body.name, self.other.name
+
+
+def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair, ...]:
+    """All pairs that are checked.
+
+    Every moving body against every obstacle (`clearance`) and every half-space (no margin), and
+    the arm's bodies, carried bodies, rope and load among themselves (`self_clearance`), except
+    bodies of the same carrier, neighbouring links, links that joints hold together whatever the
+    pose, the rope with the bodies that hold its hook, and `ignored_pairs`.  Raises InputError
+    where `ignored_pairs` names a body that is not there.
+    """
+    workspace = cell.workspace
+    ignored = _ignored(cell, bodies)
+    moving = [body for body in bodies if body.carrier != WORLD]
+    own = [body for body in bodies if body.kind != "obstacle"]
+    obstacles = [body for body in bodies if body.kind == "obstacle"]
+    pairs = [Pair(body, space, 0.0, "keep_out") for body in moving for space in workspace.keep_out]
+    load = workspace.load
+    if load is not None and load.min_height is not None:
+        up = np.array([0.0, 0.0, 1.0])
+        floor = HalfSpace(FLOOR, load.min_height * up, up)
+        hung = [body for body in bodies if body.kind == "load"]
+        pairs += [Pair(body, floor, 0.0, "load_height") for body in hung]
+    pairs += [Pair(b, o, workspace.clearance, "obstacle") for b in moving for o in obstacles]
+    if workspace.self_collision:
+        hooks = _hooks(own, chain, cell.tool.load_point)
+        pairs += [
+            Pair(b, a, workspace.self_clearance, "self_collision")
+            for a, b in combinations(own, 2)
+            if not _joined(a, b, workspace, chain, hooks)
+        ]
+    return tuple(pair for pair in pairs if frozenset(pair.names) not in ignored)
+
+
+def _ignored(cell: Cell, bodies: tuple[Body, ...]) -> set[frozenset[str]]:
+    workspace = cell.workspace
+    valid = [body.name for body in bodies] + [space.name for space in workspace.keep_out]
+    for pair in workspace.ignored_pairs:
+        for name in pair:
+            if name not in valid:
+                raise InputError(
+                    f"{cell.path or cell.name}: [workspace] ignored_pairs names '{name}', "
+                    f"but the cell has no such body"
+                    f"{did_you_mean(name, valid)}; valid: {listed(valid)}"
+                )
+    return {frozenset(pair) for pair in workspace.ignored_pairs}
+
+
+def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, hooks: set[str]) -> bool:
+    """True where the two cannot or need not keep apart."""
+    if a.carrier == b.carrier:
+        return True
+    if a.hangs or b.hangs:
+        hung, other = (a, b) if a.hangs else (b, a)
+        rope = workspace.load.rope if workspace.load is not None else 0.0
+        return other.name in hooks and (hung.kind == "rope" or rope == 0)
+    if a.kind != "arm" or b.kind != "arm":
+        return False
+    i, j = sorted((a.carrier, b.carrier))
+    return j == i + 1 or _held_together(a, b, workspace, chain)
+
+
+def _held_together(a: Body, b: Body, workspace: Workspace, chain: Chain) -> bool:
+    """Skeleton links i < j whose ends are never further apart than the links between are long.
+
+    Such a pair is in contact at every pose and says nothing (a spherical wrist).  A prismatic
+    joint between them can part them.
+    """
+    if workspace.urdf_geometry:
+        return False
+    i, j = sorted((a.carrier, b.carrier))
+    if any(chain.joints[k].kind == "prismatic" for k in range(i + 1, j + 1)):
+        return False
+    between = distal_placements(chain)[i + 1 : j]
+    length = sum(float(np.linalg.norm(T[:3, 3])) for T in between)
+    return length <= hull(a.solid)[1] + hull(b.solid)[1] + workspace.self_clearance
+
+
+def _hooks(own: list[Body], chain: Chain, load_point: np.ndarray) -> set[str]:
+    """Names of the bodies on the last link that contain or touch the load point."""
+    last = chain.n_joints - 1
+    hook = (chain.flange_placement @ [*load_point, 1.0])[:3]
+    return {b.name for b in own if b.carrier == last and touches(b.solid, hook, TOUCH)}

@@ -1,0 +1,259 @@
+"""Candidate poses: scrambled Sobol points within the limits and levels that the cell allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Protocol
+
+import numpy as np
+from scipy.stats import qmc
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InsufficientDataError, require
+from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.planning.feasibility import PoseFeasibility
+from elastocal.planning.information import ALL_LOADS, LoadStates
+from elastocal.units import Array, BoolArray, IntArray, Progress
+
+# Where poses may lie: joint ranges, and one joint that may be held at fixed levels.
+
+
+@dataclass(frozen=True)
+class JointSpace:
+    """`lower`, `upper` (n,) in rad or m, both finite; joint `held` (0-based) only takes `levels`.
+
+    Without a held joint there is one group of poses and no level.
+    """
+
+    lower: Array
+    upper: Array
+    held: int | None = None
+    levels: tuple[float, ...] = ()
+
+    @property
+    def n_groups(self) -> int:
+        return max(len(self.levels), 1)
+
+    def bounds(self, group: int) -> tuple[Array, Array]:
+        """Bounds (n,) of the poses of a group; equal for the held joint."""
+        lower, upper = self.lower.copy(), self.upper.copy()
+        if self.held is not None:
+            lower[self.held] = upper[self.held] = self.levels[group]
+        return lower, upper
+
+    def poses(self, unit: Array, group: int) -> Array:
+        """Poses (N, n) of points (N, free joints) of the unit cube."""
+        lower, upper = self.bounds(group)
+        free = [i for i in range(len(lower)) if i != self.held]
+        q = np.tile(lower, (len(unit), 1))
+        q[:, free] += unit * (upper - lower)[free]
+        return q
+
+
+def joint_space(cell: Cell, chain: Chain) -> JointSpace:
+    """The robot's limits, narrowed by [limits], with the levels of [design.levels].
+
+    A joint without a limit turns once, from −π to π, or slides 2 m (`finite_ranges`).  Raises
+    InputError for levels of several joints, and as `joint_limits` does.
+    """
+    lower, upper = finite_ranges(chain, *joint_limits(cell, chain))
+    wanted = cell.design.levels
+    if not wanted:
+        return JointSpace(lower, upper)
+    require(
+        len(wanted) == 1,
+        f"{cell.path or cell.name}: [design.levels] holds {', '.join(wanted)} at levels; only one "
+        "joint can be held: keep one, and narrow the others by [limits]",
+    )
+    name, levels = next(iter(wanted.items()))
+    return JointSpace(lower, upper, joint_index(cell, chain, name, "[design.levels]"), levels)
+
+
+# Candidate poses: scrambled Sobol points within the limits that the cell allows.
+
+CHUNK = 2048  # a power of two, so that every chunk is balanced over the joint space
+GIVE_UP = 32 * CHUNK  # tries after which a group without any feasible pose counts as empty
+PER_TASK = 4  # chunks that a process checks at a time
+TRIES = 200  # per pose wanted, at most
+
+
+class Checker(Protocol):
+    """The cell's rules: `Feasibility`, or what stands in for it.  It pickles."""
+
+    def check(self, q: Array, force: Array) -> PoseFeasibility:
+        """Every rule on poses q (N, n) under a force (3,) N."""
+
+    def feasible(self, q: Array, force: Array) -> BoolArray:
+        """(N,) as check(q, force).ok, quicker."""
+
+    def advice(self, verdict: PoseFeasibility) -> str:
+        """Which rule to relax."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Feasible poses q (N, n) with their load state `load` (N,), ALL_LOADS where a pose is
+    measured in all of them, and their `group` (N,): the level of the held joint.
+
+    Where the load state is chosen, one pose may be several candidates and counts once per state.
+    `removed_by` counts what was tried in vain by the first rule broken:
+    tried = feasible + Σ removed_by.
+    """
+
+    q: Array
+    load: IntArray
+    group: IntArray
+    tried: int
+    feasible: int
+    removed_by: dict[str, int]
+
+
+def draw(
+    cell: Cell,
+    chain: Chain,
+    states: LoadStates,
+    checker: Checker,
+    n: int,
+    seed: int,
+    jobs: int = 1,
+    progress: Progress = lambda message: None,
+) -> Candidates:
+    """About `n` feasible candidates, equally many per level of the held joint.
+
+    Owen-scrambled Sobol points (Owen 1998; scipy.stats.qmc) over the joint ranges, one sequence
+    per level, filtered by the cell's rules chunk by chunk until there are enough, or until 200
+    tries per candidate wanted.  Fewer than `n` are returned where fewer were found.  The result
+    depends on `seed` only, not on `jobs`, the number of processes (−1: all cores).
+
+    Raises InputError as `joint_space` does and where n is less than the number of levels,
+    InsufficientDataError where a level (or the whole range) has no feasible pose, with the rule
+    to relax.
+    """
+    space = joint_space(cell, chain)
+    groups = space.n_groups
+    require(n >= groups, f"{n} candidates are too few for {groups} levels; ask for more")
+    drawn: list[_Lot] = []
+    for group, stream in enumerate(np.random.SeedSequence(seed).spawn(groups)):
+        progress(f"drawing candidates, level {group + 1} of {groups}")
+        chunks = _checked(checker, states, sobol(space, group, stream), jobs)
+        lot, verdict = _fill(chunks, n // groups + (group < n % groups))
+        if not len(lot.q):
+            raise InsufficientDataError(
+                f"{cell.path or cell.name}: no feasible pose found{_at(chain, space, group)}; "
+                f"{checker.advice(verdict)}"
+            )
+        drawn.append(lot)
+    whole = _Lot.join(drawn)
+    of_group = np.repeat(np.arange(groups), [len(lot.q) for lot in drawn])
+    return Candidates(whole.q, whole.load, of_group, whole.tried, whole.feasible, whole.removed_by)
+
+
+def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:
+    """Chunks (CHUNK, n) of an endless scrambled Sobol sequence of poses of a group."""
+    free = len(space.lower) - (space.held is not None)
+    engine = qmc.Sobol(free, seed=np.random.default_rng(stream))
+    while True:
+        yield space.poses(engine.random(CHUNK), group)
+
+
+def feasible(checker: Checker, q: Array, forces: Array) -> BoolArray:
+    """(N,): poses q (N, n) break no rule under any of `forces` (k, 3) N."""
+    ok = np.ones(len(q), dtype=bool)
+    for force in forces:
+        ok[ok] = checker.feasible(q[ok], force)
+    return ok
+
+
+@dataclass(frozen=True)
+class _Lot:
+    """Feasible candidates q (k, n), load (k,) out of `tried`."""
+
+    q: Array
+    load: IntArray
+    tried: int
+    feasible: int
+    removed_by: dict[str, int]
+
+    @classmethod
+    def join(cls, lots: Sequence[_Lot]) -> _Lot:
+        removed = {rule: sum(lot.removed_by[rule] for lot in lots) for rule in lots[0].removed_by}
+        q = np.concatenate([lot.q for lot in lots])
+        load = np.concatenate([lot.load for lot in lots])
+        tried, ok = sum(lot.tried for lot in lots), sum(lot.feasible for lot in lots)
+        return cls(q, load, tried, ok, removed)
+
+
+def _check(checker: Checker, states: LoadStates, q: Array) -> tuple[_Lot, PoseFeasibility]:
+    """The feasible candidates among poses q (N, n), and the verdict on all.
+
+    A pose measured in all load states must be feasible in each, and its verdict is that of the
+    first state that forbids it; where the state is chosen, (pose, state) pairs are judged.
+    """
+    if states.chosen:
+        verdict = PoseFeasibility.join([checker.check(q, force) for force in states.forces])
+        pose = np.tile(np.arange(len(q)), len(states.forces))[verdict.ok]
+        load = np.repeat(np.arange(len(states.forces)), len(q))[verdict.ok]
+    else:
+        # The heaviest load first: what it allows, lighter ones hardly ever forbid.
+        heaviest, *others = states.forces[np.argsort(-np.linalg.norm(states.forces, axis=1))]
+        verdict = checker.check(q, heaviest)
+        for force in others:
+            left = np.flatnonzero(verdict.ok)
+            verdict.broken[left] = checker.check(q[left], force).broken
+        pose = np.flatnonzero(verdict.ok)
+        load = np.full(len(pose), ALL_LOADS)
+    order = np.lexsort((load, pose))
+    lot = _Lot(q[pose][order], load[order], len(verdict.ok), len(pose), verdict.removed_by)
+    return lot, verdict
+
+
+def _checked(
+    checker: Checker, states: LoadStates, chunks: Iterator[Array], jobs: int
+) -> Iterator[tuple[_Lot, PoseFeasibility]]:
+    """Each chunk checked, in order, on `jobs` processes."""
+    if jobs == 1:
+        for q in chunks:
+            yield _check(checker, states, q)
+    from joblib import Parallel, delayed, effective_n_jobs
+
+    with Parallel(n_jobs=jobs) as pool:
+        while True:
+            wave = [list(islice(chunks, PER_TASK)) for _ in range(effective_n_jobs(jobs))]
+            for found in pool(delayed(_check_lots)(checker, states, lots) for lots in wave):
+                yield from found
+
+
+def _check_lots(
+    checker: Checker, states: LoadStates, lots: list[Array]
+) -> list[tuple[_Lot, PoseFeasibility]]:
+    return [_check(checker, states, q) for q in lots]
+
+
+def _fill(
+    chunks: Iterator[tuple[_Lot, PoseFeasibility]], wanted: int
+) -> tuple[_Lot, PoseFeasibility]:
+    """`wanted` candidates, fewer where the tries run out; the verdict on the first tries."""
+    lots: list[_Lot] = []
+    verdicts: list[PoseFeasibility] = []
+    count = tried = 0
+    while count < wanted and tried < max(TRIES * wanted if count else 0, GIVE_UP):
+        lot, verdict = next(chunks)
+        lots.append(lot)
+        if count == 0:
+            verdicts.append(verdict)
+        count, tried = count + len(lot.q), tried + CHUNK
+    whole = _Lot.join(lots)
+    return replace(whole, q=whole.q[:wanted], load=whole.load[:wanted]), PoseFeasibility.join(
+        verdicts
+    )
+
+
+def _at(chain: Chain, space: JointSpace, group: int) -> str:
+    if space.held is None:
+        return ""
+    value = space.levels[group]
+    revolute = chain.kinds[space.held] == "revolute"
+    told = f"{np.degrees(value):.6g}°" if revolute else f"{value:.6g} m"
+    return f" with joint{space.held + 1} at {told}"

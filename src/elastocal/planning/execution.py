@@ -1,0 +1,377 @@
+"""The order of execution: the shortest tour through all poses and loads, and its stops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from elastocal.cell.plan_wishes import Motion
+from elastocal.errors import require
+from elastocal.planning.moves import (
+    BlockersOf,
+    Costs,
+    Moves,
+    PathChecker,
+    check_reachable,
+    refuse_impossible,
+)
+from elastocal.units import Array, IntArray
+
+# The order of execution as it is handed on: stops, how to get to them, what it takes.
+
+
+@dataclass(frozen=True)
+class Stop:
+    """One reading: pose `pose` at joints `q` (n,) in load state `load` (0-based both).
+
+    The arm moves straight through `via` (k, n), where nothing is measured, and then to `q`, in
+    `travel` s.  `change_after`: the load is changed once that many of these k + 1 moves are done;
+    None: it stays.  `approach` (n,): +1 or −1, the direction of each joint's last motion, and
+    `side` 0 or 1 where the pose is approached from both sides.
+    """
+
+    pose: int
+    load: int
+    q: Array
+    via: Array
+    travel: float
+    change_after: int | None = None
+    approach: IntArray | None = None
+    side: int = 0
+
+
+@dataclass(frozen=True)
+class Execution:
+    """The stops in order, and the way home, through `home_via` (k, n), where there is a home.
+
+    `travel` s in all; no order of these visits, whose moves go straight or through the given
+    points, travels less than `bound` s.  `checked` moves were tried, `blocked` of them in the
+    way of something.  `take_off`: the load hangs on the arm after the last stop.
+    """
+
+    stops: tuple[Stop, ...]
+    home_via: Array
+    home_travel: float
+    take_off: bool
+    motion: Motion
+    bound: float
+    checked: int
+    blocked: int
+
+    @property
+    def travel(self) -> float:
+        return sum(stop.travel for stop in self.stops) + self.home_travel
+
+    @property
+    def gap(self) -> float:
+        """How much longer than the best order this one can be: travel / bound − 1."""
+        if self.travel <= self.bound:
+            return 0.0
+        return self.travel / self.bound - 1 if self.bound > 0 else np.inf
+
+    @property
+    def one_sided(self) -> tuple[int, ...]:
+        """Poses that were to be approached from both sides but can be from one only."""
+        sides: dict[tuple[int, int], int] = {}
+        for stop in self.stops:
+            sides[stop.pose, stop.load] = sides.get((stop.pose, stop.load), 0) + 1
+        few = {pose for (pose, _), n in sides.items() if self.motion.both_directions and n < 2}
+        return tuple(sorted(few))
+
+    @property
+    def load_changes(self) -> int:
+        """Loads hung, exchanged or taken off; the arm begins and ends without."""
+        return sum(stop.change_after is not None for stop in self.stops) + self.take_off
+
+    @property
+    def total(self) -> float:
+        """s of travelling, measuring and changing loads."""
+        motion = self.motion
+        waiting = motion.dwell * len(self.stops) + motion.load_change * self.load_changes
+        return self.travel + waiting
+
+
+# From a tour over visits to the stops of an execution.
+
+
+def stops_of(moves: Moves, tour: list[int], costs: Costs) -> tuple[Stop, ...]:
+    """The stops of a tour whose moves have all been checked."""
+    return tuple(stop for u, v in pairwise([0, *tour]) for stop in _stops(moves, u, v, costs))
+
+
+def way_home(moves: Moves, last: int, costs: Costs) -> tuple[Array, float]:
+    """Via points (k, n) from the node `last` to home, and the time; nothing without a home."""
+    _, way = moves.way(last, 0, costs)
+    return moves.points[way[1:-1]], _time(moves, way)
+
+
+def _stops(moves: Moves, u: int, v: int, costs: Costs) -> list[Stop]:
+    """The reading of node v after node u, or two where it is approached from both sides."""
+    _, way = moves.way(u, v, costs)
+    visits, node = moves.visits, v - 1
+    pose, load, leave = int(visits.pose[node]), int(visits.load[node]), int(visits.leave[node])
+    q, side = moves.points[leave], int(costs.side[u, node])
+    before, after = moves.carries(u), moves.carries(v)
+    if moves.signs is None:
+        passed = way[1:-1] if len(way) > 1 else []
+        change = None if before == after else 0 if after < 0 else len(passed) + 1
+        time = _time(moves, way)
+        return [Stop(pose, load, q, moves.points[passed], time, change)]
+    # The load is exchanged before the last stretch, which is the approach.
+    passed = way[1:] if len(way) > 1 else way
+    change = None if before == after else 0 if after < 0 else len(passed)
+    other = int(visits.entry[node, 1 - side])
+    signs = moves.signs[pose]
+    first = Stop(
+        pose=pose,
+        load=load,
+        q=q,
+        via=moves.points[passed],
+        travel=_time(moves, [*way, leave]),
+        change_after=change,
+        approach=signs[side],
+        side=side,
+    )
+    if not np.isfinite(visits.inside[node, 1 - side]):
+        return [first]
+    second = Stop(
+        pose=pose,
+        load=load,
+        q=q,
+        via=moves.points[[other]],
+        travel=_time(moves, [leave, other, leave]),
+        approach=signs[1 - side],
+        side=1 - side,
+    )
+    return [first, second]
+
+
+def _time(moves: Moves, way: list[int]) -> float:
+    return float(sum(moves.times[i, j] for i, j in pairwise(way)))
+
+
+# A lower bound on the cost of every tour, to say how far a found one can be from the best.
+
+STEPS = 400
+
+
+def tour_bound(cost: Array, upper: float) -> float:
+    """The larger of the assignment bound and the Held–Karp bound, ≤ every tour's cost.
+
+    `cost` (V, V) of directed moves, V ≥ 2, finite; `upper`: cost of a known tour.  Held–Karp is
+    taken on min(c_ij, c_ji), which no tour's cost falls below.
+    """
+    closed = cost + np.diag(np.full(len(cost), 2.0 * upper + 1.0))
+    rows, columns = linear_sum_assignment(closed)
+    assignment = float(closed[rows, columns].sum())
+    return max(assignment, held_karp_bound(np.minimum(cost, cost.T), upper))
+
+
+def held_karp_bound(cost: Array, upper: float) -> float:
+    """max_π min over 1-trees of Σ (c_ij + π_i + π_j) − 2 Σ π_i (Held and Karp 1971).
+
+    A 1-tree is a spanning tree of all nodes but node 0 and two edges at node 0; every tour is
+    one, with degree 2 everywhere.  π by subgradient steps in the direction degree − 2, their
+    length from `upper` (Polyak), halved when the bound stalls; every step's value is a bound.
+    """
+    n = len(cost)
+    if n == 2:
+        return float(2 * cost[0, 1])
+    price, best, best_price = np.zeros(n), -np.inf, np.zeros(n)
+    scale, stalled = 1.0, 0
+    for _ in range(STEPS):
+        value, degree = _one_tree(cost + price[:, None] + price[None, :])
+        value -= 2 * float(price.sum())
+        if value > best:
+            best, best_price, stalled = value, price, 0
+        else:
+            stalled += 1
+        slope = degree - 2.0
+        if not slope.any():
+            break
+        if stalled == 10:
+            scale, stalled, price = scale / 2, 0, best_price
+            continue
+        price = price + scale * max(upper - value, 1e-9 * abs(upper)) / float(slope @ slope) * slope
+    return best
+
+
+def _one_tree(cost: Array) -> tuple[float, Array]:
+    """Cost and node degrees (V,) of the minimum 1-tree."""
+    n = len(cost)
+    rest = cost[1:, 1:]
+    shift = 1.0 - float(rest.min())  # csgraph reads zeros of a dense matrix as missing edges
+    tree = minimum_spanning_tree(rest + shift).tocoo()
+    ends = np.argsort(cost[0, 1:], kind="stable")[:2] + 1
+    total = float(tree.data.sum()) - shift * (n - 2) + float(cost[0, ends].sum())
+    degree = np.bincount(np.concatenate([tree.row, tree.col]) + 1, minlength=n).astype(float)
+    degree[ends] += 1
+    degree[0] = 2
+    return total, degree
+
+
+# The shortest tour through given costs, by PyVRP's iterated local search.
+
+LARGEST = 2**40  # of a cost as an integer: PyVRP warns beyond 2⁴⁴
+
+
+def tour_cost(cost: Array, tour: list[int]) -> float:
+    """Cost of depot 0 → tour → depot 0 under `cost` (V + 1, V + 1)."""
+    ring = [0, *tour, 0]
+    return float(cost[ring[:-1], ring[1:]].sum())
+
+
+def greedy_tour(cost: Array) -> list[int]:
+    """From the depot 0 always on to the nearest node not yet visited."""
+    left = cost.copy()
+    left[:, 0] = np.inf
+    tour, here = [], 0
+    for _ in range(len(cost) - 1):
+        nearest = int(np.argmin(left[here]))
+        left[:, nearest] = np.inf
+        tour.append(nearest)
+        here = nearest
+    return tour
+
+
+def shortest_tour(cost: Array, start: list[int], seed: int, iterations: int) -> list[int]:
+    """A short tour 0 → every node → 0, never worse than `start` (Wouda, Lan and Kool 2024).
+
+    `cost` (V + 1, V + 1), finite and not negative, need not be symmetric.  The search ends after
+    `iterations`, or a third of them without gain, not after a time, so the same seed gives the
+    same tour on any machine.
+    """
+    if len(cost) <= 2:
+        return start
+    import pyvrp
+    from pyvrp import search
+
+    whole: Any = np.round(cost * (LARGEST / max(float(cost.max()), 1e-300))).astype(np.int64)
+    np.fill_diagonal(whole, 0)
+    n = len(whole)
+    data = pyvrp.ProblemData(
+        locations=[pyvrp.Location(0, 0) for _ in range(n)],
+        clients=[pyvrp.Client(location=i) for i in range(1, n)],
+        depots=[pyvrp.Depot(location=0)],
+        vehicle_types=[pyvrp.VehicleType(num_available=1)],
+        distance_matrices=[whole],
+        duration_matrices=[0 * whole],
+    )
+    # One vehicle: the moves that exchange between routes are left out, longer segments added.
+    # Lower history than the default, which is made for thousands of nodes.
+    params = pyvrp.SolveParams(
+        operators=[
+            search.Relocate1, search.Relocate2, search.Relocate3, search.Swap11, search.Swap21,
+            search.Swap22, search.Swap31, search.Swap32, search.Swap33,
+        ],
+        ils=pyvrp.IteratedLocalSearchParams(history_length=100),
+    )  # fmt: skip
+    stop = pyvrp.stop.MultipleCriteria(
+        [pyvrp.stop.MaxIterations(iterations), pyvrp.stop.NoImprovement(iterations // 3)]
+    )
+    result = pyvrp.solve(
+        data,
+        stop,
+        seed=seed,
+        collect_stats=False,
+        display=False,
+        params=params,
+        initial_solution=pyvrp.Solution(data, [[node - 1 for node in start]]),
+    )
+    (route,) = result.best.routes()
+    tour = [stop.idx + 1 for stop in route if stop.is_client()]
+    return tour if tour_cost(cost, tour) < tour_cost(cost, start) else start
+
+
+# The shortest execution of a plan: every pose in its load states, by collision-free moves.
+
+ITERATIONS = 5000
+FEW_ITERATIONS = 300  # while moves of the tour still turn out to be blocked
+
+
+def schedule(
+    q: Array,
+    motion: Motion,
+    checker: PathChecker,
+    *,
+    loads: Array | None = None,
+    load: IntArray | None = None,
+    limits: tuple[Array, Array] | None = None,
+    via: Array | None = None,
+    blockers: BlockersOf | None = None,
+    seed: int = 0,
+    iterations: int = ITERATIONS,
+    progress: Callable[[str], None] = lambda message: None,
+) -> Execution:
+    """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
+
+    Every pose is visited under each of `loads` (L, 3) N (None: once, without load), or under
+    loads[load[i]] where `load` (N,) says so.  Load states are done one after the other with as
+    few changes as possible, unloaded first where that costs nothing.  A move is straight in
+    joint space; where that is blocked, it goes through other poses, home, or points `via`
+    (k, n), which are not measured.  With `motion.both_directions` each pose is measured twice,
+    the joints coming from below and from above, inside `limits` (lower, upper); once where one
+    side is blocked (`Execution.one_sided`).
+
+    Solve, check the moves of the solution, forbid the blocked ones, and again: at the end all
+    moves are checked, and the tour is one that the routing solver holds best at costs that are
+    nowhere above the true ones.  The same seed gives the same order.
+
+    Raises InsufficientDataError that names a pose which no free move reaches, or which cannot
+    be approached as asked, and what is in the way if `blockers` can tell; InputError for
+    arguments that do not fit together.
+    """
+    q = np.asarray(q, dtype=float)
+    require(q.ndim == 2 and len(q) > 0, "there is no pose to put in order")
+    forces = np.zeros((1, 3)) if loads is None else np.asarray(loads, dtype=float)
+    moves = Moves.of(q, motion, checker, forces, load, limits, via)
+    check_reachable(moves, blockers)
+    costs = moves.costs()
+    tour = greedy_tour(costs.cost)
+    thorough, done = False, False
+    while not done:
+        effort = iterations if thorough else min(iterations, FEW_ITERATIONS)
+        tour = shortest_tour(costs.cost, tour, seed, effort)
+        tour = _unloaded_first(tour, costs.cost, moves)
+        blocked = moves.check(tour, costs)
+        progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
+        if blocked:
+            costs = moves.costs()
+        done, thorough = thorough and not blocked, not blocked
+    refuse_impossible(moves, tour, costs, blockers)
+    stops = stops_of(moves, tour, costs)
+    home_via, home_travel = way_home(moves, tour[-1], costs)
+    travel = sum(stop.travel for stop in stops) + home_travel
+    # The bound leaves open in which order the load states come: their number alone is fixed.
+    open_cost = costs.cost - costs.changed
+    bound = tour_bound(open_cost, tour_cost(open_cost, tour)) - tour_cost(costs.apart, tour)
+    return Execution(
+        stops=stops,
+        home_via=home_via,
+        home_travel=home_travel,
+        take_off=bool(moves.loaded[stops[-1].load]),
+        motion=motion,
+        bound=float(np.clip(bound, 0.0, travel)),
+        checked=moves.checked,
+        blocked=moves.blocked,
+    )
+
+
+def _unloaded_first(tour: list[int], cost: Array, moves: Moves) -> list[int]:
+    """The tour or its reverse: the cheaper one, else the one that begins without load, else
+    with the lower pose, so that the answer does not hang on the solver's whim."""
+    there, back = tour_cost(cost, tour), tour_cost(cost, tour[::-1])
+    if not np.isclose(there, back, rtol=1e-12):
+        return tour if there < back else tour[::-1]
+
+    def key(order: list[int]) -> tuple[bool, int]:
+        first = order[0] - 1
+        return bool(moves.loaded[moves.visits.load[first]]), int(moves.visits.pose[first])
+
+    return min(tour, tour[::-1], key=key)

@@ -1,0 +1,461 @@
+"""May the arm stand there, and may it go there?  All rules of the cell in one place."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError
+from elastocal.model.chain import Chain, finite_ranges, joint_limits
+from elastocal.planning.bodies import RULES, Body, Pair, cell_bodies, cell_pairs
+from elastocal.planning.collision import (
+    Collisions,
+    Kinematics,
+    Paths,
+    Poses,
+    Sight,
+    StaticTorque,
+    incidence,
+    marker_positions,
+    rope_angle,
+)
+from elastocal.units import Array, BoolArray
+
+# What a rule of the cell is, and those that bound a quantity of the pose.
+
+SAME = 1e-9  # rounding of a joint value that was set to its limit
+
+
+class Rule(ABC):
+    """One thing a pose must respect."""
+
+    name: str
+
+    @abstractmethod
+    def broken(self, poses: Poses) -> BoolArray:
+        """(N,): the pose breaks this rule."""
+
+    @abstractmethod
+    def causes(self, poses: Poses) -> dict[str, BoolArray]:
+        """By what: a joint, a marker, a pair of bodies → (N,)."""
+
+    @abstractmethod
+    def remedy(self, poses: Poses) -> str:
+        """What to relax for poses that break this rule and no other."""
+
+
+@dataclass(frozen=True)
+class Bound(Rule):
+    """lower ≤ quantity ≤ upper: joint values, range, incidence, rope angle, torque.
+
+    `quantity` gives (N, m), `labels` (m) name its columns, `units` (m) or one for all are what
+    messages show them in: "°" for quantities in rad.  `key`: what the user calls the limit.
+    """
+
+    name: str
+    quantity: Callable[[Poses], Array]
+    lower: Array
+    upper: Array
+    labels: tuple[str, ...]
+    key: str
+    units: tuple[str, ...]
+
+    def _beyond(self, poses: Poses) -> tuple[Array, BoolArray, BoolArray]:
+        value = self.quantity(poses)
+        return value, value < self.lower - SAME, value > self.upper + SAME
+
+    def broken(self, poses: Poses) -> BoolArray:
+        _, below, above = self._beyond(poses)
+        return np.asarray((below | above).any(axis=1))
+
+    def causes(self, poses: Poses) -> dict[str, BoolArray]:
+        _, below, above = self._beyond(poses)
+        return {label: below[:, i] | above[:, i] for i, label in enumerate(self.labels)}
+
+    def remedy(self, poses: Poses) -> str:
+        value, below, above = self._beyond(poses)
+        i = int((below | above).sum(axis=0).argmax())
+        low = below[:, i].sum() > above[:, i].sum()
+        limit = np.broadcast_to(self.lower if low else self.upper, len(self.labels))[i]
+        half = np.median(value[below[:, i] if low else above[:, i], i])
+        unit = self.units[i % len(self.units)]
+        scale = 180 / np.pi if unit == "°" else 1.0
+        return (
+            f"{self.key} of {half * scale:.4g} {unit} instead of {limit * scale:.4g} {unit} for "
+            f"{self.labels[i]} would let half of those pass"
+        )
+
+
+# Rules about bodies: keep-out, obstacles, self-collision, height of the load, line of sight.
+
+# A pose keeps every margin by this much more, so that a move that ends there can be certified.
+POSE_SLACK = 1e-4  # m
+SHOWN = 3  # causes that a remedy names
+
+ADVICE = {
+    "keep_out": "move the boundary in [[workspace.keep_out]]",
+    "load_height": "lower [workspace.load] min_height_m or shorten its rope",
+    "obstacle": "move or shrink the obstacle",
+    "self_collision": "shrink the bodies if they are modelled too large",
+    "line_of_sight": "move the tracker or the markers",
+}
+
+
+class KeepApart(Rule):
+    """No pair of bodies nearer than its margin."""
+
+    def __init__(self, name: str, kinematics: Kinematics, pairs: Sequence[Pair]) -> None:
+        self.name, self._kinematics, self._pairs = name, kinematics, tuple(pairs)
+        self._collisions = Collisions(kinematics, pairs)
+
+    def broken(self, poses: Poses) -> BoolArray:
+        return self._collisions.hits(poses, POSE_SLACK)
+
+    def causes(self, poses: Poses) -> dict[str, BoolArray]:
+        return {
+            " and ".join(pair.names): Collisions(self._kinematics, [pair]).hits(poses, POSE_SLACK)
+            for pair in self._pairs
+        }
+
+    def remedy(self, poses: Poses) -> str:
+        text = f"{most_frequent(self.causes(poses))}; {ADVICE[self.name]}"
+        margin = max(pair.margin for pair in self._pairs)
+        freed = int((~self._collisions.hits(poses, POSE_SLACK - margin)).sum()) if margin else 0
+        key = {"obstacle": "clearance_mm", "self_collision": "self_clearance_mm"}.get(self.name)
+        if freed:
+            text += f", or {key} of 0 instead of {margin * 1e3:.4g} would free {freed}"
+        return text
+
+
+class LineOfSight(Rule):
+    """Every marker is seen from the tracker."""
+
+    name = "line_of_sight"
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        bodies: Sequence[Body],
+        eye: Array,
+        radius: float,
+        markers: Mapping[str, Array],
+    ) -> None:
+        self._sight = Sight(kinematics, bodies, eye, radius)
+        self._markers = dict(markers)
+        self._one = lambda body: Sight(kinematics, [body], eye, radius)
+
+    def broken(self, poses: Poses) -> BoolArray:
+        hidden = np.zeros(len(poses), dtype=bool)
+        for marker in self._markers.values():
+            observed = np.flatnonzero(~hidden)
+            hidden[observed] = self._sight.blocked(poses.take(observed), marker)
+        return hidden
+
+    def causes(self, poses: Poses) -> dict[str, BoolArray]:
+        found = {}
+        for body in self._sight.bodies:
+            sight = self._one(body)
+            for name, marker in self._markers.items():
+                found[f"{name} behind {body.name}"] = sight.blocked(poses, marker)
+        return found
+
+    def remedy(self, poses: Poses) -> str:
+        return f"{most_frequent(self.causes(poses))}; {ADVICE[self.name]}"
+
+
+def most_frequent(causes: Mapping[str, BoolArray]) -> str:
+    """'most often link3 and wall (412), …': the causes met most."""
+    counts = sorted(((int(hit.sum()), name) for name, hit in causes.items()), key=lambda c: -c[0])
+    return "most often " + ", ".join(f"{name} ({n})" for n, name in counts[:SHOWN] if n)
+
+
+# What the rules say of a batch of candidates.
+
+
+@dataclass(frozen=True)
+class PoseFeasibility:
+    """`broken` (N, R): candidate i breaks rule r, whatever the others; `rules` (R) their names
+    in the order of checking; `q` (N, n) and `force` (N, 3) the candidates themselves."""
+
+    rules: tuple[str, ...]
+    broken: BoolArray
+    q: Array
+    force: Array
+
+    @property
+    def ok(self) -> BoolArray:
+        """(N,): breaks no rule."""
+        return np.asarray(~self.broken.any(axis=1))
+
+    @property
+    def removed_by(self) -> dict[str, int]:
+        """Candidates by the first rule they break: tried = feasible + Σ removed_by."""
+        first = self.broken & (self.broken.cumsum(axis=1) == 1)
+        return self._counts(first)
+
+    @property
+    def alone(self) -> dict[str, int]:
+        """Candidates that break each rule, whatever the others: its toll if it stood alone."""
+        return self._counts(self.broken)
+
+    @property
+    def freed(self) -> dict[str, int]:
+        """Candidates that break this rule and no other: what dropping it would free."""
+        return self._counts(self.broken & (self.broken.sum(axis=1) == 1)[:, None])
+
+    def _counts(self, mask: BoolArray) -> dict[str, int]:
+        return {rule: int(n) for rule, n in zip(self.rules, mask.sum(axis=0), strict=True)}
+
+    @classmethod
+    def join(cls, verdicts: Sequence[PoseFeasibility]) -> PoseFeasibility:
+        """Several batches under the same rules as one."""
+        return cls(
+            verdicts[0].rules,
+            np.concatenate([v.broken for v in verdicts]),
+            np.concatenate([v.q for v in verdicts]),
+            np.concatenate([v.force for v in verdicts]),
+        )
+
+
+# The rules that a cell states, in the order of checking: cheap ones first.
+
+
+def rule_book(
+    cell: Cell,
+    chain: Chain,
+    kinematics: Kinematics,
+    bodies: Sequence[Body],
+    pairs: Sequence[Pair],
+) -> tuple[Rule, ...]:
+    """All rules of the cell.  Raises InputError where they do not fit the robot."""
+    return (
+        _joints(cell, chain),
+        *_seen(cell),
+        *_load(cell, chain),
+        *(
+            KeepApart(rule, kinematics, own)
+            for rule in RULES
+            if (own := [pair for pair in pairs if pair.rule == rule])
+        ),
+        *_line_of_sight(cell, kinematics, bodies),
+    )
+
+
+def _joints(cell: Cell, chain: Chain) -> Rule:
+    lower, upper = joint_limits(cell, chain)
+    labels = tuple(f"joint{i + 1}" for i in range(chain.n_joints))
+    units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
+    return Bound("joint_limits", lambda p: p.q, lower, upper, labels, "a limit", units)
+
+
+def _seen(cell: Cell) -> Iterator[Rule]:
+    sight, eye = cell.workspace.visibility, cell.tracker.position
+    if sight is None:
+        return
+    if not cell.tool.markers:
+        raise InputError(
+            f"{cell.path or cell.name}: [workspace.visibility] needs the markers; give "
+            "[tool.markers_m]"
+        )
+    names, markers = tuple(cell.tool.markers), list(cell.tool.markers.values())
+    near, far = sight.range
+
+    def distance(poses: Poses) -> Array:
+        return np.asarray(np.linalg.norm(marker_positions(poses, markers) - eye, axis=2))
+
+    if near > 0 or np.isfinite(far):
+        low, high = np.full(len(names), near), np.full(len(names), far)
+        yield Bound("range", distance, low, high, names, "a range_m", ("m",))
+    observed = tuple(name for name in names if name in sight.normals)
+    if sight.max_incidence is not None and observed:
+        at, axes = (
+            [cell.tool.markers[name] for name in observed],
+            [sight.normals[n] for n in observed],
+        )
+        low, high = np.zeros(len(observed)), np.full(len(observed), sight.max_incidence)
+        yield Bound(
+            "incidence", lambda p: incidence(p, at, axes, eye), low, high, observed,
+            "a max_incidence_deg", ("°",),
+        )  # fmt: skip
+
+
+def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
+    load = cell.workspace.load
+    if load is not None and load.max_angle is not None and load.rope_axis is not None:
+        axis = load.rope_axis
+
+        def angle(poses: Poses) -> Array:
+            return np.where(poses.loaded, rope_angle(poses, axis), 0.0)[:, None]
+
+        low, high = np.zeros(1), np.array([load.max_angle])
+        yield Bound("rope_angle", angle, low, high, ("the rope",), "a max_angle_deg", ("°",))
+    if cell.workspace.torque_limits:
+        bound = np.array(cell.workspace.torque_limits)
+        if len(bound) != chain.n_joints:
+            raise InputError(
+                f"{cell.path or cell.name}: [workspace] torque_limits_Nm has {len(bound)} values, "
+                f"but robot '{chain.name}' has {chain.n_joints} joints"
+            )
+        torque, labels = (
+            StaticTorque(cell, chain),
+            tuple(f"joint{i + 1}" for i in range(len(bound))),
+        )
+        yield Bound(
+            "torque", lambda p: np.abs(torque(p)), np.zeros(len(bound)), bound, labels,
+            "a torque_limits_Nm", ("N m",),
+        )  # fmt: skip
+
+
+def _line_of_sight(cell: Cell, kinematics: Kinematics, bodies: Sequence[Body]) -> Iterator[Rule]:
+    sight = cell.workspace.visibility
+    if sight is not None and sight.line_of_sight:
+        yield LineOfSight(
+            kinematics, bodies, cell.tracker.position, sight.beam_radius, cell.tool.markers
+        )
+
+
+# Which rule to relax when next to nothing is feasible.
+
+SAMPLE = 2000  # candidates whose causes are looked at
+
+
+def advice(verdict: PoseFeasibility, rules: Sequence[Rule], kinematics: Kinematics) -> str:
+    """The rule, or the smallest set of rules, that stops most candidates by itself.
+
+    Among the sets of rules that candidates break, the smallest, and of these the one broken most
+    often: dropping it frees as many candidates, and no smaller set frees any.
+    """
+    sets, which, counts = np.unique(verdict.broken, axis=0, return_inverse=True, return_counts=True)
+    which = which.ravel()
+    size = sets.sum(axis=1)
+    stopped = np.flatnonzero(size > 0)
+    tried, feasible = len(verdict.broken), int(verdict.ok.sum())
+    head = f"{feasible} of {tried} candidates are feasible"
+    if not len(stopped):
+        return f"{head}; no rule removes any"
+    best = stopped[np.lexsort((-counts[stopped], size[stopped]))[0]]
+    chosen = [rule for rule, used in zip(rules, sets[best], strict=True) if used]
+    rows = np.flatnonzero(which == best)[:SAMPLE]
+    poses = kinematics.poses(verdict.q[rows], verdict.force[rows])
+    names = " and ".join(f"'{rule.name}'" for rule in chosen)
+    text = f"{head}; relax {names}, which {'alone stops' if len(chosen) == 1 else 'stop'} "
+    text += f"{counts[best]} of them: "
+    return text + "; ".join(rule.remedy(poses) for rule in chosen)
+
+
+# May the arm stand there, and may it go there?  All rules of the cell in one place.
+
+LOADED = np.array([0.0, 0.0, -1.0])  # any force: the load hangs
+MOST_TRIED = 300  # random poses in which a pair must once keep apart to be believed
+
+
+_last_restored: dict[str, Feasibility] = {}
+
+
+def _restored(token: str, cell: Cell, chain: Chain) -> Feasibility:
+    """The rules anew, once per process: with every task the same ones are sent again."""
+    if token not in _last_restored:
+        _last_restored.clear()
+        _last_restored[token] = Feasibility(cell, chain)
+    return _last_restored[token]
+
+
+class Feasibility:
+    """The rules of a cell for the nominal, rigid arm.
+
+    `bodies` and `pairs`: what there is and what must keep apart; `rules` in the order of
+    checking, cheap ones first.  Pickles by its cell and chain, so that processes can share it.
+    Raises InputError for a workspace that does not fit the robot.
+    """
+
+    def __init__(self, cell: Cell, chain: Chain) -> None:
+        self.cell, self.chain, self._token = cell, chain, uuid4().hex
+        self.kinematics = Kinematics(cell, chain)
+        self.bodies: tuple[Body, ...] = cell_bodies(cell, chain)
+        self.pairs: tuple[Pair, ...] = cell_pairs(cell, chain, self.bodies)
+        self.rules: tuple[Rule, ...] = rule_book(
+            cell, chain, self.kinematics, self.bodies, self.pairs
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (self._token, self.cell, self.chain)
+
+    def check(self, q: Array, force: Array) -> PoseFeasibility:
+        """Every rule on every pose q (N, n) rad or m under a force (3,) or (N, 3) N.
+
+        The load hangs wherever the force is not zero.  Raises InputError for joint values that
+        are not finite or of another robot.
+        """
+        poses = self._poses(q, force)
+        broken = np.stack([rule.broken(poses) for rule in self.rules], axis=1)
+        return PoseFeasibility(
+            tuple(rule.name for rule in self.rules), broken, poses.q, poses.force
+        )
+
+    def feasible(self, q: Array, force: Array) -> BoolArray:
+        """(N,) as check(q, force).ok, without looking at a pose again that broke a rule."""
+        poses = self._poses(q, force)
+        left = np.arange(len(poses))
+        for rule in self.rules:
+            left = left[~rule.broken(poses.take(left))]
+        ok = np.zeros(len(poses), dtype=bool)
+        ok[left] = True
+        return ok
+
+    def advice(self, verdict: PoseFeasibility) -> str:
+        """Which rule to relax, how many candidates that frees, and how."""
+        text = advice(verdict, self.rules, self.kinematics)
+        for a, b in self.always_in_contact:
+            text += (
+                f"; {a} and {b} are too close in every pose, which is probably a wrong size or "
+                f'place: correct it, or add ["{a}", "{b}"] to [workspace] ignored_pairs'
+            )
+        return text
+
+    @cached_property
+    def always_in_contact(self) -> tuple[tuple[str, str], ...]:
+        """Pairs too close in each of 300 random poses: likely modelling errors."""
+        lower, upper = finite_ranges(self.chain, *joint_limits(self.cell, self.chain))
+        q = np.random.default_rng(0).uniform(lower, upper, (MOST_TRIED, len(lower)))
+        poses = self._poses(q, LOADED)
+        return tuple(
+            pair.names
+            for pair in self.pairs
+            if Collisions(self.kinematics, [pair]).hits(poses).all()
+        )
+
+    def path_free(self, q_from: Array, q_to: Array, loaded: bool) -> bool:
+        """The joint interpolation q_from → q_to (n,) breaks no margin at any point of it."""
+        return bool(self.paths_free(np.atleast_2d(q_from), np.atleast_2d(q_to), loaded)[0])
+
+    def paths_free(self, q_from: Array, q_to: Array, loaded: bool | BoolArray) -> BoolArray:
+        """(M,) for moves q_from → q_to (M, n); `loaded` for all or per move (M,).
+
+        Keep-out, obstacles, self-collision, height and rope angle of the load hold all the way;
+        visibility and torque concern poses at rest.  See `Paths` for what "free" guarantees.
+        """
+        start, end = self._poses(q_from, LOADED).q, self._poses(q_to, LOADED).q
+        start, end = np.broadcast_arrays(start, end)
+        return self._paths.free(start, end, np.broadcast_to(loaded, len(start)))
+
+    @cached_property
+    def _paths(self) -> Paths:
+        return Paths(self.kinematics, self.bodies, self.pairs, self.cell.workspace.load)
+
+    def _poses(self, q: Array, force: Array) -> Poses:
+        q = np.atleast_2d(np.asarray(q, dtype=float))
+        if q.shape[1] != self.chain.n_joints:
+            raise InputError(
+                f"poses have {q.shape[1]} joint values, but robot '{self.chain.name}' has "
+                f"{self.chain.n_joints} joints"
+            )
+        if not np.isfinite(q).all():
+            raise InputError(f"pose {int(np.argwhere(~np.isfinite(q))[0][0])} is not finite")
+        return self.kinematics.poses(q, force)

@@ -1,0 +1,510 @@
+"""Moves between poses: visits under loads, approaches, free joint moves, and what blocks them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csgraph
+
+from elastocal.cell.plan_wishes import Motion
+from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.planning.collision import Collisions
+from elastocal.planning.feasibility import LOADED, Feasibility
+from elastocal.units import Array, IntArray
+
+# Approach of a pose from both sides, so that backlash and hysteresis show.
+
+
+def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> IntArray:
+    """Directions (N, 2, n) of the last motion of each joint: first upwards (+1), then down (−1).
+
+    The arm starts that motion at q − sign · overshoot, for poses `q` (N, n), in rad or m.  A
+    joint that would leave its limits [lower, upper] (n,) there comes from its other side both
+    times.  Raises InputError where neither side has room.
+    """
+    require(overshoot > 0, f"the overshoot must be positive; found {overshoot:g}")
+    below, above = q - overshoot >= lower, q + overshoot <= upper
+    if not (below | above).all():
+        i, j = (int(v) for v in np.argwhere(~(below | above))[0])
+        raise InputError(
+            f"pose {i + 1}: joint {j + 1} has no room on either side of {q[i, j]:.4g} for an "
+            f"overshoot of {overshoot:g}; lower overshoot_deg in [design.motion], or widen its "
+            "limits"
+        )
+    return np.stack([np.where(below, 1, -1), np.where(above, -1, 1)], axis=1)
+
+
+def approach_points(q: Array, signs: IntArray, overshoot: float) -> Array:
+    """Joint vectors (N, 2, n) at which the last motions of `approach_signs` start."""
+    return np.asarray(q[:, None] - signs * overshoot)
+
+
+# What has to be visited: poses under load states, from which points they are entered and left.
+
+
+@dataclass(frozen=True)
+class Visits:
+    """V visits, each of one pose in one load state, as indices into the roadmap's points.
+
+    A visit is entered at one of `entry` (V, O), takes `inside` (V, O) s from there on, inf where
+    that entry is blocked, and is left from `leave` (V,), where the pose is.  Entry o is the side
+    from which the pose is approached first; without approaches the pose itself is the one entry.
+    """
+
+    pose: IntArray
+    load: IntArray
+    leave: IntArray
+    entry: IntArray
+    inside: Array
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+
+@dataclass(frozen=True)
+class Costs:
+    """`cost` (V + 1, V + 1) of going from one visit through the next one, node 0 being the
+    beginning and the end, and `side` (V + 1, V): the entry taken.
+
+    Contained in `cost`: `apart` for going to another load state, `changed` where that changes
+    what hangs on the arm.
+    """
+
+    cost: Array
+    apart: Array
+    changed: Array
+    side: IntArray
+
+
+def loaded_between(visits: Visits, loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(V + 1, V + 1): is the load on the arm during the move?  Only if it is before and after.
+
+    So loads are hung and taken off where the arm stands for a loaded reading, and moves to and
+    from the beginning, node 0, are without.
+    """
+    carries = np.concatenate([[False], loaded[visits.load]])
+    return np.asarray(carries[:, None] & carries[None, :])
+
+
+def visit_costs(
+    visits: Visits,
+    loaded: NDArray[np.bool_],
+    times: tuple[Array, Array],
+    home: int | None,
+) -> Costs:
+    """Costs of all moves, from the times (m, m) between points without and with load.
+
+    Load states are kept together and changed as rarely as can be: going to another one costs
+    more than all travelling, and twice that if what hangs on the arm changes.  The arm begins
+    and ends without load, at point `home` or, where that is None, anywhere.  What cannot be
+    reached costs more than everything else together.
+    """
+    n = len(visits)
+    with_load = loaded_between(visits, loaded)
+    travel = np.zeros((n + 1, n + 1))
+    side = np.zeros((n + 1, n), dtype=np.int64)
+    for layer, between in enumerate(times):
+        leave = visits.leave if home is None else np.append(home, visits.leave)
+        ways = between[leave[:, None, None], visits.entry[None]]
+        back = np.zeros(n) if home is None else between[visits.leave, home]
+        if home is None:
+            ways = np.concatenate([np.zeros((1, *ways.shape[1:])), ways])
+        ways = ways + visits.inside
+        here = with_load == bool(layer)
+        side = np.where(here[:, 1:], ways.argmin(axis=2), side)
+        travel[:, 1:] = np.where(here[:, 1:], ways.min(axis=2), travel[:, 1:])
+        travel[1:, 0] = np.where(here[1:, 0], back, travel[1:, 0])
+    np.fill_diagonal(travel, 0.0)
+    finite = np.isfinite(travel)
+    # Any tour travels less than this in all, if it needs no unreachable move.
+    change = max(float(travel[finite].max()) * (n + 1), 1.0)
+    states = np.append(-1, visits.load)
+    # The beginning is its own block; the unloaded states carry the same as it: nothing.
+    carried = np.append(-1, np.where(loaded[visits.load], visits.load, -1))
+    apart = change * (states[:, None] != states[None])
+    changed = change * (carried[:, None] != carried[None])
+    travel[~finite] = 4 * change * (n + 1)
+    return Costs(travel + apart + changed, apart, changed, side)
+
+
+# Which joint moves are free: a graph over joint vectors whose edges are checked when needed.
+
+# Added to every edge, relative to the longest one: of equally long ways the one with fewer stops.
+PER_EDGE = 1e-9
+
+
+class PathChecker(Protocol):
+    """Says whether the arm may move straight in joint space from one joint vector to another."""
+
+    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> NDArray[np.bool_]:
+        """(M,): are all configurations from q_from to q_to (M, n), ends included, allowed?
+
+        `loaded`: with the hanging load.  The answer for the way back is the same.
+        """
+        ...
+
+
+def travel_times(points: Array, speed: Array | None) -> Array:
+    """Times (m, m) in s of synchronised joint moves between `points` (m, n).
+
+    t_ij = max_k |q_ik − q_jk| / v_k with `speed` v (n,) in rad/s or m/s, 1 where it is None.
+    Being a metric, no way through other points is faster than the straight one.
+    """
+    q = points if speed is None else points / speed
+    return np.asarray(np.abs(q[:, None] - q[None]).max(axis=2))
+
+
+class Roadmap:
+    """Joint vectors `points` (m, n) and the straight moves between them, in one load state.
+
+    A move counts as free until it is checked; a blocked one is replaced by the fastest way
+    through other points.  So costs never exceed the true ones, and a tour that is optimal at
+    these costs and whose moves have all been checked is optimal (lazy shortest paths: Bohlin
+    and Kavraki 2000).
+    """
+
+    def __init__(self, points: Array, times: Array, loaded: bool, checker: PathChecker) -> None:
+        self.points, self.loaded, self.checker = points, loaded, checker
+        self.direct = times.copy()  # inf where blocked
+        self.verdict: dict[tuple[int, int], bool] = {}
+        self._ways: tuple[Array, NDArray[np.integer]] | None = None
+
+    def check(self, moves: Iterable[tuple[int, int]]) -> bool:
+        """Are the straight moves between these pairs of points all free?  Each is checked once,
+        those not checked before together."""
+        pairs = {(min(move), max(move)) for move in moves if move[0] != move[1]}
+        new = sorted(pairs - self.verdict.keys())
+        if new:
+            i, j = np.array(new).T
+            free = self.checker.paths_free(self.points[i], self.points[j], self.loaded)
+            self.verdict.update(zip(new, (bool(f) for f in free), strict=True))
+            blocked = ~np.asarray(free)
+            self.direct[i[blocked], j[blocked]] = self.direct[j[blocked], i[blocked]] = np.inf
+            self._ways = None
+        return all(self.verdict[pair] for pair in pairs)
+
+    @property
+    def blocked(self) -> int:
+        """How many straight moves were found blocked."""
+        return sum(not verdict for verdict in self.verdict.values())
+
+    def costs(self) -> Array:
+        """Times (m, m) between points: straight, or by the fastest way around; inf for none."""
+        return np.where(np.isfinite(self.direct), self.direct, self._shortest()[0])
+
+    def way(self, i: int, j: int) -> list[int]:
+        """Points passed on the fastest way from i to j, j included, i not; [] from i to itself."""
+        if i == j:
+            return []
+        if np.isfinite(self.direct[i, j]):
+            return [j]
+        before, way = self._shortest()[1][i], [j]
+        while before[way[-1]] != i:
+            way.append(int(before[way[-1]]))
+        return way[::-1]
+
+    def _shortest(self) -> tuple[Array, NDArray[np.integer]]:
+        if self._ways is None:
+            finite = self.direct[np.isfinite(self.direct)]
+            extra = max(PER_EDGE * float(finite.max()), np.finfo(float).tiny)
+            self._ways = csgraph.shortest_path(
+                self.direct + extra, method="FW", return_predecessors=True
+            )
+        return self._ways
+
+    def parts(self, needed: list[int]) -> list[list[int]]:
+        """`needed` points by what is connected through free moves, the largest part first.
+
+        Only as many moves are checked as it takes, first among `needed`, then through all points.
+        """
+        part = np.arange(len(self.points))
+        for among in (needed, list(range(len(self.points)))):
+            if len(set(part[needed])) > 1:
+                self._join(part, np.array(among), needed)
+        labels = part[needed]
+        found = [[p for p in needed if part[p] == label] for label in dict.fromkeys(labels)]
+        return sorted(found, key=len, reverse=True)
+
+    def _join(self, part: IntArray, among: IntArray, needed: list[int]) -> None:
+        """Relabel `part` (m,) by free moves between points of `among`, until all of `needed` are
+        of one part or no move is left (Borůvka: every part tries its shortest ways out, twice as
+        many each time)."""
+        tries = 1
+        while len(set(part[needed])) > 1:
+            new: list[tuple[int, int]] = []
+            for label in set(part[among]):
+                own, others = among[part[among] == label], among[part[among] != label]
+                out = self.direct[np.ix_(own, others)]
+                for k in np.argsort(out, axis=None, kind="stable")[:tries]:
+                    i, j = np.unravel_index(k, out.shape)
+                    if np.isfinite(out[i, j]):
+                        new.append((int(own[i]), int(others[j])))
+            if not new:
+                return
+            self.check(new)
+            for i, j in new:
+                if np.isfinite(self.direct[i, j]):
+                    part[part == part[j]] = part[i]
+            tries *= 2
+
+
+# The points of a schedule, its visits, and the moves between them, checked when needed.
+
+
+@dataclass(frozen=True)
+class Moves:
+    """Home, poses, points of approach and via points in one list, and the visits among them.
+
+    `points` (m, n), and `times` (m, m) between them; `maps`: the roadmaps without and with
+    load; `home`: its point or None; `signs` (N, 2, n) where poses are approached from both
+    sides; `loaded` (L,): which load states have a load.
+    """
+
+    points: Array
+    times: Array
+    maps: tuple[Roadmap, Roadmap]
+    visits: Visits
+    loaded: NDArray[np.bool_]
+    home: int | None
+    signs: IntArray | None
+
+    @classmethod
+    def of(
+        cls,
+        q: Array,
+        motion: Motion,
+        checker: PathChecker,
+        forces: Array,
+        load: IntArray | None,
+        limits: tuple[Array, Array] | None,
+        via: Array | None,
+    ) -> Moves:
+        """The arguments of `schedule`, checked and laid out."""
+        n_poses, n = q.shape
+        _check_motion(motion, n)
+        pose = np.repeat(np.arange(n_poses), len(forces) if load is None else 1)
+        state = np.tile(np.arange(len(forces)), n_poses) if load is None else np.asarray(load)
+        require(
+            state.shape == pose.shape and bool(np.isin(state, np.arange(len(forces))).all()),
+            f"load must be one of {len(forces)} load states for each of {n_poses} poses",
+        )
+        home = None if motion.home is None else 0
+        start = np.zeros((0, n)) if motion.home is None else motion.home[None]
+        leave = len(start) + pose
+        between, signs = np.zeros((0, n)), None
+        entry = leave[:, None]
+        if motion.both_directions:
+            if limits is None:
+                raise InputError("approaches from both sides need the joint limits")
+            signs = approach_signs(q, *limits, motion.overshoot)
+            between = approach_points(q, signs, motion.overshoot).reshape(-1, n)
+            entry = len(start) + n_poses + 2 * pose[:, None] + np.arange(2)
+        points = np.vstack([start, q, between, np.zeros((0, n)) if via is None else via])
+        times = travel_times(points, motion.speed)
+        maps = (Roadmap(points, times, False, checker), Roadmap(points, times, True, checker))
+        loaded = (forces != 0).any(axis=1)
+        inside = times[leave[:, None], entry]
+        if signs is not None:
+            inside = _approach_times(inside, _free_sides(maps, loaded[state], leave, entry))
+        visits = Visits(pose, state, leave, entry, inside)
+        return cls(points, times, maps, visits, loaded, home, signs)
+
+    @property
+    def checked(self) -> int:
+        return sum(len(roadmap.verdict) for roadmap in self.maps)
+
+    @property
+    def blocked(self) -> int:
+        return sum(roadmap.blocked for roadmap in self.maps)
+
+    def carries(self, node: int) -> int:
+        """The load state on the arm at a node of a tour, −1 for none; node 0 is without."""
+        state = -1 if node == 0 else int(self.visits.load[node - 1])
+        return state if state >= 0 and self.loaded[state] else -1
+
+    def costs(self) -> Costs:
+        """Costs between visits as known so far."""
+        times = (self.maps[0].costs(), self.maps[1].costs())
+        return visit_costs(self.visits, self.loaded, times, self.home)
+
+    def way(self, u: int, v: int, costs: Costs) -> tuple[Roadmap, list[int]]:
+        """The roadmap and the points from node u to the entry of node v, both included.
+
+        Only the last point where u is the beginning and there is no home; none where v is the
+        end; the ends alone where no way is known.
+        """
+        roadmap = self.maps[int(self.carries(u) >= 0 and self.carries(v) >= 0)]
+        goal = self.home if v == 0 else int(self.visits.entry[v - 1, costs.side[u, v - 1]])
+        start = self.home if u == 0 else int(self.visits.leave[u - 1])
+        if goal is None:
+            return roadmap, []
+        if start is None:
+            return roadmap, [goal]
+        return roadmap, [start, *roadmap.way(start, goal)]
+
+    def check(self, tour: list[int], costs: Costs) -> bool:
+        """Check every straight move of the tour not yet checked; is one of them news, blocked?"""
+        wanted: list[list[tuple[int, int]]] = [[], []]
+        for u, v in pairwise([0, *tour, 0]):
+            roadmap, way = self.way(u, v, costs)
+            # Where no way is left, every move has been checked: nothing to be learnt.
+            wanted[roadmap.loaded] += [m for m in pairwise(way) if np.isfinite(roadmap.direct[m])]
+        return not all([self.maps[k].check(wanted[k]) for k in (0, 1)])
+
+
+def _free_sides(
+    maps: tuple[Roadmap, Roadmap], loaded: NDArray[np.bool_], leave: IntArray, entry: IntArray
+) -> NDArray[np.bool_]:
+    """(V, 2): is the last stretch to the pose free from that side?"""
+    stretch = np.stack([entry, np.broadcast_to(leave[:, None], entry.shape)], axis=2)
+    for roadmap in maps:
+        roadmap.check(stretch[loaded == roadmap.loaded].reshape(-1, 2).tolist())
+    free = np.zeros(entry.shape, dtype=bool)
+    for v, side in np.ndindex(*entry.shape):
+        free[v, side] = maps[int(loaded[v])].check([(int(entry[v, side]), int(leave[v]))])
+    return free
+
+
+def _approach_times(reach: Array, free: NDArray[np.bool_]) -> Array:
+    """Time (V, 2) from the first entry on: the approach, then to the other side and back, where
+    that is free; inf where this side is not."""
+    back = np.where(free, 2 * reach, 0.0)[:, ::-1]
+    return np.asarray(np.where(free, reach + back, np.inf))
+
+
+def _check_motion(motion: Motion, n: int) -> None:
+    speed, home = motion.speed, motion.home
+    require(
+        speed is None or (speed.shape in ((1,), (n,)) and bool((speed > 0).all())),
+        f"[design.motion] needs {n} positive joint speeds, or one for all; found {speed}",
+    )
+    require(
+        home is None or home.shape == (n,),
+        f"[design.motion] home needs {n} joint values; found {home}",
+    )
+
+
+# What stands in the way of a straight joint move, for messages.
+
+SAMPLES = 200
+
+
+class Blockers:
+    """The pairs of bodies that come too close on the way from one joint vector to another."""
+
+    def __init__(self, feasibility: Feasibility) -> None:
+        self.feasibility = feasibility
+
+    def __call__(self, q_from: Array, q_to: Array, loaded: bool) -> tuple[str, ...]:
+        """ "link3 and pillar", …, in the order in which they are met, from samples of the way."""
+        step = np.linspace(0.0, 1.0, SAMPLES)[:, None]
+        force = LOADED if loaded else np.zeros(3)
+        kinematics = self.feasibility.kinematics
+        poses = kinematics.poses(q_from + step * (q_to - q_from), force)
+        met = []
+        for pair in self.feasibility.pairs:
+            hits = Collisions(kinematics, [pair]).hits(poses)
+            if hits.any():
+                met.append((int(np.argmax(hits)), " and ".join(pair.names)))
+        return tuple(name for _, name in sorted(met))
+
+
+# Poses that no collision-free move reaches, told before and after the routing.
+
+# The bodies in the way of the straight move between two joint vectors (n,), with or without load.
+BlockersOf = Callable[[Array, Array, bool], Sequence[str]]
+
+MOST_NAMED = 3
+
+
+class Unreachable(InsufficientDataError):
+    """Some poses of a plan cannot be reached: `poses` are their indices."""
+
+    def __init__(self, message: str, poses: IntArray) -> None:
+        super().__init__(message)
+        self.poses = poses
+
+
+def check_reachable(moves: Moves, blockers: BlockersOf | None) -> None:
+    """Raise Unreachable for a pose that cannot be approached from either side, where
+    it has to be, or that no chain of free moves joins to the others (or home) of its load state."""
+    for roadmap in moves.maps:
+        here = moves.loaded[moves.visits.load] == roadmap.loaded
+        leave = moves.visits.leave[here]
+        if moves.signs is not None:
+            _check_approaches(moves, roadmap, here, blockers)
+        needed = [int(point) for point in dict.fromkeys(leave)]
+        if moves.home is not None and len(needed) and not roadmap.loaded:
+            needed.insert(0, moves.home)
+        if len(needed) < 2:
+            continue
+        _, *lost = roadmap.parts(needed)
+        if lost:
+            raise _unreachable(moves, roadmap, lost[0], blockers)
+
+
+def _check_approaches(
+    moves: Moves, roadmap: Roadmap, here: NDArray[np.bool_], blockers: BlockersOf | None
+) -> None:
+    for v in np.flatnonzero(here & ~np.isfinite(moves.visits.inside).any(axis=1)):
+        pose, (below, above) = int(moves.visits.leave[v]), moves.visits.entry[v].tolist()
+        raise Unreachable(
+            f"{_name(moves, pose)} cannot be approached{_carrying(roadmap)}, neither from below"
+            f"{_in_the_way(roadmap, below, pose, blockers)} nor from above"
+            f"{_in_the_way(roadmap, above, pose, blockers)}; lower overshoot_deg in "
+            "[design.motion], or raise clearance_mm in [workspace]",
+            moves.visits.pose[[v]],
+        )
+
+
+def refuse_impossible(
+    moves: Moves, tour: list[int], costs: Costs, blockers: BlockersOf | None
+) -> None:
+    """Raise Unreachable where the tour holds a move for which no way is left."""
+    for u, v in pairwise([0, *tour, 0]):
+        roadmap, way = moves.way(u, v, costs)
+        if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
+            lost = [int(moves.visits.leave[(v or u) - 1])]
+            raise _unreachable(moves, roadmap, lost, blockers)
+
+
+def _unreachable(
+    moves: Moves, roadmap: Roadmap, lost: list[int], blockers: BlockersOf | None
+) -> Unreachable:
+    named = ", ".join(_name(moves, point) for point in lost[:MOST_NAMED])
+    more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+    others = np.setdiff1d(np.arange(len(moves.points)), lost)
+    between = moves.times[lost][:, others]
+    i, j = np.unravel_index(int(np.argmin(between)), between.shape)
+    by = _in_the_way(roadmap, int(others[j]), lost[int(i)], blockers)
+    return Unreachable(
+        f"{named}{more} cannot be reached{_carrying(roadmap)} by collision-free joint moves, "
+        f"neither directly nor through home and other poses{by}; give "
+        "another home in [design.motion], free the way, or narrow [limits] to exclude such poses",
+        np.unique(moves.visits.pose[np.isin(moves.visits.leave, lost)]),
+    )
+
+
+def _name(moves: Moves, point: int) -> str:
+    joints = ", ".join(f"{value:.3f}" for value in moves.points[point])
+    if point == moves.home:
+        return f"home (joints {joints})"
+    first = 0 if moves.home is None else 1
+    return f"pose {point - first + 1} (joints {joints})"
+
+
+def _carrying(roadmap: Roadmap) -> str:
+    return " with the load" if roadmap.loaded else ""
+
+
+def _in_the_way(roadmap: Roadmap, i: int, j: int, blockers: BlockersOf | None) -> str:
+    """What blocks the straight move between two points, in brackets, where it can be told."""
+    if blockers is None:
+        return ""
+    names = blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
+    return f" (in the way: {', '.join(names)})" if names else ""

@@ -1,0 +1,482 @@
+"""The plan: poses in order, what they promise, how far from the best; as CSV and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import linalg, stats
+
+from elastocal.above import Result
+from elastocal.errors import InputError, require
+from elastocal.files import atomic_write_text
+from elastocal.measurements import DEFAULT_MARKER, Measurements, families
+from elastocal.model.manipulator import Model
+from elastocal.planning.criterion import Criterion
+from elastocal.planning.exact_plan import RandomPlans
+from elastocal.planning.execution import Execution, Stop
+from elastocal.planning.information import Estimable
+from elastocal.tables import column, csv_text
+from elastocal.text import is_label, json_text, quoted
+from elastocal.units import Array, IntArray, to_si
+
+# What a plan promises, and why each pose is in it.
+
+TOLD = 3  # parameters named per pose
+COMBINED = 0.01  # share of a typical deviation that counts as being part of a combination
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Standard deviation and half width of the 95 % interval of a parameter, in its unit.
+
+    `combined_with`: what the readings cannot tell from it; the interval is that of the sum.
+    """
+
+    name: str
+    unit: str
+    std: float
+    half_width: float
+    combined_with: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Reason:
+    """What a plan loses without one pose: `loss` of the criterion, as a factor (inf: everything).
+
+    `serves`: the parameters that lose most and by what factor their standard deviation grows.
+    """
+
+    loss: float
+    serves: tuple[tuple[str, float], ...]
+
+
+def predicted(model: Model, found: Estimable, M: Array, n_numbers: int) -> tuple[Predicted, ...]:
+    """Intervals of the kept parameters from the information M (p, p), scaled by their sizes.
+
+    cov(X̂) = M⁻¹ (eq. 13 of Klimchik et al. 2013); the half width is that of Student's t with
+    `n_numbers` − p degrees of freedom, as identification will estimate the noise.
+    """
+    r, sizes = found.reduction, found.sizes
+    std = np.sqrt(np.diag(_inverse(M))) * sizes[r.kept]
+    quantile = float(stats.t.ppf(0.975, max(n_numbers - len(r.kept), 1)))
+    return tuple(
+        Predicted(
+            model.names[c], model.parameters[c].unit, float(std[k]), float(quantile * std[k]),
+            tuple(
+                model.names[d]
+                for j, d in enumerate(r.dropped)
+                if abs(r.mixing[k, j]) * sizes[d] > COMBINED * sizes[c]
+            ),
+        )
+        for k, c in enumerate(r.kept)
+    )  # fmt: skip
+
+
+def reasons(
+    model: Model, found: Estimable, blocks: Array, prior: Array, values: Array, value: float
+) -> tuple[Reason, ...]:
+    """Why each pose of a plan is in it: blocks (N, r, p), prior (p, p), both scaled.
+
+    `values` (N,): the criterion of the plan without that pose; `value`: with all.
+    """
+    M = prior + np.einsum("nri,nrj->ij", blocks, blocks)
+    V = _inverse(M)
+    names = [model.names[c] for c in found.columns]
+    told = []
+    for B, without in zip(blocks, values, strict=True):
+        # V₋ = V + V Bᵀ (1 − B V Bᵀ)⁻¹ B V; a pose that carries a direction alone leaves 1 − BVBᵀ
+        # singular.
+        share, turn = linalg.eigh(B @ V @ B.T)
+        moved = turn.T @ B @ V
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rest = np.where(1 - share > 1e-9, 1 - share, 0.0)
+            more = (np.where(np.abs(moved) > 1e-12, moved**2, 0.0) / rest[:, None]).sum(axis=0)
+            growth = np.sqrt(1 + np.nan_to_num(more, nan=0.0, posinf=np.inf) / np.diag(V))
+        first = np.argsort(-growth, kind="stable")[:TOLD]
+        serves = tuple((names[k], float(growth[k])) for k in first if growth[k] > 1.005)
+        told.append(Reason(float(without / value), serves))
+    return tuple(told)
+
+
+def _inverse(M: Array) -> Array:
+    factor = linalg.cho_factor(M)
+    return np.asarray(linalg.cho_solve(factor, np.eye(len(M))))
+
+
+# The plan on disk: plan.csv, which `simulate` takes and people measure by, and plan.json.
+
+SCHEMA = "elastocal/plan/1"
+# Of degrees and mm: 9e-12 rad and 5e-13 m, and a level of -25.24° reads so.
+DIGITS = 9
+UNITS = {"revolute": "deg", "prismatic": "mm"}
+
+
+@dataclass(frozen=True)
+class PlanRows:
+    """R rows of plan.csv: `configuration` names, `q` (R, n) rad or m, `level` (R,) from 1 on,
+    `order` (R,) of execution from 1 on, and where the plan states them `force` (R, 3) N and
+    `approach` (R, n) of ±1.  `notes`: further columns for people, passed over when read."""
+
+    configuration: tuple[str, ...]
+    q: Array
+    level: IntArray
+    order: IntArray
+    force: Array | None = None
+    approach: IntArray | None = None
+    notes: Mapping[str, Sequence[str]] | None = None
+
+    def table(self, joint_kinds: Sequence[str]) -> Measurements:
+        """What `measurement_reader.read_plan` reads of these rows once they are written."""
+        n = len(self.configuration)
+        labels = tuple(dict.fromkeys(self.configuration))
+        q = np.column_stack(
+            [
+                to_si(np.round(in_unit(values, kind), DIGITS), UNITS[kind])
+                for values, kind in zip(self.q.T, joint_kinds, strict=True)
+            ]
+        )
+        return Measurements(
+            source="plan",
+            row=np.arange(2, n + 2),
+            q=q,
+            configuration=np.array([labels.index(name) for name in self.configuration]),
+            configuration_labels=labels,
+            repeat=np.zeros(n, dtype=np.int64),
+            marker=np.zeros(n, dtype=np.int64),
+            marker_names=(DEFAULT_MARKER,),
+            force=np.zeros((n, 3)) if self.force is None else self.force,
+            approach=None if self.approach is None else self.approach.astype(float),
+        )
+
+
+def plan_rows(
+    execution: Execution,
+    configurations: Sequence[str],
+    level: IntArray,
+    forces: Array | None = None,
+) -> PlanRows:
+    """The rows of an execution, sorted by pose, then side of approach, then load state.
+
+    With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
+    row per pose and side, to be measured in every load state, with the place in the order of the
+    second state as note_order_2, and so on.  `configurations` and `level`: one per pose.  Where a
+    pose is approached from both sides, they are two configurations, 7+ (joints moving up to it)
+    and 7-: the difference between them is what such a plan is for, not noise of repeats.
+    """
+    numbered = list(enumerate(execution.stops, start=1))
+    readings: dict[tuple[int, int, int], list[tuple[int, Stop]]] = {}
+    for k, stop in sorted(numbered, key=lambda s: (s[1].pose, s[1].side, s[1].load)):
+        key = (stop.pose, stop.side, -1 if forces is None else stop.load)
+        readings.setdefault(key, []).append((k, stop))
+    rows = [sorted(row, key=lambda s: s[0]) for row in readings.values()]
+    first = [row[0][1] for row in rows]
+    sides = ("", "") if first[0].approach is None else ("+", "-")
+    most = max(len(row) for row in rows)
+    notes = {
+        f"note_order_{i + 1}": [str(row[i][0]) if i < len(row) else "" for row in rows]
+        for i in range(1, most)
+    }
+    approach = [stop.approach for stop in first if stop.approach is not None]
+    return PlanRows(
+        configuration=tuple(configurations[stop.pose] + sides[stop.side] for stop in first),
+        q=np.array([stop.q for stop in first]),
+        level=np.array([level[stop.pose] for stop in first]),
+        order=np.array([row[0][0] for row in rows]),
+        force=None if forces is None else forces[[stop.load for stop in first]],
+        approach=np.array(approach) if approach else None,
+        notes=notes,
+    )
+
+
+def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> None:
+    """Write plan.csv, whole or not at all; angles in degrees, travel in mm.
+
+    `measurements.read_plan` reads it back to 1e-11 rad.  Raises InputError for values that
+    are not finite, names that cannot stand in a table or repeat, and an unwritable place.
+    """
+    columns = _columns(rows, joint_kinds)
+    for name in rows.configuration:
+        if not is_label(name):
+            raise InputError(
+                f"{path}: configuration name {quoted(name)} cannot stand in a table; use one "
+                "line without blanks at its ends"
+            )
+    keys = list(zip(rows.configuration, *([] if rows.force is None else rows.force.T), strict=True))
+    require(len(set(keys)) == len(keys), f"{path}: two rows of the plan have the same name")
+    for values in (rows.q, rows.force):
+        if values is not None and not np.isfinite(values).all():
+            raise InputError(f"{path}: the plan's joint values and forces must be finite")
+    atomic_write_text(path, csv_text(columns, zip(*columns.values(), strict=True)))
+
+
+def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[str]]:
+    """Header → cells, in the units and names of the measurement table."""
+    known = families(joint_kinds)
+    columns: dict[str, Sequence[str]] = {"configuration": rows.configuration}
+    for stem, kind, values in zip(known["q"].units, joint_kinds, rows.q.T, strict=True):
+        columns[column(stem, UNITS[kind])] = [_number(v) for v in in_unit(values, kind)]
+    if rows.force is not None:
+        for stem, values in zip(known["force"].units, rows.force.T, strict=True):
+            columns[column(stem, "N")] = [repr(float(v) + 0.0) for v in values]
+    if rows.approach is not None:
+        for stem, values in zip(known["approach"].units, rows.approach.T, strict=True):
+            columns[stem] = [str(int(v)) for v in values]
+    columns["level"] = [str(int(v)) for v in rows.level]
+    columns["order"] = [str(int(v)) for v in rows.order]
+    return columns | dict(rows.notes or {})
+
+
+def in_unit(values: Array, kind: str) -> Array:
+    """A joint's values in rad or m in the unit of the file."""
+    return np.degrees(values) if kind == "revolute" else values * 1e3
+
+
+def _number(value: float) -> str:
+    return repr(round(float(value), DIGITS) + 0.0)
+
+
+def write_plan_json(path: str | Path, summary: Mapping[str, Any]) -> None:
+    """Write plan.json of schema elastocal/plan/1, whole or not at all.
+
+    numpy numbers and arrays become plain ones; numbers that are not finite become null, as JSON
+    has none.  Raises InputError where the place cannot be written.
+    """
+    atomic_write_text(path, json_text({"schema": SCHEMA, **summary}) + "\n")
+
+
+# The frozen result of a design: poses in order, what they promise, how far from the best.
+
+
+@dataclass(frozen=True)
+class CandidateCounts:
+    """How many poses were tried, how many the cell allows, and which rule removed the others."""
+
+    tried: int
+    feasible: int
+    removed_by: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How far the plan is from the best, as shares of the criterion (1: cannot be better).
+
+    `efficiency_pool` is certified: no plan with the same shares from the `pool` candidates has a
+    value below `bound_pool`.  `efficiency_continuum` is an estimate: the search tried `searched`
+    poses and `ascents` local searches, and a better pose may still exist.  Values Φ; None where
+    the criterion has no bound.
+    """
+
+    pool: int
+    bound_pool: float | None
+    efficiency_pool: float | None
+    bound_continuum: float | None = None
+    efficiency_continuum: float | None = None
+    searched: int = 0
+    ascents: int = 0
+
+
+@dataclass(frozen=True)
+class Chance:
+    """The same number of random feasible poses: criteria of `drawn` such plans in the plan's unit.
+
+    `determined` of them determine every parameter; `median`, `best` and `worst` are None where
+    that plan does not.  `efficiency` is the plan's Φ over the median's, None where the criterion
+    has no bound: such a Φ does not count poses.
+    """
+
+    drawn: int
+    determined: int
+    median: float | None
+    best: float | None
+    worst: float | None
+    efficiency: float | None
+
+    @classmethod
+    def of(cls, found: RandomPlans, value: float, criterion: Criterion) -> Chance:
+        """What `found` is beside a plan of Φ = `value`."""
+
+        def known(phi: float) -> float | None:
+            return criterion.reported(phi)[0] if np.isfinite(phi) else None
+
+        values = found.values
+        return cls(
+            len(values), found.determined, known(found.median), known(float(values[0])),
+            known(float(values[-1])),
+            found.efficiency(value) if criterion.certifiable else None,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PlanSize:
+    """The criterion of the best plan found of `poses` poses, and its bound, in the plan's unit."""
+
+    poses: int
+    value: float
+    bound: float | None
+
+
+@dataclass(frozen=True, repr=False)
+class Plan(Result):
+    """A measurement plan: poses in their order, what they promise, how far from the best they are.
+
+    Attributes:
+        model: The `Model` that it is for.
+        criterion: What was made small; `value` is it as the search has it (Φ), `reported` as people
+            know it, in `unit`.
+        q: Commanded joints (N, joints), in rad or m.
+        load: (N,), each pose's load state, an index into `forces`; −1 for all of them.
+        forces: Load states (L, 3), in N.
+        group: (N,), the level of each pose, an index into `levels` of the joint `level_joint`.
+        execution: The order of execution, with the points in between.
+        candidates: How many poses were tried, and which rule removed how many.
+        certificate: How far the plan is from the best: certified on the pool of candidates,
+            estimated on the continuum.
+        predicted: How far each parameter will be known.
+        reasons: What each pose is for.
+        targets: What the test poses were, in words.
+        seed: Of all random draws.
+        polished: How many poses were moved from their candidate.
+        curve: The criterion against the number of poses, where it was asked for.
+        bound_reported: The certificate's bound, in `unit`.
+        warnings: What to know before one measures, in sentences.
+        first: Number of the first configuration: after those that were measured already.
+        chance: What as many random poses would reach.
+
+    Examples:
+        >>> plan = ec.design(
+        ...     "cell.toml", poses=4, criterion="D", candidates=60, effort="quick",
+        ...     loads=[[0, 0, -2600]], levels={"joint2": np.radians([-25.24, -99.85])},
+        ... )
+        >>> len(plan), plan.q.shape, plan.unit
+        (4, (4, 6), 'log det')
+        >>> data = ec.simulate("cell.toml", plan, load=[0, 0, -2600])
+        >>> plan.save("plan4.csv")
+    """
+
+    model: Model
+    criterion: str
+    value: float
+    reported: float
+    unit: str
+    q: Array
+    load: IntArray
+    forces: Array
+    group: IntArray
+    levels: tuple[float, ...]
+    level_joint: str | None
+    execution: Execution
+    candidates: CandidateCounts
+    certificate: Certificate
+    predicted: tuple[Predicted, ...]
+    reasons: tuple[Reason, ...]
+    targets: str
+    seed: int
+    polished: int = 0
+    curve: tuple[PlanSize, ...] = ()
+    bound_reported: float | None = None
+    warnings: tuple[str, ...] = field(default=())
+    first: int = 1
+    chance: Chance | None = None
+
+    def __repr__(self) -> str:
+        sure = self.certificate.efficiency_pool
+        told = "" if sure is None else f", at least {100 * sure:.1f} % of the best of its pool"
+        return (
+            f"<Plan {self.model.chain.name}: {len(self)} poses by {self.criterion}, "
+            f"{self.reported:.4g} {self.unit}{told}>"
+        )
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def table(self) -> Measurements:
+        """The poses as a table for `simulate`, as the plan's file has them."""
+        rows = plan_rows(self.execution, self.configurations, self.group + 1, self.stated_forces)
+        return rows.table(self.model.chain.kinds)
+
+    @property
+    def configurations(self) -> tuple[str, ...]:
+        """Their names: numbers from `first` on."""
+        return tuple(str(self.first + k) for k in range(len(self.q)))
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """The levels as people read them: "joint2 at -25.24°"."""
+        if self.level_joint is None:
+            return ("poses",)
+        revolute = self.model.chain.kinds[int(self.level_joint.removeprefix("joint")) - 1]
+        if revolute == "revolute":
+            return tuple(f"{self.level_joint} at {np.degrees(v):.6g}°" for v in self.levels)
+        return tuple(f"{self.level_joint} at {v * 1e3:.6g} mm" for v in self.levels)
+
+    @property
+    def stated_forces(self) -> Array | None:
+        """The load states where the plan must state them row by row.
+
+        Not where every pose is measured unloaded, or unloaded and under one load, which is what
+        `simulate` does with a load to a plan without forces.
+        """
+        loaded = np.any(self.forces != 0, axis=1)
+        usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2
+        return None if usual and (self.load < 0).all() else self.forces
+
+    def to_json(self) -> dict[str, Any]:
+        """The plan as numbers and texts; the file adds its schema."""
+        c = self.certificate
+        return {
+            "criterion": self.criterion,
+            "value": self.reported,
+            "unit": self.unit,
+            "n_poses": len(self.q),
+            "candidates": {
+                "tried": self.candidates.tried,
+                "feasible": self.candidates.feasible,
+                "removed_by": self.candidates.removed_by,
+            },
+            "certificate": {
+                "efficiency_pool": c.efficiency_pool,
+                "bound_pool": self.bound_reported,
+                "efficiency_continuum": c.efficiency_continuum,
+                "pool": c.pool,
+                "pool_is": "certified on the pool",
+                "continuum_is": "estimated on the continuum",
+                "searched": c.searched,
+                "ascents": c.ascents,
+            },
+            "random_plans": None if self.chance is None else {
+                "n": self.chance.drawn,
+                "determined": self.chance.determined,
+                "median": self.chance.median,
+                "best": self.chance.best,
+                "worst": self.chance.worst,
+                "efficiency": self.chance.efficiency,
+            },
+            "predicted": [
+                {
+                    "name": p.name,
+                    "std": p.std,
+                    "unit": p.unit,
+                    "ci95_half_width": p.half_width,
+                    "combined_with": list(p.combined_with),
+                }
+                for p in self.predicted
+            ],
+            "poses": [
+                {
+                    "configuration": k + 1,
+                    "value_without": None if not np.isfinite(r.loss) else r.loss,
+                    "serves": [
+                        {"name": name, "std_without": None if not np.isfinite(f) else f}
+                        for name, f in r.serves
+                    ],
+                }
+                for k, r in enumerate(self.reasons)
+            ],
+            "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
+            "warnings": list(self.warnings),
+            "seed": self.seed,
+        }  # fmt: skip

@@ -1,0 +1,296 @@
+"""What a design knows before it chooses: parameters, criterion, earlier information, shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InsufficientDataError, option, require
+from elastocal.identification.knowledge import GaussianPrior
+from elastocal.identification.start import fixed_and_free
+from elastocal.model.effects import effect_of
+from elastocal.model.manipulator import Model
+from elastocal.planning.criteria import criterion_named, make_criterion
+from elastocal.planning.criterion import Criterion
+from elastocal.planning.information import (
+    Done,
+    Estimable,
+    LoadStates,
+    PoseInformation,
+    estimable,
+    interest_of,
+    typical_sizes,
+    why,
+)
+from elastocal.planning.selection_problem import DesignProblem
+from elastocal.planning.test_poses import (
+    TargetPoses,
+    on_kept,
+    prediction_rows,
+    remaining_bias,
+    unpredictable,
+)
+from elastocal.simulation.simulate import draw_errors, values_from
+from elastocal.text import listed
+from elastocal.units import Array, IntArray
+
+# How many poses a plan has at each level.
+
+DEFAULT = 15  # poses, as in Table 2 of Klimchik et al. 2013
+
+
+def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
+    """Poses (L,) per level of [design.levels]; (1,) without levels.
+
+    `n_poses` overrides what the cell says; what does not divide evenly goes to the first levels.
+    Raises InputError where levels would be left without a pose, or `per_level` contradicts.
+    """
+    spec = cell.design
+    levels = max(max((len(v) for v in spec.levels.values()), default=1), 1)
+    where = f"{cell.path or cell.name}: [design]"
+    if spec.per_level and n_poses is None:
+        each = spec.per_level * levels if len(spec.per_level) == 1 else spec.per_level
+        require(
+            len(each) == levels,
+            f"{where} poses_per_level has {len(each)} numbers, but there are {levels} levels",
+        )
+        return np.array(each, dtype=np.int64)
+    total = n_poses or spec.poses or DEFAULT
+    require(
+        total >= levels,
+        f"{where} asks for {total} poses at {levels} levels; ask for {levels} at least, or drop "
+        "levels",
+    )
+    return np.array([total // levels + (k < total % levels) for k in range(levels)], dtype=np.int64)
+
+
+def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
+    """Are there as many candidates per level, `available` (L,), as the plan has poses there?
+
+    A candidate stands in a plan once.  Raises InputError where too few were asked for,
+    InsufficientDataError where too few are feasible.
+    """
+    short = np.flatnonzero(available < shares)
+    if not len(short):
+        return
+    k, drawn = int(short[0]), cell.design.candidates
+    level = f" takes {shares[k]} at level {k + 1} of {next(iter(cell.design.levels), '')}"
+    where = f"{cell.path or cell.name}: a plan of {int(shares.sum())} poses"
+    where += level if len(shares) > 1 else ""
+    asked = drawn // len(shares) + (k < drawn % len(shares))
+    require(
+        asked >= shares[k],
+        f"{where}, but {drawn} candidates leave {asked} to choose from; ask for more "
+        f"({option('candidates')}, or [design] candidates)",
+    )
+    raise InsufficientDataError(
+        f"{where}, but only {available[k]} feasible candidates were found; plan fewer poses, or "
+        "relax the limits or the rules of [workspace]"
+    )
+
+
+def most_poses(cell: Cell, available: IntArray, limit: int) -> int:
+    """The most poses, `limit` at most, for which `available` (L,) candidates per level suffice."""
+    n = len(available)
+    while n < limit and (shares_of(cell, n + 1) <= available).all():
+        n += 1
+    return n
+
+
+# Everything a design knows before it chooses: parameters, criterion, information known before.
+
+WORTH_TELLING = 1e-7  # m
+SCENARIO_STREAM = 1  # of the seed's children; see design.py
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known before a plan: held parameters, a stated prior, measurements done."""
+
+    fixed: tuple[str, ...] = ()
+    prior: GaussianPrior | None = None
+    done: Done | None = None
+
+
+@dataclass(frozen=True)
+class FeasiblePool:
+    """Candidates q (N, n), their load state (N,) and group (N,), and blocks (S, N, r, p)."""
+
+    q: Array
+    load: IntArray
+    group: IntArray
+    blocks: Array
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @property
+    def n_groups(self) -> int:
+        return int(self.group.max()) + 1
+
+    def take(self, kept: IntArray) -> FeasiblePool:
+        return FeasiblePool(self.q[kept], self.load[kept], self.group[kept], self.blocks[:, kept])
+
+    def joined(self, other: FeasiblePool) -> FeasiblePool:
+        return FeasiblePool(
+            np.vstack([self.q, other.q]),
+            np.concatenate([self.load, other.load]),
+            np.concatenate([self.group, other.group]),
+            np.concatenate([self.blocks, other.blocks], axis=1),
+        )
+
+
+@dataclass(frozen=True)
+class Setup:
+    """`information` over the kept parameters, `prior` (S, p, p) scaled, and the criterion."""
+
+    information: PoseInformation
+    found: Estimable
+    criterion: Criterion
+    prior: Array
+    warnings: tuple[str, ...]
+
+    def pool(self, q: Array, load: IntArray, group: IntArray) -> FeasiblePool:
+        return FeasiblePool(q, load, group, self.information.blocks(q, load))
+
+    def problem(self, pool: FeasiblePool, shares: IntArray) -> DesignProblem:
+        return DesignProblem(pool.blocks, self.prior, pool.group, shares, self.criterion)
+
+    def gathered(self, blocks: Array) -> Array:
+        """M (S, p, p) of a plan's blocks (S, N, r, p) and what was known before."""
+        return self.prior + np.einsum("snri,snrj->sij", blocks, blocks, optimize=True)
+
+    def value(self, q: Array, load: IntArray) -> float:
+        """Φ of any plan of poses q (N, n) in load states `load` (N,)."""
+        return float(self.criterion.value(self.gathered(self.information.blocks(q, load))))
+
+
+def set_up(
+    model: Model,
+    states: LoadStates,
+    q: Array,
+    load: IntArray,
+    n_poses: int,
+    targets: TargetPoses,
+    known: Known,
+    seed: int,
+) -> Setup:
+    """The parameters that the candidates q (N, n) show, and the criterion on them.
+
+    Raises InsufficientDataError where no pose shows a parameter that the criterion needs, named
+    with what it is combined with; InputError for unknown names.
+    """
+    spec = model.cell.design
+    scenarios = _scenarios(model, known, seed)
+    every = np.arange(len(model.parameters))
+    raw = PoseInformation(model, states, scenarios, every, np.ones(len(every)))
+    sizes = typical_sizes(raw, q, load)
+    information = replace(raw, sizes=sizes)
+    prior = _prior(model, known, sizes)
+    free = fixed_and_free(model, known.fixed)
+    found = estimable(information, q, load, free, prior, n_poses, _stated(model, known))
+    kept = found.columns
+    information = replace(information, columns=kept, sizes=sizes[kept])
+    interest = interest_of(model, found)
+    A, warnings = None, _unseen(model, found, free)
+    if "test_poses" in criterion_named(spec.criterion).needs:
+        rows = np.stack([prediction_rows(information, targets, x) for x in scenarios])
+        A = on_kept(model, rows, found)
+        warnings += _held(model, found, remaining_bias(rows[0], targets.weight, found))
+    criterion = make_criterion(
+        spec.criterion,
+        parameters=len(kept),
+        interest=interest,
+        scenarios=len(scenarios),
+        A=A,
+        weights=targets.weight,
+        combination=_combination(model, found),
+        unit=_unit(model),
+        n_poses=n_poses,
+        names=information.names,
+        sizes=information.sizes,
+        robust=spec.robust,
+    )
+    prior = np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0)
+    return Setup(information, found, criterion, prior, warnings)
+
+
+def _scenarios(model: Model, known: Known, seed: int) -> Array:
+    """X (S, parameters): the arm as known best, and draws of what it may be besides."""
+    spec = model.cell.design
+    best = model.nominal if known.done is None else known.done.x
+    if spec.robust == "none":
+        return best[None]
+    rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(SCENARIO_STREAM + 1)[-1])
+    arm = np.array([not effect_of(p.effect).registered for p in model.parameters])
+    draws = [values_from(model, draw_errors(model, 1.0, rng)) for _ in range(spec.robust_samples)]
+    moved = [np.where(arm, best + x - model.nominal, best) for x in draws]
+    return np.stack([best, *moved])
+
+
+def _prior(model: Model, known: Known, sizes: Array) -> Array:
+    """Information known before (parameters, parameters), scaled by `sizes`."""
+    n = len(sizes)
+    information = np.zeros((n, n))
+    if model.cell.design.prior == "typical":
+        has = np.array([p.typical is not None for p in model.parameters])
+        information[has, has] += 1.0
+    if known.prior is not None:
+        P = known.prior.rows(model.names)[0] * sizes
+        information += P.T @ P
+    if known.done is not None:
+        information += known.done.information * np.outer(sizes, sizes)
+    return information
+
+
+def _stated(model: Model, known: Known) -> NDArray[np.bool_]:
+    """(parameters,) those of which a size is known beforehand and asked to be counted."""
+    names = () if known.prior is None else known.prior.names
+    typical = model.cell.design.prior == "typical"
+    return np.array(
+        [p.name in names or (typical and p.typical is not None) for p in model.parameters]
+    )
+
+
+def _combination(model: Model, found: Estimable) -> Array | None:
+    """The coefficients (kept,) of `[design] combination`, scaled."""
+    wanted = model.cell.design.combination
+    if not wanted:
+        return None
+    a = values_from(model, {name: 0.0 for name in wanted})  # names are checked there
+    a = np.zeros_like(a)
+    for name, factor in wanted.items():
+        a[model.names.index(name)] = factor
+    lost = unpredictable(a[None, None], found)
+    if lost is not None:
+        raise InsufficientDataError(
+            f"{model.cell.path or model.cell.name}: [design] combination depends on "
+            f"{model.names[lost[1]]}; {why(model, found, lost[1])}"
+        )
+    return np.asarray((a * found.sizes)[found.columns])
+
+
+def _unit(model: Model) -> str:
+    """The unit of `[design] combination`: that of its parameters, "" where they differ."""
+    units = {p.unit for p in model.parameters if p.name in model.cell.design.combination}
+    return units.pop() if len(units) == 1 else ""
+
+
+def _unseen(model: Model, found: Estimable, free: IntArray) -> tuple[str, ...]:
+    """A sentence per free parameter that no feasible pose shows at all."""
+    return tuple(why(model, found, int(i)) for i in found.structure.invisible if i in free)
+
+
+def _held(model: Model, found: Estimable, bias: float) -> tuple[str, ...]:
+    """A sentence on what ρ₀ leaves out, where that is worth one."""
+    held = [model.names[c] for c in found.structure.kept if c not in found.columns]
+    if bias < WORTH_TELLING or not held:
+        return ()
+    return (
+        f"so many poses show less of {listed(held)} than their noise; identification holds what it "
+        f"cannot see, and typical deviations of that move the test points by {bias * 1e6:.3g} µm "
+        "rms, which the criterion does not count",
+    )

@@ -1,0 +1,656 @@
+"""The test poses: where position must be right, and how the parameters move the tool there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence, Sized
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
+
+from elastocal.cell.arm_description import EffectChoice
+from elastocal.cell.plan_wishes import TargetBox, TargetPath
+from elastocal.cell.work_cell import Cell
+from elastocal.config import place
+from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.identification.identifiability import Reduction
+from elastocal.measurements import NUMBERED, Measurements, families, layout_of, rotation_column
+from elastocal.model.arm import LEVEL_TOLERANCE
+from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.placements import MarkerPosition
+from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
+from elastocal.model.manipulator import Model
+from elastocal.planning.information import Estimable, PoseInformation, why
+from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
+from elastocal.text import listed, quoted
+from elastocal.units import Array, IntArray
+
+# Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.
+
+LIMIT_SLACK = 1e-6  # rad or m: what rounding to printed digits may push over a limit
+
+
+def check_cell(cell: Cell, chain: Chain) -> None:
+    """Numbers of joints, links, and joint values of [workspace] and [design].
+
+    Raises InputError that names the key, what was found and what to do.
+    """
+    _check_workspace(cell, chain)
+    _check_levels(cell, chain)
+    _check_motion(cell, chain)
+    for k, pose in enumerate(cell.design.test_poses):
+        key = place("design", "test_pose", k, "q_deg" if pose.degrees else "q_si")
+        check_posture(cell, chain, key, pose.q, pose.degrees)
+
+
+def check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -> None:
+    """A posture q (n,) that `key` states: number of joints, their unit, their limits."""
+    _check_count(cell, chain, key, q)
+    if degrees:
+        _check_revolute(cell, chain, key)
+    problem = beyond_limits(cell, chain, q)
+    require(
+        problem is None,
+        f"{cell.path or cell.name}: key {key}: {problem}; correct the posture or the limits",
+    )
+
+
+def beyond_limits(cell: Cell, chain: Chain, q: Array) -> str | None:
+    """Which joint of the posture q (n,) lies beyond its limits, as a sentence; None for none."""
+    lower, upper = joint_limits(cell, chain)
+    beyond = np.flatnonzero((q < lower - LIMIT_SLACK) | (q > upper + LIMIT_SLACK))
+    if not len(beyond):
+        return None
+    j = int(beyond[0])
+    low, high = _told(chain, j, lower[j]), _told(chain, j, upper[j])
+    return (
+        f"joint{j + 1} ({chain.joints[j].name}) at {_told(chain, j, q[j])} is beyond its limits, "
+        f"{low} to {high}"
+    )
+
+
+def _told(chain: Chain, j: int, value: float) -> str:
+    if chain.kinds[j] == "revolute":
+        return f"{np.degrees(value):.6g}°"
+    return f"{value:.6g} m"
+
+
+def _check_count(cell: Cell, chain: Chain, key: str, found: Sized, one: bool = False) -> None:
+    """One number per joint, or where `one` allows it a single number for all."""
+    n = chain.n_joints
+    if len(found) != n and not (one and len(found) == 1):
+        raise InputError(
+            f"{cell.path or cell.name}: key {key} has {len(found)} numbers, but robot "
+            f"'{chain.name}' has {n} joints; give {n} numbers{' or one for all' if one else ''}"
+        )
+
+
+def _check_revolute(cell: Cell, chain: Chain, key: str) -> None:
+    sliding = [k for k, kind in enumerate(chain.kinds) if kind == "prismatic"]
+    if sliding:
+        other = key.replace("deg_per_s", "si").replace("_deg", "_si")
+        raise InputError(
+            f"{cell.path or cell.name}: key {key} gives degrees, but joint{sliding[0] + 1} "
+            f"({chain.joints[sliding[0]].name}) is prismatic; use {other}, in rad and m"
+        )
+
+
+def _check_workspace(cell: Cell, chain: Chain) -> None:
+    space, n = cell.workspace, chain.n_joints
+    if space.link_radius:
+        _check_count(cell, chain, "workspace.link_radius_mm", space.link_radius, one=True)
+    if space.torque_limits:
+        _check_count(cell, chain, "workspace.torque_limits_Nm", space.torque_limits)
+    links = {f"link{i}" for i in range(1, n + 1)}
+    for k, body in enumerate(space.bodies):
+        if body.on.startswith("link") and body.on not in links:
+            raise InputError(
+                f"{cell.path or cell.name}: key {place('workspace', 'body', k, 'on')} is "
+                f"'{body.on}', but robot '{chain.name}' has {n} moving links, link1 to link{n}"
+            )
+
+
+def _check_levels(cell: Cell, chain: Chain) -> None:
+    lower, upper = joint_limits(cell, chain)
+    for joint, values in cell.design.levels.items():
+        i = joint_index(cell, chain, joint, "[design.levels]")
+        split = cell.model.compliance_levels.get(joint)
+        for value in values:
+            require(
+                lower[i] - LIMIT_SLACK <= value <= upper[i] + LIMIT_SLACK,
+                f"{cell.path or cell.name}: [design.levels] has {joint} at "
+                f"{_told(chain, i, value)}, beyond its limits, {_told(chain, i, lower[i])} to "
+                f"{_told(chain, i, upper[i])}; correct the level or the limits",
+            )
+            require(
+                split is None or min(abs(value - s) for s in split) <= LEVEL_TOLERANCE,
+                f"{cell.path or cell.name}: [design.levels] has {joint} at "
+                f"{_told(chain, i, value)}, which is none of its levels in "
+                "[model.compliance_levels]; give both the same levels",
+            )
+
+
+def _check_motion(cell: Cell, chain: Chain) -> None:
+    motion = cell.design.motion
+    unit = "deg" if motion.degrees else "si"
+    if motion.speed is not None:
+        key = "design.motion.speed_" + ("deg_per_s" if motion.degrees else "si")
+        _check_count(cell, chain, key, motion.speed, one=motion.degrees)
+        if motion.degrees:
+            _check_revolute(cell, chain, key)
+    if motion.home is not None:
+        check_posture(cell, chain, f"design.motion.home_{unit}", motion.home, motion.degrees)
+
+
+# A table of test poses: a machining path in joints, or in positions of the tool's point.
+
+TAKEN = ("q", "position", "rotation", "quaternion", "force")
+WEIGHT = Family("weight", "weights", {"weight": NO_UNIT})
+MOST_POSES = 10_000
+
+
+@dataclass(frozen=True)
+class PathTable:
+    """N poses in SI units: either joints `q` (N, n), or `position` (N, 3) in the data's frame
+    and perhaps `rotation` (N, 3), a rotation vector; `force` (N, 3), None where not stated;
+    `weight` (N,).  `raw` tells where each row stands in the file."""
+
+    raw: RawTable
+    q: Array | None
+    position: Array | None
+    rotation: Array | None
+    force: Array | None
+    weight: Array
+
+    def columns(self, family: str) -> tuple[str, ...]:
+        """The headers of a family of columns."""
+        return tuple(column.header for column in self.raw.layout.columns[family])
+
+
+def read_path(path: Path, joint_kinds: Sequence[str]) -> PathTable:
+    """The poses of a CSV or Parquet (.parquet, .pq) file; columns as in the measurement table.
+
+    q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is
+    prescribed; force_x_N … and weight may be added.  Raises InputError that names file, line,
+    column and the offending text.
+    """
+
+    def choose(header: Sequence[str]) -> Layout:
+        return _layout(str(path), header, joint_kinds)
+
+    raw = read_table(path, choose)
+    require(
+        len(raw.row) <= MOST_POSES,
+        f"{raw.source}: {len(raw.row)} poses; a path takes at most {MOST_POSES}; thin it out: "
+        "neighbouring poses say the same",
+    )
+    weight = raw.si(WEIGHT.name)
+    if weight is not None:
+        raw.check(WEIGHT.name, weight > 0, "a weight must be positive")
+    return PathTable(
+        raw=raw,
+        q=raw.si("q"),
+        position=raw.si("position"),
+        rotation=rotation_column(raw),
+        force=raw.si("force"),
+        weight=np.ones(len(raw.row)) if weight is None else weight[:, 0],
+    )
+
+
+def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> Layout:
+    in_joints = any((m := NUMBERED.fullmatch(text)) and m[1] == "q" for text in header)
+    kinds = joint_kinds if in_joints else ()
+    layout = layout_of(source, header, kinds, "plan", extra=(WEIGHT,))
+    columns = {n: cs for n, cs in layout.columns.items() if n in (*TAKEN, WEIGHT.name)}
+    for name, family in layout.columns.items():
+        if name not in columns and name != "configuration":
+            raise InputError(
+                f"{source}: column {quoted(family[0].header)} has no meaning in a path; drop it, "
+                "or start its name with '#', '_' or 'note' to have it ignored"
+            )
+    if in_joints and ("rotation" in columns or "quaternion" in columns):
+        other = columns["rotation" if "rotation" in columns else "quaternion"][0].header
+        raise InputError(
+            f"{source}: {columns['q'][0].header} … says the rotation too; drop {other} …"
+        )
+    if in_joints and "position" in columns:
+        raise InputError(
+            f"{source}: {columns['q'][0].header} … and {columns['position'][0].header} … say the "
+            "same in two ways; keep the joints or the positions"
+        )
+    if not in_joints and "position" not in columns:
+        joints = next(iter(families(joint_kinds)["q"].units), "q1")
+        raise InputError(
+            f"{source}: the columns {joints}_deg … or x_mm,y_mm,z_mm are missing; a path needs "
+            f"the joints or the positions of its poses; found {listed(header, 12)}"
+        )
+    numbers = tuple(column.header for family in columns.values() for column in family)
+    return Layout(columns, (), numbers)
+
+
+# Places of the data's frame reached by the arm, in postures that the work cell allows.
+
+FEW, MANY = 16, 256  # postures per place; many where the work cell allows none of few
+WRONG_UNIT = 1e5  # mm
+
+
+class Rules(Protocol):
+    """What a work cell allows: `check` gives a verdict with `ok` (N,)."""
+
+    def check(self, q: Array, force: Array) -> Any: ...
+
+
+def working_loads(cell: Cell) -> Array:
+    """The forces (L, 3) N of the design's loads that are not zero, or none but zero."""
+    loads = cell.design.loads
+    loaded = np.zeros((0, 3)) if loads is None else loads[(loads != 0).any(axis=1)]
+    return loaded if len(loaded) else np.zeros((1, 3))
+
+
+@dataclass(frozen=True)
+class Places:
+    """`position` (T, 3) m in the data's frame for the `point` (3,) of the flange, `rotation`
+    (T, 3, 3) of the flange, None for any, and `force` (T, 3) N, None for the cell's loads."""
+
+    position: Array
+    rotation: Array | None
+    point: Array
+    force: Array | None
+
+    def take(self, index: NDArray[np.int64]) -> Places:
+        """Some of the places."""
+        return replace(
+            self,
+            position=self.position[index],
+            rotation=None if self.rotation is None else self.rotation[index],
+            force=None if self.force is None else self.force[index],
+        )
+
+
+def reach(cell: Cell, chain: Chain, places: Places, seed: int, postures: int = FEW) -> Postures:
+    """Postures at the places: inverse kinematics with the cell's limits, base and home."""
+    nominal, T = cell.model.nominal, np.eye(4)
+    if nominal.base_rotation is not None:
+        T[:3, :3] = nominal.base_rotation
+    if nominal.base_position is not None:
+        T[:3, 3] = nominal.base_position
+    return inverse_kinematics(
+        chain,
+        places.position,
+        joint_limits(cell, chain),
+        rotation=places.rotation,
+        point=places.point,
+        T_data_base=T,
+        near=cell.design.motion.home,
+        postures=postures,
+        seed=seed,
+    )
+
+
+def preferred(
+    cell: Cell, chain: Chain, places: Places, found: Postures, rules: Rules | None, seed: int
+) -> tuple[Array, str]:
+    """Per place the first posture that the rules allow, and what to tell.
+
+    Where they allow none of those found, more are tried; where they allow none at all, it is the
+    first, and the text says of how many places that holds.
+    """
+    q = found.q[:, 0].copy()
+    if rules is None:
+        return q, ""
+    stuck = _take_allowed(cell, places, found, rules, q, np.arange(len(q)))
+    if len(stuck):
+        more = reach(cell, chain, places.take(stuck), seed, MANY)
+        stuck = _take_allowed(cell, places.take(stuck), more, rules, q, stuck)
+    told = f" ({len(stuck)} of them in no posture that the work cell allows)"
+    return q, told if len(stuck) else ""
+
+
+def _take_allowed(
+    cell: Cell,
+    places: Places,
+    found: Postures,
+    rules: Rules,
+    q: Array,
+    rows: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Put the first allowed posture of each place into q[rows]; the rows that have none."""
+    T, K, n = found.q.shape
+    allowed = found.reached.copy()
+    loads = working_loads(cell)[:, None] if places.force is None else places.force[None]
+    for load in loads:
+        of_each = np.repeat(np.broadcast_to(load, (T, 3)), K, axis=0)
+        allowed &= np.asarray(rules.check(found.q.reshape(T * K, n), of_each).ok).reshape(T, K)
+    some = allowed.any(axis=1)
+    q[rows[some]] = found.q[some, allowed[some].argmax(axis=1)]
+    return rows[~some]
+
+
+def how_near(found: Postures, t: int) -> str:
+    """How near the arm gets to target t."""
+    distance, turn = found.miss[t, 0] * 1e3, np.degrees(found.turn[t, 0])
+    # A place missed by this much is given in another unit than its column says.
+    told = f"{distance:.4g} mm" if distance < WRONG_UNIT else f"{distance:.0f} mm, wrong unit?"
+    also = f" and {turn:.3g}° from its rotation" if turn > 0.01 else ""
+    return f"the arm gets no nearer than {told}{also}"
+
+
+def remedy(cell: Cell) -> str:
+    """What to do about a place out of reach."""
+    if cell.model.nominal.base_position is None:
+        return (
+            "move it, or state where the arm stands in the data's frame ([model.nominal] "
+            "base_position_m, base_rpy_deg)"
+        )
+    return "move it, or check base_position_m and base_rpy_deg of [model.nominal], and [limits]"
+
+
+# The test poses: where position must be right, under which load, at which point of the tool.
+
+DEFAULT_COUNT = 20
+DRAWN = 4096  # postures among which the default test poses are sought, where a cell has rules
+
+
+@dataclass(frozen=True)
+class TargetPoses:
+    """T test poses: `q` (T, n) rad or m, `force` (T, 3) N in the data's frame, `weight` (T,) of
+    sum 1, `point` (T, 3) m in the flange frame, `stated` (T,) by the user or else the default;
+    `source` says where they come from."""
+
+    q: Array
+    force: Array
+    weight: Array
+    point: Array
+    stated: NDArray[np.bool_]
+    source: str
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Poses of one source: q (N, n), force (N, 3) or None for the cell's loads, weight (N,)."""
+
+    q: Array
+    force: Array | None
+    weight: Array
+    point: Array
+    told: str
+    stated: bool
+
+
+def test_poses(
+    cell: Cell, chain: Chain, feasibility: Rules | None = None, seed: int = 0
+) -> TargetPoses:
+    """The test poses of the cell: [[design.test_pose]], [design.test_path], [design.test_box].
+
+    Several sources add up.  A pose without a force of its own is taken under each of the
+    design's loads that is not zero, which share its weight.  Places are reached by the posture
+    nearest to the home posture, or the middle of the joint ranges; with `feasibility` by the
+    first that its rules allow.  Without any source 20 poses are drawn over the joint limits.
+
+    Raises InputError where a pose lies beyond the joint limits or out of reach, a table is wrong,
+    and InsufficientDataError where the cell allows none of the drawn poses.
+    """
+    spec, groups = cell.design, []
+    point = _default_point(cell)
+    for k, pose in enumerate(spec.test_poses):
+        key = place("design", "test_pose", k, "q_deg" if pose.degrees else "q_si")
+        check_posture(cell, chain, key, pose.q, pose.degrees)
+        own = point if pose.point is None else pose.point
+        force = None if pose.force is None else pose.force[None]
+        groups.append(
+            _Group(pose.q[None], force, np.array([pose.weight]), own, "", pose.point is not None)
+        )
+    told = [f"{len(groups)} of [[design.test_pose]]"] if groups else []
+    if spec.test_path is not None:
+        groups.append(_along_path(cell, chain, spec.test_path, point, feasibility, seed))
+    if spec.test_box is not None:
+        groups.append(_in_box(cell, chain, spec.test_box, point, feasibility, seed))
+    if not groups:
+        groups.append(_drawn(cell, chain, point, feasibility, seed))
+    return _together(groups, working_loads(cell), [*told, *(g.told for g in groups if g.told)])
+
+
+def _default_point(cell: Cell) -> Array:
+    """The load point where the cell states one, else the mean over the markers."""
+    if cell.tool.load_point.any() or not cell.tool.markers:
+        return cell.tool.load_point
+    return np.asarray(np.mean(list(cell.tool.markers.values()), axis=0))
+
+
+def _together(groups: Sequence[_Group], loads: Array, told: Sequence[str]) -> TargetPoses:
+    q, force, weight, point, stated = [], [], [], [], []
+    for group in groups:
+        each = loads if group.force is None else np.zeros((1, 3))
+        q.append(np.repeat(group.q, len(each), axis=0))
+        force.append(np.tile(loads, (len(group.q), 1)) if group.force is None else group.force)
+        weight.append(np.repeat(group.weight / len(each), len(each)))
+        point.append(np.broadcast_to(group.point, (len(q[-1]), 3)))
+        stated.append(np.full(len(q[-1]), group.stated))
+    all_weights = np.concatenate(weight)
+    # First by the largest, so that no sum overflows.
+    all_weights = all_weights / all_weights.max()
+    return TargetPoses(
+        np.vstack(q),
+        np.vstack(force),
+        all_weights / all_weights.sum(),
+        np.vstack(point),
+        np.concatenate(stated),
+        "test poses: " + ", ".join(told),
+    )
+
+
+def _along_path(
+    cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Rules | None, seed: int
+) -> _Group:
+    path = read_path(spec.file, chain.kinds)
+    stated = spec.point is not None
+    point = point if spec.point is None else spec.point
+    force = path.force
+    if force is None and spec.force is not None:
+        force = np.broadcast_to(spec.force, (len(path.weight), 3))
+    if path.q is not None:
+        _check_path_limits(cell, chain, path, path.q)
+        return _Group(
+            path.q, force, path.weight, point, f"{len(path.q)} of {spec.file.name}", stated
+        )
+    assert path.position is not None  # read_path: joints or positions
+    rotation = None if path.rotation is None else Rotation.from_rotvec(path.rotation).as_matrix()
+    places = Places(path.position, rotation, point, force)
+    found = reach(cell, chain, places, seed)
+    for t in found.out_of_reach[:1]:
+        raw, headers = path.raw, path.columns("position")
+        raise InputError(
+            f"{raw.source}, {raw.noun} {raw.row[t]}, columns {', '.join(headers)}: the place is "
+            f"out of reach, {how_near(found, t)} ({len(found.out_of_reach)} of "
+            f"{len(path.weight)} places); {remedy(cell)}"
+        )
+    q, told = preferred(cell, chain, places, found, rules, seed)
+    return _Group(q, force, path.weight, point, f"{len(q)} of {spec.file.name}{told}", stated)
+
+
+def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> None:
+    lower, upper = joint_limits(cell, chain)
+    excess = np.maximum(lower - q, q - upper)
+    for i in np.flatnonzero((excess > 0).any(axis=1)):
+        problem = beyond_limits(cell, chain, q[i])
+        if problem is not None:
+            header = path.columns("q")[int(np.argmax(excess[i] > 0))]
+            raise InputError(
+                f"{path.raw.where(int(i), header)}: {problem}; correct the path or the limits"
+            )
+
+
+def _in_box(
+    cell: Cell, chain: Chain, box: TargetBox, point: Array, rules: Rules | None, seed: int
+) -> _Group:
+    stated = box.point is not None
+    point = point if box.point is None else box.point
+    position = box.lower + (box.upper - box.lower) * _sobol(3, box.count, seed)
+    each = (box.count, 3)
+    force = None if box.force is None else np.broadcast_to(box.force, each)
+    rotation = None if box.rotation is None else np.broadcast_to(box.rotation, (*each, 3))
+    places = Places(position, rotation, point, force)
+    found = reach(cell, chain, places, seed)
+    for t in found.out_of_reach[:1]:
+        x, y, z = position[t]
+        raise InputError(
+            f"{cell.path or cell.name}: [design.test_box]: the place [{x:.3f}, {y:.3f}, {z:.3f}] m "
+            f"in it is out of reach, {how_near(found, t)} ({len(found.out_of_reach)} of "
+            f"{box.count} places); make the box smaller, "
+            f"{'leave out rpy_deg, ' if box.rotation is not None else ''}{remedy(cell)}"
+        )
+    q, told = preferred(cell, chain, places, found, rules, seed)
+    return _Group(q, force, np.ones(len(q)), point, f"{len(q)} in [design.test_box]{told}", stated)
+
+
+def _drawn(cell: Cell, chain: Chain, point: Array, rules: Rules | None, seed: int) -> _Group:
+    low, high = finite_ranges(chain, *joint_limits(cell, chain))
+    count = DEFAULT_COUNT if rules is None else DRAWN
+    q = low + (high - low) * _sobol(chain.n_joints, count, seed)
+    for name, levels in cell.model.compliance_levels.items():
+        # Elsewhere the model has no compliance for that joint.
+        q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, count)
+    if rules is not None:
+        loads = working_loads(cell)
+        ok = np.logical_and.reduce(
+            [rules.check(q, np.broadcast_to(f, (count, 3))).ok for f in loads]
+        )
+        q = q[ok][:DEFAULT_COUNT]
+        if not len(q):
+            raise InsufficientDataError(
+                f"{cell.path or cell.name}: the cell states no test poses, and its rules allow "
+                f"none of {count} postures drawn over the joint limits; state "
+                "[[design.test_pose]], or relax the rules of [workspace]"
+            )
+    told = f"{len(q)} drawn over the joint limits (the cell states none)"
+    return _Group(q, None, np.ones(len(q)), point, told, False)
+
+
+def _sobol(dimension: int, count: int, seed: int) -> Array:
+    """`count` scrambled Sobol points (count, dimension) in the unit cube."""
+    sampler = qmc.Sobol(dimension, scramble=True, seed=seed)
+    return np.asarray(sampler.random_base2(int(np.ceil(np.log2(count))))[:count])
+
+
+# Where position must be right: A_t, how the parameters move the tool at the test poses.
+
+# Share of a test point's motion that may lie outside what the poses show: rounding, not physics.
+OUTSIDE = 1e-6
+
+
+def prediction_rows(information: PoseInformation, targets: TargetPoses, x: Array) -> Array:
+    """A (T, r, parameters): ∂(position at the test pose)/∂X in m per unit, at arm values x.
+
+    The position is that under load in the data's frame; base and markers move it too, so that it
+    does not depend on how the arm's frames are chosen.  It is that of the test point.  Where the
+    markers' own places are fitted and no point was stated, it is that of the M markers, each
+    divided by √M, as only they can be known: the sum of squares is then their mean.
+    """
+    model = information.model
+    fitted = any(p.effect == MarkerPosition.name for p in model.parameters)
+    by_marker = ~targets.stated & fitted
+    markers = tuple(model.cell.tool.markers)
+    M = len(markers) if by_marker.any() else 1
+    A = np.zeros((len(targets.q), M, 3, len(model.parameters)))
+    if by_marker.any():
+        own = replace(model.cell.model, observe="position")
+        arm = Model.assembled(model.chain, replace(model.cell, model=own))
+        which = np.flatnonzero(by_marker)
+        code = np.tile(np.arange(M), len(which))
+        table = _table(targets, np.repeat(which, M), code, markers)
+        A[which] = arm.regressor(table, x).B.reshape(len(which), M, 3, -1) / np.sqrt(M)
+    if not by_marker.all():
+        which = np.flatnonzero(~by_marker)
+        points, code = np.unique(targets.point[which], axis=0, return_inverse=True)
+        names = tuple(f"test point {k + 1}" for k in range(len(points)))
+        arm = _with_points(model, dict(zip(names, points, strict=True)))
+        table = _table(targets, which, code.ravel(), names)
+        A[which, 0] = arm.regressor(table, x).B.reshape(len(which), 3, -1)
+    return A.reshape(len(A), 3 * M, -1)
+
+
+def _table(
+    targets: TargetPoses, pose: IntArray, marker: IntArray, names: tuple[str, ...]
+) -> Measurements:
+    """The test poses `pose` (R,) as rows with these markers."""
+    n = len(pose)
+    return Measurements(
+        source="test poses",
+        row=pose + 1,
+        q=targets.q[pose],
+        configuration=pose,
+        configuration_labels=tuple(map(str, range(1, len(targets.q) + 1))),
+        repeat=np.zeros(n, dtype=np.int64),
+        marker=marker,
+        marker_names=names,
+        force=targets.force[pose],
+        position=np.zeros((n, 3)),
+    )
+
+
+def _with_points(model: Model, points: dict[str, Array]) -> Model:
+    """The same arm with the test points as markers whose place on the flange is known."""
+    cell = model.cell
+    effects = tuple(
+        EffectChoice(choice.name, place)
+        for choice in cell.model.effects
+        for place in _places(choice, model)
+    )
+    spec = replace(cell.model, effects=effects, observe="position")
+    tool = replace(cell.tool, markers=cell.tool.markers | points)
+    return Model.assembled(model.chain, replace(cell, model=spec, tool=tool))
+
+
+def _places(choice: EffectChoice, model: Model) -> tuple[str, ...]:
+    """Where the effect acts on the model as it is, without the test points."""
+    if choice.where is not None:
+        return (choice.where,)
+    return CATALOGUE[choice.name].places(model.chain, model.cell)
+
+
+def on_kept(model: Model, A: Array, found: Estimable) -> Array:
+    """A (S, T, r, kept) on the kept parameters, scaled by their sizes, under S scenarios.
+
+    A test point is predictable where its motion by the dropped parameters is that by the kept
+    ones they combine with: A_D = A_K · mixing.  Raises InsufficientDataError that names the
+    parameter where it is not: no number of poses would make that position certain.
+    """
+    lost = unpredictable(A[0], found)  # the mixing is that of the first scenario
+    if lost is not None:
+        pose, index = lost
+        raise InsufficientDataError(
+            f"{model.cell.path or model.cell.name}: the position at test pose {pose + 1} depends "
+            f"on {model.names[index]}; {why(model, found, index)}; or ask for parameters instead "
+            'of test poses (criterion = "D")'
+        )
+    kept = found.reduction.kept
+    return np.asarray(A[..., kept] * found.sizes[kept])
+
+
+def unpredictable(A: Array, found: Estimable) -> tuple[int, int] | None:
+    """A row of A (T, r, parameters) and a parameter by which no plan can predict it, if any."""
+    r, sizes = found.structure, found.sizes
+    off = np.abs(_unexplained(A, r, sizes)).max(axis=1)
+    if off.max(initial=0.0) <= OUTSIDE * float(np.abs(A * sizes).max()):
+        return None
+    dropped = int(off.max(axis=0).argmax())
+    return int(off[:, dropped].argmax()), int(r.dropped[dropped])
+
+
+def remaining_bias(A: Array, weight: Array, found: Estimable) -> float:
+    """Rms in m of what typical deviations of held parameters move the test points by.
+
+    A (T, r, parameters), `weight` (T,): held are those that the poses show below their noise.
+    """
+    off = _unexplained(A, found.reduction, found.sizes)
+    return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
+
+
+def _unexplained(A: Array, r: Reduction, sizes: Array) -> Array:
+    """(T, r, dropped): A_D − A_K · mixing, times the sizes."""
+    return np.asarray((A[..., r.dropped] - A[..., r.kept] @ r.mixing) * sizes[r.dropped])

@@ -1,0 +1,111 @@
+"""Errors of the transmission that follow the joint's angle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model.effects.stick import model, positions, rows, stick
+from support.cells import kr270_cell, kr270_chain, random_table
+from support.robots import random_chain_urdf
+
+from elastocal.cell.arm_description import Nominal
+from elastocal.errors import InputError
+from elastocal.model import Model, read_urdf
+from elastocal.model.effects import CATALOGUE
+
+Q = np.radians([-170.0, -90.0, -20.0, 0.0, 35.0, 90.0, 160.0])
+
+
+def turned(effect: str, q: np.ndarray, **values: float) -> np.ndarray:
+    """How far a joint about z has run ahead of its command, by the direction of its link."""
+    settings = {"joint1": {"ripple_order": 88.5}} if "ripple" in effect else None
+    x, y, _ = positions(model(stick("z"), effect, settings=settings), rows(q), **values).T
+    return np.arctan2(np.sin(np.arctan2(y, x) - q), np.cos(np.arctan2(y, x) - q))
+
+
+@pytest.mark.parametrize(
+    "effect, prefix, order",
+    [
+        ("gear_eccentricity", "eccentricity", 1.0),
+        ("gear_second_harmonic", "harmonic2", 2.0),
+        ("gear_ripple", "ripple", 88.5),
+    ],
+)
+def test_a_harmonic_repeats_its_order_times_per_turn(
+    effect: str, prefix: str, order: float
+) -> None:
+    found = turned(effect, Q, **{f"{prefix}_sin": 3e-4, f"{prefix}_cos": -4e-4})
+    np.testing.assert_allclose(
+        found, 3e-4 * np.sin(order * Q) - 4e-4 * np.cos(order * Q), atol=1e-15
+    )
+    ahead = turned(effect, Q + 2 * np.pi / order, **{f"{prefix}_sin": 3e-4, f"{prefix}_cos": -4e-4})
+    np.testing.assert_allclose(ahead, found, atol=1e-15)
+    # Half a period on it lags by what it led.
+    behind = turned(effect, Q + np.pi / order, **{f"{prefix}_sin": 3e-4, f"{prefix}_cos": -4e-4})
+    np.testing.assert_allclose(behind, -found, atol=1e-15)
+
+
+def test_a_scale_error_grows_with_the_command() -> None:
+    np.testing.assert_allclose(turned("encoder_scale", Q, encoder_scale=1e-3), 1e-3 * Q, atol=1e-15)
+
+
+@pytest.mark.parametrize("orders, second", [((40.0,), 40.0), ((10.0, 20.0), 20.0)])
+def test_ripple_orders_are_one_for_all_or_one_each(
+    orders: tuple[float, ...], second: float
+) -> None:
+    m = model(stick("zz", (1.0, 1.0)), "gear_ripple:joint2", gear_ripple_orders=orders)
+    q = np.column_stack([np.zeros_like(Q), Q])
+    y = positions(m, rows(q), ripple_sin=1e-3)[:, 1]
+    expected = np.sin(Q + 1e-3 * np.sin(second * Q))
+    np.testing.assert_allclose(y, expected, atol=1e-14)
+
+
+def test_another_number_of_ripple_orders_is_refused() -> None:
+    with pytest.raises(InputError, match=r"gear_ripple_orders has 3 values.*has 2 joints"):
+        model(stick("zz", (1.0, 1.0)), "gear_ripple", gear_ripple_orders=(1.0, 2.0, 3.0))
+
+
+def test_an_order_of_a_place_wins_over_the_list() -> None:
+    m = model(
+        stick("z"),
+        "gear_ripple",
+        gear_ripple_orders=(40.0,),
+        nominal=Nominal(settings={"joint1": {"ripple_order": 3.0}}),
+    )
+    y = positions(m, rows([np.pi / 6]), ripple_sin=1e-3)[0, 1]
+    np.testing.assert_allclose(y, np.sin(np.pi / 6 + 1e-3), atol=1e-15)
+
+
+def test_a_coupled_wrist_moves_as_if_commanded_so() -> None:
+    chain = kr270_chain()
+    m = Model.assembled(chain, kr270_cell(["wrist_coupling"]))
+    table = random_table(chain, 6, seed=1)
+    a, b, c = 3e-3, -2e-3, 5e-3
+    q = table.q.copy()
+    q[:, 4] += a * table.q[:, 3]
+    q[:, 5] += b * table.q[:, 3] + c * table.q[:, 4]
+    expected = Model.assembled(chain, kr270_cell()).predict(replace(table, q=q))
+    np.testing.assert_allclose(m.predict(table, np.array([a, b, c])), expected, atol=1e-14)
+
+
+def test_only_arms_with_a_turning_wrist_have_one() -> None:
+    cell, coupling = kr270_cell(), CATALOGUE["wrist_coupling"]
+    assert coupling.places(kr270_chain(), cell) == ("wrist",)
+    assert coupling.places(stick("zyyzy", (1.0,) * 5), cell) == ()
+    last = kr270_chain().joints[-1]
+    sliding = replace(
+        kr270_chain(), joints=(*kr270_chain().joints[:-1], replace(last, kind="prismatic"))
+    )
+    assert coupling.places(sliding, cell) == ()
+
+
+def test_gears_are_at_turning_joints_only(tmp_path) -> None:
+    path = tmp_path / "chain.urdf"
+    path.write_text(random_chain_urdf(4, n_joints=5))
+    chain = read_urdf(path, base="base", flange="flange")
+    turning = tuple(f"joint{i + 1}" for i, kind in enumerate(chain.kinds) if kind == "revolute")
+    assert 0 < len(turning) < 5
+    for name in ("gear_eccentricity", "gear_ripple", "backlash", "hysteresis", "joint_hardening"):
+        assert CATALOGUE[name].places(chain, kr270_cell()) == turning

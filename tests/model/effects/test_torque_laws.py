@@ -1,0 +1,159 @@
+"""Backlash, hysteresis and hardening: deflections that follow the load's torque."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from model.effects.stick import model, positions, rows, stick
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
+
+from elastocal.cell.arm_description import Nominal
+from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.compliances import rated_torque, torque_scale, weight_torque
+
+FORCE = 500.0  # N, downwards at the end of 1 m: far above the 1 N m of a massless stick's scale
+DOWN = (0.0, 0.0, -FORCE)
+BETA = 1e-3
+
+
+def test_play_lets_the_arm_sink_on_either_side() -> None:
+    """Reaching forward the torque is positive, backward it is negative: the tip sinks both ways."""
+    m = model(stick("y"), "backlash")
+    tip = positions(m, rows([0.0, np.pi], DOWN), backlash=BETA)
+    np.testing.assert_allclose(tip[:, 0], [np.cos(BETA / 2), -np.cos(BETA / 2)], atol=1e-15)
+    np.testing.assert_allclose(tip[:, 2], -np.sin(BETA / 2), atol=1e-15)
+
+
+def test_play_turns_over_with_the_weights_side_of_the_joint() -> None:
+    m = model(stick("y", mass=100.0), "backlash", link_gravity=True)
+    z = positions(m, rows([0.0, np.pi]), backlash=BETA)[:, 2]
+    np.testing.assert_allclose(z, -np.sin(BETA / 2), atol=1e-12)
+
+
+def test_a_balanced_joint_floats_in_its_play() -> None:
+    m = model(stick("y"), "backlash")
+    hanging = np.pi / 2  # straight down, no torque
+    tip = positions(m, rows([hanging], DOWN), backlash=BETA)
+    np.testing.assert_allclose(tip, [[0.0, 0.0, -1.0]], atol=1e-15)
+
+
+def test_an_unloaded_joint_shows_no_play() -> None:
+    m = model(stick("y"), "backlash")
+    np.testing.assert_array_equal(
+        positions(m, rows([0.3]), backlash=BETA), positions(m, rows([0.3]))
+    )
+
+
+def test_a_joint_stops_short_of_or_beyond_its_target_by_its_approach() -> None:
+    m = model(stick("y"), "hysteresis")
+    table = rows([0.0, 0.0], approach=[[1.0], [-1.0]])
+    z = positions(m, table, hysteresis=2e-4)[:, 2]
+    np.testing.assert_allclose(z, [-np.sin(2e-4), np.sin(2e-4)], atol=1e-17)
+
+
+def test_hysteresis_grows_with_the_load_whatever_its_sign() -> None:
+    """By g |τ| far above the torque scale, and not at all without load."""
+    m = model(stick("y"), "hysteresis")
+    up = (0.0, 0.0, FORCE)
+    for approach in (1.0, -1.0):
+        angle = [
+            -np.arcsin(positions(m, rows([0.0], f, approach=[[approach]]),
+                                 hysteresis=2e-4, hysteresis_per_torque=1e-6)[0, 2])
+            for f in ((0.0, 0.0, 0.0), DOWN, up)
+        ]  # fmt: skip
+        expected = approach * (2e-4 + 1e-6 * np.array([0.0, FORCE, FORCE]))
+        np.testing.assert_allclose(angle, expected, rtol=0, atol=1.01e-6)
+        assert angle[1] == pytest.approx(angle[2], rel=1e-9)
+
+
+def test_hardening_solves_the_cubic_law_at_the_deflected_lever() -> None:
+    m = model(stick("y"), "joint_hardening")
+    k3 = 1e-10
+    theta = brentq(lambda t: t - k3 * (FORCE * np.cos(t)) ** 3, 0.0, 0.1, xtol=1e-15)
+    z = positions(m, rows([0.0], DOWN), hardening=k3)[0, 2]
+    assert theta > 0.01
+    np.testing.assert_allclose(z, -np.sin(theta), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "effect, key, value, law",
+    [
+        ("joint_hardening", "hardening", 1e-10, lambda t: 1e-10 * t**3),
+        ("backlash", "backlash", BETA, lambda t: BETA / 2 * np.tanh(t)),
+        ("hysteresis", "hysteresis_per_torque", 1e-6, lambda t: 1e-6 * (np.hypot(t, 1) - 1)),
+    ],
+)
+def test_measured_torques_drive_the_same_laws(effect, key, value, law) -> None:
+    """Explicitly, with the scale of 1 N m of an arm of which nothing else is known."""
+    m = model(stick("z"), effect, torque="measured")
+    torque = np.array([-300.0, -0.5, 0.0, 2.0, 200.0])
+    table = rows(np.zeros(5), torque=torque[:, None], approach=np.ones((5, 1)))
+    assert m.deflection(table).shape[1] == 0
+    y = positions(m, table, **{key: value})[:, 1]
+    np.testing.assert_allclose(y, np.sin(law(torque)), atol=1e-16)
+
+
+def test_the_weights_torque_is_a_bound_that_a_horizontal_stick_attains() -> None:
+    chain = stick("yy", (2.0, 1.0), mass=10.0)
+    g = 9.80665
+    assert weight_torque(chain, 0) == pytest.approx(10 * g * (1.0 + 2.5))
+    assert weight_torque(chain, 1) == pytest.approx(10 * g * 0.5)
+    assert weight_torque(stick("x", mass=10.0), 0) == 0  # all of the mass on the axis
+    assert weight_torque(stick("y"), 0) == 0
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_no_pose_and_no_mounting_exceeds_the_weights_torque(seed: int) -> None:
+    chain = kr270_chain()
+    k = 1e-12  # rigid enough to read the torque of the nominal pose from the deflection
+    nominal = Nominal((k,) * 6, base_rotation=Rotation.random(rng=seed).as_matrix())
+    m = Model.assembled(chain, kr270_cell(["joint_compliance"], link_gravity=True, nominal=nominal))
+    table = random_table(chain, 300, seed=seed, force=np.zeros(3), markers=("M1",))
+    largest = np.abs(m.deflection(table) / k).max(axis=0)
+    bounds = np.array([weight_torque(chain, i) for i in range(6)])
+    assert (largest <= bounds * (1 + 1e-6) + 1e-6).all()
+    assert largest[1] > 0.8 * bounds[1]  # and it is no loose one where weights matter most
+
+
+def test_a_rated_torque_comes_from_compliance_weights_or_the_strongest_joint() -> None:
+    chain, cell = kr270_chain(), kr270_cell()
+    assert rated_torque(chain, cell, 5) == pytest.approx(3e-3 / COMPLIANCE[5])
+    unknown = kr270_cell(nominal=Nominal())
+    assert rated_torque(chain, unknown, 1) == weight_torque(chain, 1)
+    # A wrist carries payloads, not its own few kilograms.
+    assert rated_torque(chain, unknown, 5) == pytest.approx(weight_torque(chain, 0) / 8)
+    bare = stick("y")
+    assert rated_torque(bare, unknown, 0) is None
+    assert torque_scale(bare, unknown, 0) == 1.0
+
+
+def test_typical_hardening_is_a_fifth_of_the_linear_deflection_at_the_rated_torque() -> None:
+    chain, cell = kr270_chain(), kr270_cell()
+    (spec,) = CATALOGUE["joint_hardening"].parameters("joint2", chain, cell)
+    torque = rated_torque(chain, cell, 1)
+    assert spec.typical * torque**3 == pytest.approx(0.2 * COMPLIANCE[1] * torque)
+    (unknown,) = CATALOGUE["joint_hardening"].parameters(
+        "joint2", chain, kr270_cell(nominal=Nominal())
+    )
+    assert unknown.typical is None
+
+
+@pytest.mark.parametrize(
+    "effect, computed, weighed, measured",
+    [
+        ("backlash", ("load",), (), ()),
+        ("joint_compliance", ("load",), (), ()),
+        ("off_axis_compliance", ("load",), (), ("load",)),  # of no torque that a drive measures
+        ("hysteresis", ("approach",), ("approach",), ("approach",)),
+        ("payload_error", ("load",), ("load",), ("load",)),
+    ],
+)
+def test_what_the_table_must_say(effect: str, computed, weighed, measured) -> None:
+    """A load, unless the links' weights are one or the joint's torque is measured."""
+    needed = CATALOGUE[effect].needed
+    assert needed(kr270_cell()) == computed
+    assert needed(kr270_cell(link_gravity=True)) == weighed
+    assert needed(kr270_cell(torque="measured")) == measured

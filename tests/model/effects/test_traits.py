@@ -1,0 +1,117 @@
+"""What effects say of themselves, and what is assumed of one that says nothing."""
+
+from __future__ import annotations
+
+import pytest
+from support.cells import kr270_cell, kr270_chain
+from support.registered import forgotten
+
+from elastocal.errors import InputError
+from elastocal.model import effect_of, register
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.base import Effect, Symbols
+from elastocal.model.effects.driven import JointMotion
+
+COMPLIANCES = {"joint_compliance", "off_axis_compliance", "link_bending", "base_compliance"}
+
+
+class Stranger(JointMotion):
+    """Nothing but what every effect must state."""
+
+    name = "stranger"
+
+
+def having(trait: str) -> set[str]:
+    return {name for name, effect in CATALOGUE.items() if getattr(effect, trait)}
+
+
+def test_traits_of_the_catalogue() -> None:
+    assert having("registered") == {
+        "base_frame", "marker_position", "marker_orientation", "distance_sensor",
+    }  # fmt: skip
+    assert having("elastic") == COMPLIANCES
+    assert having("sized_by_value") == COMPLIANCES - {"link_bending"}
+    assert having("of_the_measurement") == {
+        "base_drift", "frame_jump", "distance_sensor", "tracker_distortion", "marker_slip",
+    }  # fmt: skip
+    assert having("remedy") == {
+        "base_drift", "frame_jump", "tracker_distortion", "link_mass_error",
+        "gravity_compensator", "payload_error",
+    }  # fmt: skip
+    ranks = [{n for n, e in CATALOGUE.items() if e.rank == k} for k in (0, 1, 2, 3, 5)]
+    assert ranks == [
+        (COMPLIANCES - {"link_bending"}) | {"gravity_compensator"},
+        {"base_frame", "distance_sensor"},
+        {"marker_position", "marker_orientation"},
+        {"joint_offset"},
+        {"link_geometry"},
+    ]
+
+
+@pytest.mark.parametrize("observe", ["position", "pose", "distance"])
+def test_what_a_diagnosis_may_suspect_and_what_acts_unasked(observe: str) -> None:
+    cell = kr270_cell((), observe, link_gravity=True)
+    never = {n for n, e in CATALOGUE.items() if not e.may_be_missing(cell)}
+    only = {"marker_orientation": "pose", "distance_sensor": "distance"}
+    assert never == {"payload", "link_gravity"} | {n for n, o in only.items() if o != observe}
+    assert {n for n, e in CATALOGUE.items() if e.acts_unasked(cell)} == {"payload", "link_gravity"}
+    light = kr270_cell((), observe)
+    assert {n for n, e in CATALOGUE.items() if e.acts_unasked(light)} == {"payload"}
+
+
+def test_a_stranger_is_an_ordinary_error_of_the_arm_that_no_file_holds() -> None:
+    for effect in (Stranger(), effect_of("not in the catalogue")):
+        assert not (effect.registered or effect.elastic or effect.sized_by_value or effect.remedy)
+        assert effect.formats == () and effect.rank == CATALOGUE["link_bending"].rank
+        assert effect.may_be_missing(kr270_cell(())) and not effect.acts_unasked(kr270_cell(()))
+    assert not Stranger().of_the_measurement
+    assert Stranger().unphysical({}, kr270_chain(), kr270_cell(())) == ""
+
+
+def test_registering_keeps_the_order_of_the_others_and_the_dictionary_itself() -> None:
+    before, catalogue = list(CATALOGUE), CATALOGUE
+    with forgotten():
+        register(Stranger())
+        assert [name for name in CATALOGUE if name != "stranger"] == before
+        assert CATALOGUE is catalogue
+    assert list(CATALOGUE) == before
+
+
+def test_a_name_is_taken_once_but_by_the_same_class() -> None:
+    class Other(JointMotion):
+        name = "stranger"
+
+    with forgotten():
+        register(Stranger())
+        again = Stranger()
+        register(again)
+        assert CATALOGUE["stranger"] is again
+        with pytest.raises(InputError, match="there is an effect 'stranger' already"):
+            register(Other())
+
+
+class Unplaced(Effect):
+    name = "unplaced"
+    stage = "tool"
+
+    def read(self, arm: object, place: str, p: Symbols) -> None:  # type: ignore[override]
+        pass
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"name": "Big"}, "name takes lower-case letters"),
+        ({"stage": "gears"}, "stage takes transmission, geometry"),
+        ({"formats": ("urdf",)}, "formats takes rigid, elastic"),
+        ({"needs": ("wind",)}, "needs takes time, approach, temperature, load; found 'wind'"),
+    ],
+)
+def test_what_is_stated_wrongly_is_named(changes: dict[str, object], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        register(type("Wrong", (Stranger,), changes)())
+
+
+def test_an_effect_without_places_is_refused() -> None:
+    with pytest.raises(InputError, match=r"Unplaced lacks places; it states where it can act"):
+        register(Unplaced())

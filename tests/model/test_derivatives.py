@@ -1,0 +1,253 @@
+"""B is the derivative of the prediction: every effect, every observation, both deflection models.
+
+The reference knows nothing of CasADi's derivatives: it evaluates `Model.predict` at disturbed
+parameter values.  Position, deflection and distance are analytic, so a complex step gives their
+derivatives to rounding; a pose passes through atan2, which numpy has for real numbers only, and
+is differenced (central, fourth order).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.cells import COMPENSATOR, COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_table
+from support.robots import random_chain_urdf
+
+from elastocal.cell.arm_description import Nominal
+from elastocal.measurements import Measurements
+from elastocal.model import Model, observe, read_urdf
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.observations import COMPONENTS
+
+TOLERANCE = 1e-7  # relative to the largest entry of the column
+EPS = float(np.finfo(float).eps)
+# What changes once does so in the middle of `random_table`'s two hours.
+CHANGES = {
+    **{f"joint{i}": {"jump_time_s": 3000.0} for i in range(1, 7)},
+    "tracker": {"jump_time_s": 4000.0},
+    **{f"marker:{name}": {"slip_time_s": 3500.0} for name in MARKERS},
+}
+SPRING = Nominal(COMPLIANCE, gravity_compensator=COMPENSATOR, settings=CHANGES)
+OBSERVED = tuple(COMPONENTS)
+
+
+def full_cell(effects: Sequence[str], observe: str = "position", **model):
+    model = {"nominal": SPRING, "link_gravity": True, "gear_ripple_orders": (8.0,)} | model
+    return kr270_cell(effects, observe, **model)
+
+
+def with_parameters(observed: str = "position") -> list[str]:
+    """The effects of the catalogue that have parameters where this is observed."""
+    chain, cell = kr270_chain(), full_cell((), observed)
+    return [
+        name
+        for name, effect in CATALOGUE.items()
+        if any(effect.parameters(place, chain, cell) for place in effect.places(chain, cell))
+    ]
+
+
+def second(name: str) -> str:
+    """An effect at joint (link, marker) 2 only, at all its places where it has no such one."""
+    places = CATALOGUE[name].places(kr270_chain(), full_cell(()))
+    return next((f"{name}:{place}" for place in places if place[-1] == "2"), name)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model with its table, parameter values off their nominal ones, and B there."""
+
+    model: Model
+    table: Measurements
+    x: NDArray
+    sizes: NDArray
+    B: NDArray
+    prediction: NDArray
+
+    def columns(self, effect: str) -> list[int]:
+        return [k for k, p in enumerate(self.model.parameters) if p.effect == effect]
+
+
+def case(model: Model, table: Measurements, disturbed: bool = True) -> Case:
+    sizes = model.sizes(model.regressor(table).B)
+    x = model.nominal
+    if disturbed:
+        rng = np.random.default_rng(7)
+        step = 0.3 * sizes * rng.uniform(0.5, 1.0, len(x)) * rng.choice([-1.0, 1.0], len(x))
+        lower = np.array([p.lower for p in model.parameters])
+        x = np.where(x + step < lower, x - step, x + step)
+    regression = model.regressor(table, x)
+    return Case(model, table, x, sizes, regression.B, regression.prediction)
+
+
+@lru_cache
+def everything(observed: str, deflection_model: str, disturbed: bool = True) -> Case:
+    """All effects together, so that each acts on the others' derivatives."""
+    effects = [second(name) for name in with_parameters(observed)]
+    effects += [f"joint_compliance:joint{i}" for i in (1, 3, 4, 5, 6)]
+    cell = full_cell(effects, observed, deflection_model=deflection_model)
+    return case(
+        Model.assembled(kr270_chain(), cell), random_table(kr270_chain(), 4, seed=3), disturbed
+    )
+
+
+def complex_step(c: Case, k: int) -> NDArray:
+    """∂prediction/∂x_k to rounding: Im h(x + i s) / s."""
+    step = 1e-20 * c.sizes[k]
+    x = c.x.astype(complex)
+    x[k] += 1j * step
+    return c.model.predict(c.table, x).imag / step
+
+
+def central_difference(c: Case, k: int) -> NDArray:
+    """∂prediction/∂x_k, fourth order."""
+    step = difference_step(c, k)
+    slope = np.zeros(len(c.prediction))
+    for weight, n in ((8.0, 1), (-1.0, 2)):
+        for sign in (1.0, -1.0):
+            x = c.x.copy()
+            x[k] += sign * n * step
+            slope += sign * weight * c.model.predict(c.table, x) / (12.0 * step)
+    return slope
+
+
+def difference_step(c: Case, k: int) -> float:
+    # Small against the torque over which backlash changes its side.
+    return 1e-3 * c.sizes[k]
+
+
+def largest_excess(c: Case, columns: Sequence[int]) -> float:
+    """Largest |B − derivative| as a multiple of what is allowed in its column."""
+    positions = c.B
+    if c.model.observe == "deflection":
+        # A difference of two positions: its rounding is that of the positions' derivatives.
+        every_row = observe(c.table, "position")
+        positions = c.model.regressor(c.table, c.x, observations=every_row).B
+    worst = 0.0
+    for k in columns:
+        if c.model.observe == "pose":
+            derivative = central_difference(c, k)
+            floor = 10 * EPS * np.abs(c.prediction).max() / difference_step(c, k)
+        else:
+            derivative = complex_step(c, k)
+            floor = 100 * EPS * np.abs(positions[:, k]).max()
+        error = np.abs(c.B[:, k] - derivative).max()
+        if error > 0:
+            allowed = TOLERANCE * np.abs(derivative).max() + floor
+            worst = max(worst, error / allowed)
+    return worst
+
+
+@pytest.mark.parametrize("deflection_model", ["equilibrium", "linear"])
+@pytest.mark.parametrize(
+    "effect, observed", [(effect, o) for o in OBSERVED for effect in with_parameters(o)]
+)
+def test_of_every_effect_at_every_observation(
+    effect: str, observed: str, deflection_model: str
+) -> None:
+    c = everything(observed, deflection_model)
+    assert c.columns(effect)
+    assert largest_excess(c, c.columns(effect)) <= 1
+
+
+@pytest.mark.parametrize("effect", with_parameters())
+def test_every_parameter_moves_some_observation(effect: str) -> None:
+    """Else the comparison above would compare zeros."""
+    cases = [everything(observed, "equilibrium") for observed in OBSERVED]
+    for k in cases[0].columns(effect):
+        assert any(np.abs(c.B[:, k]).max() * c.sizes[k] > 1e-9 for c in cases)
+
+
+@pytest.mark.parametrize(
+    "observed, deflection_model", [("position", "equilibrium"), ("pose", "linear")]
+)
+def test_at_the_nominal_values(observed: str, deflection_model: str) -> None:
+    """Where rotation vectors are exactly zero and off-axis joints are rigid."""
+    c = everything(observed, deflection_model, disturbed=False)
+    assert largest_excess(c, range(len(c.x))) <= 1
+
+
+@pytest.mark.parametrize("effect", with_parameters())
+def test_at_all_places(effect: str) -> None:
+    """On an elastic arm."""
+    chain = kr270_chain()
+    cell = full_cell({"joint_compliance", effect})
+    c = case(Model.assembled(chain, cell), random_table(chain, 3, seed=5))
+    assert largest_excess(c, c.columns(effect)) <= 1
+
+
+@pytest.mark.parametrize("observed", OBSERVED)
+def test_of_each_column_alone(observed: str) -> None:
+    """A choice of columns is the same columns of B."""
+    c = everything(observed, "equilibrium")
+    chosen = np.array([len(c.x) - 1, 3, 17])
+    B = c.model.regressor(c.table, c.x, chosen).B
+    np.testing.assert_allclose(B, c.B[:, chosen], rtol=1e-12, atol=1e-15 * np.abs(c.B).max())
+
+
+@pytest.mark.parametrize("observed", OBSERVED)
+def test_with_measured_torques(observed: str) -> None:
+    explicit = ("joint_compliance", "joint_hardening", "backlash", "hysteresis")
+    effects = (*explicit, "joint_offset", "link_geometry:link3", "marker_position")
+    cell = full_cell(effects, observed, torque="measured", link_gravity=False)
+    c = case(Model.assembled(kr270_chain(), cell), random_table(kr270_chain(), 4, seed=6))
+    assert c.model.deflection(c.table).shape[1] == 0  # nothing left to solve for
+    assert largest_excess(c, range(len(c.x))) <= 1
+    if observed == "position":
+        for effect in explicit:
+            assert np.abs(c.B[:, c.columns(effect)]).max(axis=0).min() > 0
+
+
+@pytest.mark.parametrize("deflection_model", ["equilibrium", "linear"])
+@pytest.mark.parametrize("observed", ["position", "deflection"])
+def test_with_a_compliance_per_level(observed: str, deflection_model: str) -> None:
+    """k2 split as in Table 2: each level's column is that of k2 in its own rows, else zero."""
+    levels = tuple(np.radians([-0.01, -25.24, -56.9]))
+    cell = full_cell(
+        ("joint_compliance", "joint_offset", "gravity_compensator"),
+        observed,
+        deflection_model=deflection_model,
+        compliance_levels={"joint2": levels},
+    )
+    table = random_table(kr270_chain(), 6, seed=8)
+    level = table.configuration % 3
+    q = table.q.copy()
+    q[:, 1] = np.array(levels)[level]
+    table = replace(table, q=q)
+    c = case(Model.assembled(kr270_chain(), cell), table)
+    assert largest_excess(c, range(len(c.x))) <= 1
+    split = [c.model.names.index(f"joint2.compliance_level{n + 1}") for n in range(3)]
+    lead = observe(table, observed).lead
+    moved = np.abs(c.B[:, split]).reshape(len(lead), 3, 3).max(axis=1) > 0
+    np.testing.assert_array_equal(moved, level[lead][:, None] == np.arange(3))
+
+
+@pytest.mark.parametrize("deflection_model", ["equilibrium", "linear"])
+@pytest.mark.parametrize("observed", OBSERVED)
+@pytest.mark.parametrize("seed", [1, 4])
+def test_of_chains_with_sliding_joints(
+    seed: int, observed: str, deflection_model: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "chain.urdf"
+    path.write_text(random_chain_urdf(seed, n_joints=5))
+    chain = read_urdf(path, base="base", flange="flange")
+    assert set(chain.kinds) == {"prismatic", "revolute"}
+    turning = f"joint{chain.kinds.index('revolute') + 1}"
+    nominal = Nominal(
+        joint_compliance=(1e-6,) * chain.n_joints,
+        gravity_compensator=COMPENSATOR | {"joint": turning},
+    )
+    effects = ("base_frame", "joint_offset", "encoder_scale", "gear_eccentricity", "joint_drift",
+               "link_geometry:link3", "thermal_expansion:all", "joint_compliance",
+               f"backlash:{turning}", "gravity_compensator", "link_mass_error:link3",
+               "marker_position")  # fmt: skip
+    cell = full_cell(effects, observed, nominal=nominal, deflection_model=deflection_model)
+    c = case(
+        Model.assembled(chain, cell), random_table(chain, 3, seed, force=np.array([300, -200, 500]))
+    )
+    assert largest_excess(c, range(len(c.x))) <= 1

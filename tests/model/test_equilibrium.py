@@ -1,0 +1,390 @@
+"""The loaded arm at rest: torque balance, energy, MuJoCo's arm, and where eq. (3) stops holding.
+
+References: pinocchio on the URDF for load and weight torques and energies, MuJoCo's springs for
+whole deflected arms, numpy for the gravity compensator's formulas.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+from support.cells import (
+    COMPENSATOR,
+    COMPLIANCE,
+    DOWN,
+    LOAD_POINT,
+    MARKERS,
+    SLANTED,
+    TABLE_2,
+    kr270_cell,
+    kr270_chain,
+    random_poses,
+    table_of,
+)
+from support.robots import KR270
+
+from elastocal.cell.arm_description import Nominal
+from elastocal.errors import ElastocalError
+from elastocal.model import Chain, Joint, LinkMass, Model, equilibrium
+from elastocal.model.effects.compliances import transverse_axes
+from elastocal.simulation import MujocoArm
+from elastocal.units import Array
+
+K = np.array(COMPLIANCE)
+GRAVITY = np.array([0.0, 0.0, -9.80665])
+SPRING = Nominal(joint_compliance=COMPLIANCE, gravity_compensator=COMPENSATOR)
+
+
+def kr270(*effects: str, **model) -> Model:
+    return Model.assembled(kr270_chain(), kr270_cell(effects or ("joint_compliance",), **model))
+
+
+def positions(model: Model, poses: Array, force: Array) -> Array:
+    """Marker positions (poses, markers, 3) in m."""
+    return model.predict(table_of(poses, force)).reshape(len(poses), -1, 3)
+
+
+def kr270_poses(count: int) -> Array:
+    return np.vstack([TABLE_2, random_poses(kr270_chain(), count, seed=11)])
+
+
+class Pinocchio:
+    """Torques and energy of weights and load on the URDF's own bodies, base as given."""
+
+    def __init__(self, gravity: Array, R_tracker_base: Array | None = None) -> None:
+        self.model = pin.buildModelFromUrdf(str(KR270))
+        flange = self.model.getFrameId("flange", pin.FrameType.BODY)
+        parent = self.model.frames[flange].parentJoint
+        placement = self.model.frames[flange].placement * pin.SE3(np.eye(3), LOAD_POINT)
+        frame = pin.Frame("load", parent, flange, placement, pin.FrameType.OP_FRAME)
+        self.load = self.model.addFrame(frame)
+        self.data = self.model.createData()
+        self.R = np.eye(3) if R_tracker_base is None else R_tracker_base
+        self.model.gravity.linear = self.R.T @ gravity
+
+    def torques(self, q: Array, force: Array) -> Array:
+        """Jᵀ f minus the weights' torques, (6,) N m, at joint values q."""
+        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        J = pin.computeFrameJacobian(self.model, self.data, q, self.load, axes)
+        weights = pin.computeGeneralizedGravity(self.model, self.data, q)
+        return J[:3].T @ (self.R.T @ force) - weights
+
+    def energy(self, q: Array, force: Array) -> float:
+        """Potential energy of weights and load in J."""
+        pin.framesForwardKinematics(self.model, self.data, q)
+        point = self.data.oMf[self.load].translation
+        weights = pin.computePotentialEnergy(self.model, self.data, q)
+        return float(weights - (self.R.T @ force) @ point)
+
+
+class Compensator:
+    """FACTS' formulas of the gravity compensator, in their own words."""
+
+    def __init__(self) -> None:
+        ax, ay = COMPENSATOR["anchor_m"]
+        self.Kc, self.L = COMPENSATOR["stiffness_N_per_m"], COMPENSATOR["arm_m"]
+        self.s0 = COMPENSATOR["free_length_m"]
+        self.a, self.alpha = float(np.hypot(ax, ay)), float(np.arctan2(ay, ax))
+
+    def length(self, q2: float) -> float:
+        a, L = self.a, self.L
+        return float(np.sqrt(a**2 + L**2 + 2 * a * L * np.cos(self.alpha - q2)))
+
+    def torque(self, q2: float) -> float:
+        stretched = 1 - self.s0 / self.length(q2)
+        return float(-self.Kc * stretched * self.a * self.L * np.sin(self.alpha - q2))
+
+    def stiffness(self, q2: float) -> float:
+        """K2(q2) − K2⁰."""
+        s, aL, phi = self.length(q2), self.a * self.L, self.alpha - q2
+        bracket = self.s0 / s * (np.cos(phi) + aL / s**2 * np.sin(phi) ** 2) - np.cos(phi)
+        return float(self.Kc * aL * bracket)
+
+    def energy(self, q2: float) -> float:
+        return float(self.Kc * (self.length(q2) - self.s0) ** 2 / 2)
+
+
+# --- balance -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("force", [DOWN, SLANTED, np.zeros(3)], ids=["down", "slanted", "none"])
+@pytest.mark.parametrize("weights", [False, True], ids=["weightless", "weights"])
+def test_torques_balance_at_the_deflected_pose(weights: bool, force: Array) -> None:
+    """θ = k τ, τ by pinocchio at q + θ, to 1e-13 rad."""
+    poses = kr270_poses(30)
+    theta = kr270(link_gravity=weights).deflection(table_of(poses, force, ("M1",)))
+    reference = Pinocchio(GRAVITY if weights else np.zeros(3))
+    for q, bent in zip(poses, theta, strict=True):
+        expected = K * reference.torques(q + bent, force)
+        np.testing.assert_allclose(bent, expected, rtol=0, atol=1e-13)
+    assert (np.abs(theta).max() > 1e-4) == (weights or bool(force.any()))
+
+
+def test_weights_and_loads_are_in_the_trackers_frame() -> None:
+    """A tilted base: the tracker's z stays vertical."""
+    R = Rotation.from_rotvec([0.4, -0.7, 1.9]).as_matrix()
+    nominal = Nominal(COMPLIANCE, base_position=np.array([1.0, -2.0, 0.5]), base_rotation=R)
+    poses = kr270_poses(10)
+    reference = Pinocchio(GRAVITY, R)
+    for effects in (("joint_compliance",), ("base_frame", "joint_compliance")):
+        model = kr270(*effects, link_gravity=True, nominal=nominal)
+        theta = model.deflection(table_of(poses, SLANTED, ("M1",)))
+        for q, bent in zip(poses, theta, strict=True):
+            expected = K * reference.torques(q + bent, SLANTED)
+            np.testing.assert_allclose(bent, expected, rtol=0, atol=1e-13)
+
+
+def test_equilibrium_is_a_minimum_of_the_energy() -> None:
+    """E = Σ θ²/2k + weights + load + compensator: no slope at θ, and uphill on both sides."""
+    effects = ("joint_compliance", "gravity_compensator")
+    model = kr270(*effects, link_gravity=True, nominal=SPRING)
+    poses = kr270_poses(5)
+    theta = model.deflection(table_of(poses, SLANTED, ("M1",)))
+    weighed, spring = Pinocchio(GRAVITY), Compensator()
+
+    def energy(q: Array, bent: Array) -> float:
+        at = q + bent
+        loads = weighed.energy(at, SLANTED) + spring.energy(at[1])
+        return float((bent**2 / K).sum() / 2 + loads)
+
+    for q, bent in zip(poses, theta, strict=True):
+        lowest = energy(q, bent)
+        for step in 1e-4 * np.eye(6):
+            ahead, behind = energy(q, bent + step), energy(q, bent - step)
+            assert min(ahead, behind) > lowest
+            # Beside torques of thousands of N m; the next term, E‴ step² / 6, is some 1e-5 N m.
+            assert abs(ahead - behind) / 2e-4 < 2e-4
+
+
+# --- MuJoCo --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("force", [DOWN, SLANTED], ids=["down", "slanted"])
+@pytest.mark.parametrize("weights", [False, True], ids=["weightless", "weights"])
+def test_markers_agree_with_mujoco(weights: bool, force: Array) -> None:
+    """2.6 kN at the load point, Table 2 and 25 random poses: the same arm within 1 µm."""
+    pytest.importorskip("mujoco")
+    poses = kr270_poses(25)
+    gravity = GRAVITY if weights else None
+    arm = MujocoArm(kr270_chain(), K, LOAD_POINT, MARKERS, gravity=gravity)
+    ours = positions(kr270(link_gravity=weights), poses, force)
+    difference, bent = [], []
+    for q, predicted in zip(poses, ours, strict=True):
+        theirs = np.array(list(arm.markers(arm.equilibrium(q, force)).values()))
+        difference.append(predicted - theirs)
+        bent.append(theirs - np.array(list(arm.markers(q).values())))
+    worst = np.linalg.norm(difference, axis=-1).max()
+    print(f"markers differ from MuJoCo's by at most {worst * 1e6:.2e} µm")
+    assert worst < 1e-6
+    assert np.linalg.norm(bent, axis=-1).max() > 5e-3
+
+
+def test_bearings_and_base_agree_with_mujoco() -> None:
+    """Off-axis and base springs: MuJoCo gets a rigid joint for each axis they turn about."""
+    pytest.importorskip("mujoco")
+    model = kr270("joint_compliance", "off_axis_compliance", "base_compliance", link_gravity=True)
+    rng = np.random.default_rng(2)
+    across, tilt = 0.2 * K[:, None] * rng.uniform(0.5, 1.5, (6, 2)), np.array([3e-8, 5e-8])
+    values = {f"joint{i + 1}.compliance": K[i] for i in range(6)}
+    for axis, name in enumerate("xy"):
+        values[f"base.tilt_compliance_{name}"] = tilt[axis]
+        for i in range(6):
+            values[f"joint{i + 1}.off_axis_compliance_{name}"] = across[i, axis]
+    x = np.array([values[name] for name in model.names])
+
+    chain, compliance = with_bearings(kr270_chain(), K, across, tilt)
+    arm = MujocoArm(chain, compliance, LOAD_POINT, MARKERS, gravity=GRAVITY)
+    poses = kr270_poses(5)
+    ours = model.predict(table_of(poses, SLANTED), x).reshape(len(poses), -1, 3)
+    for q, predicted in zip(poses, ours, strict=True):
+        commanded = np.zeros(chain.n_joints)
+        commanded[[joint.name.startswith("moved") for joint in chain.joints]] = q
+        theirs = arm.markers(arm.equilibrium(commanded, SLANTED))
+        np.testing.assert_allclose(predicted, list(theirs.values()), rtol=0, atol=1e-6)
+    rigid = positions(kr270("joint_compliance", link_gravity=True), poses, SLANTED)
+    assert np.abs(ours - rigid).max() > 1e-4  # they do give way
+
+
+def with_bearings(chain: Chain, k: Array, across: Array, tilt: Array) -> tuple[Chain, Array]:
+    """Elastic joints before each moved one: about its own axis and across it; two at the base."""
+    weightless = LinkMass(0.0, np.zeros(3))
+    parts = [
+        (Joint(f"tilt{i}", "revolute", np.eye(4), np.eye(3)[i]), tilt[i], weightless)
+        for i in range(2)
+    ]
+    for i, joint in enumerate(chain.joints):
+        axes = (joint.axis, *transverse_axes(joint.axis))
+        for j, (axis, c) in enumerate(zip(axes, (k[i], *across[i]), strict=True)):
+            placement = joint.placement if j == 0 else np.eye(4)
+            spring = Joint(f"spring{i}{j}", "revolute", placement, axis)
+            parts.append((spring, c, weightless))
+        moved = replace(joint, name=f"moved{i}", placement=np.eye(4))
+        parts.append((moved, 0.0, chain.masses[i]))
+    joints, compliance, masses = zip(*parts, strict=True)
+    return Chain("bearings", joints, chain.flange_placement, masses), np.array(compliance)
+
+
+# --- the linear model of eq. (3) -----------------------------------------------------------
+
+
+def linearisation_error(force: Array, poses: Array) -> Array:
+    """|equilibrium − linear model| of every marker, (poses, markers) in m."""
+    exact = positions(kr270(), poses, force)
+    linear = positions(kr270(deflection_model="linear"), poses, force)
+    return np.linalg.norm(exact - linear, axis=-1)
+
+
+def test_linear_model_is_off_by_many_microns_at_table_2() -> None:
+    worst = linearisation_error(DOWN, TABLE_2).max()
+    print(f"linear model against equilibrium: up to {worst * 1e6:.1f} µm")
+    assert 5e-6 < worst < 40e-6
+
+
+@pytest.mark.parametrize("force", [DOWN, SLANTED], ids=["down", "slanted"])
+def test_linearisation_error_grows_with_the_square_of_the_load(force: Array) -> None:
+    poses = kr270_poses(30)
+    whole, half = (linearisation_error(f, poses) for f in (force, force / 2))
+    np.testing.assert_allclose(whole / half, 4, rtol=0.1)
+
+
+def test_linear_model_is_eq_3() -> None:
+    """δp_j = Σ_k (z_k × (p_j − o_k)) · k_k [(z_k × (p_F − o_k)) · F], numbers by pinocchio."""
+    model = pin.buildModelFromUrdf(str(KR270))
+    data = model.createData()
+    chain = kr270_chain()
+    ours = positions(kr270(deflection_model="linear"), TABLE_2, SLANTED)
+    for q, predicted in zip(TABLE_2, ours, strict=True):
+        pin.framesForwardKinematics(model, data, q)
+        flange = data.oMf[model.getFrameId("flange", pin.FrameType.BODY)]
+        load = flange.act(LOAD_POINT)
+        for name, marker in zip(MARKERS, predicted, strict=True):
+            p = flange.act(MARKERS[name])
+            expected = p.copy()
+            for joint, T, k in zip(chain.joints, list(data.oMi)[1:], COMPLIANCE, strict=True):
+                z, o = T.rotation @ joint.axis, T.translation
+                expected += np.cross(z, p - o) * k * (np.cross(z, load - o) @ SLANTED)
+            np.testing.assert_allclose(marker, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("deflection_model", ["equilibrium", "linear"])
+def test_a_rigid_arm_does_not_bend(deflection_model: str) -> None:
+    nominal = Nominal(joint_compliance=(0.0,) * 6)
+    model = kr270(nominal=nominal, deflection_model=deflection_model, link_gravity=True)
+    poses = kr270_poses(5)
+    rigid = positions(kr270("joint_offset"), poses, SLANTED)
+    assert not model.deflection(table_of(poses, SLANTED)).any()
+    np.testing.assert_allclose(positions(model, poses, SLANTED), rigid, rtol=0, atol=1e-15)
+
+
+# --- gravity compensator -------------------------------------------------------------------
+
+
+def test_compensator_torque() -> None:
+    """Without load, θ2 = k2 M(q2 + θ2) with FACTS' M, and nothing else bends."""
+    model = kr270("joint_compliance", "gravity_compensator", nominal=SPRING)
+    poses = kr270_poses(30)
+    theta = model.deflection(table_of(poses, np.zeros(3), ("M1",)))
+    M = np.array([Compensator().torque(q2) for q2 in poses[:, 1] + theta[:, 1]])
+    np.testing.assert_allclose(theta[:, 1], COMPLIANCE[1] * M, rtol=1e-12, atol=1e-15)
+    assert not np.delete(theta, 1, axis=1).any()
+    assert np.abs(M).max() > 1e3
+
+
+def test_compensator_changes_the_stiffness_of_joint_2() -> None:
+    """A little more load bends joint 2 by its torque over K2(q2), FACTS' formula."""
+    k2 = COMPLIANCE[1]
+    only_joint_2 = Nominal((0.0, k2, 0.0, 0.0, 0.0, 0.0), gravity_compensator=COMPENSATOR)
+    model = kr270("joint_compliance", "gravity_compensator", nominal=only_joint_2)
+    spring, reference = Compensator(), Pinocchio(np.zeros(3))
+    changes = []
+    for q in kr270_poses(30):
+        bent, torque = [], []
+        for force in (-DOWN / 26, DOWN / 26):  # 100 N
+            theta = model.deflection(table_of(q[None], force, ("M1",)))[0]
+            bent.append(theta[1])
+            torque.append(reference.torques(q + theta, force)[1])
+        if abs(torque[1] - torque[0]) < 20:  # the arm is folded over the joint: no lever
+            continue
+        effective = (torque[1] - torque[0]) / (bent[1] - bent[0])
+        q2 = q[1] + np.mean(bent)
+        assert effective == pytest.approx(1 / k2 + spring.stiffness(q2), rel=1e-7)
+        changes.append(spring.stiffness(q2) * k2)
+    assert len(changes) > 30
+    assert max(np.abs(changes)) > 1e-3  # far above the tolerance
+
+
+# --- too much load -------------------------------------------------------------------------
+
+
+SOFT = Nominal(joint_compliance=(1e-3,) * 6)
+
+
+def test_a_load_without_equilibrium_is_nan_and_named() -> None:
+    """Joints a thousand times too soft under 100 kN: lines that find no rest are NaN."""
+    poses = np.vstack([TABLE_2, random_poses(kr270_chain(), 40, seed=1)])
+    table = table_of(poses, np.array([3e4, 0.0, -1e5]), ("M1",), both=True)
+    model = kr270(nominal=SOFT)
+    predicted = model.predict(table).reshape(-1, 3)
+    lost = np.isnan(predicted).any(axis=1)
+    assert lost.any()
+    assert not lost[table.force[:, 2] == 0].any()
+    assert np.isnan(model.deflection(table)[lost]).all()
+    first = table.row[np.flatnonzero(lost)[0]]
+    message = rf"table, line {first}: no static equilibrium .*\({lost.sum()} rows\)"
+    with pytest.raises(ElastocalError, match=message):
+        model.regressor(table)
+    kept = model.regressor(table.take(~lost))
+    assert np.isfinite(kept.B).all()
+
+
+def test_an_arm_that_falls_over_has_no_equilibrium() -> None:
+    """Upright under a vertical load beyond buckling; MuJoCo's arm refuses it, too."""
+    upright = np.radians([[0.0, -90.0, 0.0, 0.0, 0.0, 0.0]])
+    model = kr270(nominal=SOFT)
+    assert np.isnan(model.predict(table_of(upright, np.array([0.0, 0.0, -1e5])))).all()
+
+
+@pytest.mark.parametrize("load", [1e5, 1e7])
+def test_no_joint_deflects_by_a_turn(load: float) -> None:
+    """Newton's method wanders under absurd loads; where it ends is not a deflection."""
+    table = table_of(random_poses(kr270_chain(), 40, seed=1), np.array([0, 0, -load]), ("M1",))
+    theta = kr270(nominal=SOFT).deflection(table)
+    assert not np.any(np.abs(theta) > np.pi)
+
+
+def test_message_says_what_to_check() -> None:
+    poses = random_poses(kr270_chain(), 40, seed=1)
+    with pytest.raises(ElastocalError) as caught:
+        kr270(nominal=SOFT).regressor(table_of(poses, np.array([3e4, 0.0, -1e5])))
+    text = str(caught.value)
+    assert re.search(r"force_\*_N", text) and "joint_compliance" in text and "rad/(N m)" in text
+
+
+# --- many springs ---------------------------------------------------------------------------
+
+
+def test_many_springs_settle_by_slopes_along_directions_as_by_the_whole_jacobian(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Small tables first take F_θ direction by direction; B and θ are those of F_θ whole."""
+    poses = table_of(kr270_poses(5), SLANTED, tuple(MARKERS), True)
+    whole = kr270("joint_compliance", "off_axis_compliance", "marker_position")
+    x = whole.nominal + 1e-7
+    expected, theta = whole.regressor(poses, x), whole.deflection(poses, x)
+    monkeypatch.setattr(equilibrium, "LARGEST_JACOBIAN", 0)
+    monkeypatch.setattr(equilibrium, "ROWS_THAT_PAY", 8 * len(poses))
+    monkeypatch.setattr(equilibrium, "AT_A_TIME", 100)
+    model = kr270("joint_compliance", "off_axis_compliance", "marker_position")
+    solver = model._symbolic.equilibrium
+    for _ in range(4):
+        found = model.regressor(poses, x)
+        np.testing.assert_allclose(found.B, expected.B, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(model.deflection(poses, x), theta, rtol=0, atol=1e-15)
+        if solver._rows <= 8 * len(poses):
+            assert "_whole" not in vars(solver)
+    assert "_along" in vars(solver) and "_whole" in vars(solver)

@@ -1,0 +1,260 @@
+"""From rows to observations: which rows a deflection subtracts, in which order, and what lacks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.cells import kr270_cell, kr270_chain, random_table
+
+from elastocal.errors import InputError
+from elastocal.measurements import Measurements
+from elastocal.model import Model, observe, pair_loaded_with_unloaded, subset
+from elastocal.model.observations import SIZE
+
+DOWN = -2600.0
+
+
+def readings(*rows: tuple[int, int, str, float]) -> Measurements:
+    """A table of (configuration, repeat, marker, vertical force); row i reads (i, 10 i, 100 i)."""
+    configuration, repeat, marker, force = zip(*rows, strict=True)
+    markers = tuple(sorted(set(marker)))
+    n = len(rows)
+    return Measurements(
+        source="data.csv",
+        row=np.arange(n) + 2,
+        q=np.zeros((n, 6)),
+        configuration=np.array(configuration),
+        configuration_labels=tuple(f"pose {k}" for k in range(max(configuration) + 1)),
+        repeat=np.array(repeat),
+        marker=np.array([markers.index(m) for m in marker]),
+        marker_names=markers,
+        force=np.outer(force, [0.0, 0.0, 1.0]),
+        position=np.outer(np.arange(n), [1.0, 10.0, 100.0]),
+    )
+
+
+def subtracted(table: Measurements) -> dict[int, dict[int, float]]:
+    """Loaded row → {row: weight} of everything that enters its deflection."""
+    lead, combine = pair_loaded_with_unloaded(table)
+    found = {}
+    for i, row in zip(lead, combine.toarray(), strict=True):
+        found[int(i)] = {int(j): float(row[j]) for j in np.flatnonzero(row)}
+    return found
+
+
+# --- pairing -------------------------------------------------------------------------------
+
+
+def test_the_same_repeat_is_preferred() -> None:
+    table = readings((0, 0, "M1", 0), (0, 1, "M1", 0), (0, 1, "M1", DOWN), (0, 0, "M1", DOWN))
+    assert subtracted(table) == {2: {2: 1, 1: -1}, 3: {3: 1, 0: -1}}
+
+
+def test_the_mean_of_all_unloaded_serves_where_the_repeat_is_missing() -> None:
+    table = readings(
+        (0, 0, "M1", 0), (0, 1, "M1", 0), (0, 2, "M1", 0), (0, 2, "M1", DOWN), (0, 7, "M1", DOWN)
+    )
+    third = -1 / 3
+    assert subtracted(table) == {3: {3: 1, 2: -1}, 4: {4: 1, 0: third, 1: third, 2: third}}
+
+
+def test_two_unloaded_readings_of_one_repeat_are_averaged() -> None:
+    table = readings((0, 0, "M1", 0), (0, 0, "M1", DOWN), (0, 0, "M1", 0))
+    assert subtracted(table) == {1: {1: 1, 0: -0.5, 2: -0.5}}
+
+
+def test_every_load_level_subtracts_the_same_reading() -> None:
+    table = readings(
+        (0, 0, "M1", 0), (0, 0, "M1", DOWN / 2), (0, 0, "M1", DOWN), (0, 0, "M1", -DOWN)
+    )
+    assert subtracted(table) == {k: {k: 1, 0: -1} for k in (1, 2, 3)}
+
+
+def test_configurations_and_markers_are_not_mixed() -> None:
+    table = readings(
+        (0, 0, "M1", 0), (0, 0, "M2", 0), (1, 0, "M1", 0), (1, 0, "M2", 0),
+        (1, 0, "M2", DOWN), (0, 0, "M1", DOWN), (1, 0, "M1", DOWN), (0, 0, "M2", DOWN),
+    )  # fmt: skip
+    partner = {i: next(j for j, w in row.items() if w < 0) for i, row in subtracted(table).items()}
+    assert partner == {4: 3, 5: 0, 6: 2, 7: 1}
+
+
+def test_a_sideways_force_is_a_load_too() -> None:
+    table = readings((0, 0, "M1", 0), (0, 0, "M1", 0))
+    force = np.zeros((2, 3))
+    force[1, 0] = 1e-3
+    assert subtracted(replace(table, force=force)) == {1: {1: 1, 0: -1}}
+
+
+@pytest.mark.parametrize(
+    "unloaded", [(1, 0, "M1", 0), (0, 0, "M2", 0)], ids=["other pose", "other marker"]
+)
+def test_a_missing_partner_is_named(unloaded: tuple) -> None:
+    table = readings((0, 0, "M1", 0), unloaded, (0, 0, "M1", DOWN), (2, 0, "M1", DOWN))
+    wanted = r"data\.csv, line 5: .* configuration pose 2, marker M1 has no unloaded reading"
+    with pytest.raises(InputError, match=wanted):
+        pair_loaded_with_unloaded(table)
+
+
+def test_a_missing_partner_stays_missing_after_another_marker_was_measured() -> None:
+    table = readings((0, 0, "M1", 0), (0, 0, "M1", DOWN), (0, 0, "M2", DOWN))
+    with pytest.raises(InputError, match=r"line 4.*marker M2.*observe = 'position'"):
+        observe(table, "deflection")
+
+
+def test_without_loaded_rows_there_is_no_deflection() -> None:
+    table = readings((0, 0, "M1", 0), (0, 1, "M1", 0))
+    with pytest.raises(InputError, match=r"data\.csv: .*needs loaded rows.*force_x_N"):
+        observe(table, "deflection")
+
+
+# --- observed values -----------------------------------------------------------------------
+
+
+def test_observed_deflections_are_differences_of_positions() -> None:
+    table = readings((0, 0, "M1", 0), (0, 1, "M1", 0), (0, 1, "M1", DOWN), (0, 5, "M1", DOWN))
+    observed = observe(table, "deflection")
+    np.testing.assert_allclose(observed.value, [1, 10, 100, 2.5, 25, 250], rtol=1e-15)
+    np.testing.assert_array_equal(observed.lead, [2, 3])
+
+
+def test_every_row_is_a_position() -> None:
+    table = readings((0, 0, "M1", 0), (1, 0, "M1", DOWN))
+    observed = observe(table, "position")
+    np.testing.assert_array_equal(observed.value, table.position.ravel())
+    np.testing.assert_array_equal(observed.combine.toarray(), np.eye(2))
+    np.testing.assert_array_equal(observed.configuration, [0, 1])
+
+
+def test_poses_are_observed_as_turned_by_nothing() -> None:
+    """The rotation is relative to the measured one, hence zero."""
+    table = random_table(kr270_chain(), 2, seed=0)
+    value = observe(table, "pose").value.reshape(-1, 6)
+    np.testing.assert_array_equal(value[:, :3], table.position)
+    assert not value[:, 3:].any()
+
+
+def test_a_measured_pose_that_is_the_models_has_no_residual() -> None:
+    model = Model.assembled(kr270_chain(), kr270_cell(("joint_compliance",), "pose"))
+    table = random_table(model.chain, 3, seed=1)
+    predicted = model.predict(table).reshape(-1, 6)
+    assert np.linalg.norm(predicted[:, 3:], axis=1).min() > 1e-3
+    turned = model.target_poses(table)[0]
+    table = replace(table, position=predicted[:, :3],
+                    rotation=Rotation.from_matrix(turned).as_rotvec())  # fmt: skip
+    np.testing.assert_allclose(model.regressor(table).residual, 0, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "kind, column, named",
+    [
+        ("position", "position", "x_mm, y_mm, z_mm"),
+        ("deflection", "position", "x_mm, y_mm, z_mm"),
+        ("pose", "position", "x_mm, y_mm, z_mm"),
+        ("pose", "rotation", "rx_deg"),
+        ("distance", "distance", "distance_mm"),
+    ],
+)
+def test_a_missing_column_is_named(kind: str, column: str, named: str) -> None:
+    table = replace(random_table(kr270_chain(), 2, seed=0), **{column: None})
+    with pytest.raises(InputError, match=f"table: observe = '{kind}' needs the columns {named}"):
+        observe(table, kind)
+
+
+# --- predictions and B ---------------------------------------------------------------------
+
+
+def models() -> tuple[Model, Model]:
+    effects = ("base_frame", "joint_offset", "joint_compliance")
+    return tuple(
+        Model.assembled(kr270_chain(), kr270_cell(effects, kind, link_gravity=True))
+        for kind in ("position", "deflection")
+    )
+
+
+def shuffled(n: int = 4, seed: int = 2) -> Measurements:
+    table = random_table(kr270_chain(), n, seed)
+    return table.take(np.random.default_rng(seed).permutation(len(table)))
+
+
+def test_predicted_deflections_are_differences_of_predicted_positions() -> None:
+    at_position, at_deflection = models()
+    table = shuffled()
+    pairs = subtracted(table)
+    positions = at_position.regressor(table)
+    h = positions.prediction.reshape(len(table), 3)
+    B = positions.B.reshape(len(table), 3, -1)
+    found = at_deflection.regressor(table)
+    np.testing.assert_array_equal(found.prediction, at_deflection.predict(table))
+    for k, (loaded, row) in enumerate(sorted(pairs.items())):
+        (partner,) = set(row) - {loaded}
+        block = slice(3 * k, 3 * k + 3)
+        np.testing.assert_allclose(found.prediction[block], h[loaded] - h[partner], atol=1e-15)
+        np.testing.assert_allclose(found.B[block], B[loaded] - B[partner], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", SIZE)
+def test_rows_of_b_follow_the_table(kind: str) -> None:
+    """All components of an observation together, observations in the table's order."""
+    model = Model.assembled(kr270_chain(), kr270_cell(("joint_offset", "joint_compliance"), kind))
+    table = shuffled()
+    whole = model.regressor(table)
+    observed, size = whole.observations, SIZE[kind]
+    assert whole.B.shape == (len(observed.lead) * size, 12)
+    assert whole.residual.shape == whole.prediction.shape == (len(whole.B),)
+    assert list(observed.lead) == sorted(observed.lead)
+    for k in range(len(observed.lead)):
+        block = slice(size * k, size * (k + 1))
+        alone = model.regressor(table.take(np.unique(observed.combine[[k]].indices)))
+        np.testing.assert_allclose(whole.B[block], alone.B, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(whole.residual[block], alone.residual, rtol=1e-9, atol=1e-14)
+
+
+# --- subset --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", SIZE)
+def test_a_subset_keeps_the_rows_it_needs(kind: str) -> None:
+    model = Model.assembled(kr270_chain(), kr270_cell(("joint_offset", "joint_compliance"), kind))
+    whole = model.regressor(shuffled())
+    observed = whole.observations
+    chosen = np.random.default_rng(5).random(len(observed.lead)) < 0.4
+    part = subset(observed, chosen)
+    rows = np.repeat(chosen, observed.size)
+    np.testing.assert_array_equal(part.value, whole.observations.value[rows])
+    assert len(part.table) == chosen.sum() * (2 if kind == "deflection" else 1)
+    np.testing.assert_array_equal(
+        part.table.row[part.lead], observed.table.row[observed.lead[chosen]]
+    )
+    np.testing.assert_array_equal(part.configuration, observed.configuration[chosen])
+    found = model.regressor(part.table, observations=part)
+    np.testing.assert_allclose(found.prediction, whole.prediction[rows], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(found.B, whole.B[rows], rtol=1e-9, atol=1e-15)
+
+
+def test_a_subset_keeps_all_unloaded_readings_of_a_mean() -> None:
+    table = readings(
+        (1, 0, "M1", 0), (0, 0, "M1", 0), (0, 1, "M1", 0), (1, 0, "M1", DOWN), (0, 9, "M1", DOWN)
+    )
+    part = subset(observe(table, "deflection"), np.array([False, True]))
+    np.testing.assert_array_equal(part.table.row, [3, 4, 6])
+    np.testing.assert_array_equal(part.combine.toarray(), [[-0.5, -0.5, 1]])
+    np.testing.assert_array_equal(part.lead, [2])
+    again = observe(part.table, "deflection")
+    np.testing.assert_array_equal(again.value, part.value)
+
+
+def test_a_subset_of_a_subset() -> None:
+    observed = observe(shuffled(6), "deflection")
+    rng = np.random.default_rng(6)
+    outer = rng.random(len(observed.lead)) < 0.6
+    inner = rng.random(outer.sum()) < 0.5
+    both = outer.copy()
+    both[outer] = inner
+    twice, once = subset(subset(observed, outer), inner), subset(observed, both)
+    np.testing.assert_array_equal(twice.table.row, once.table.row)
+    np.testing.assert_array_equal(twice.lead, once.lead)
+    np.testing.assert_array_equal(twice.combine.toarray(), once.combine.toarray())

@@ -1,0 +1,129 @@
+"""One configuration's B as an expression of q is the model's own B."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.cells import (
+    COMPLIANCE,
+    DOWN,
+    SLANTED,
+    TABLE_2,
+    kr270_cell,
+    kr270_chain,
+    random_poses,
+    table_of,
+)
+
+from elastocal.cell.arm_description import Nominal
+from elastocal.measurements import Measurements
+from elastocal.model import Model, SymbolicArm, configuration_rows
+from elastocal.units import Array
+
+GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")
+BASE = Nominal(COMPLIANCE, np.array([0.4, -2.0, 0.3]), np.eye(3)[[1, 2, 0]])
+
+
+def model_of(effects: tuple[str, ...], observe: str, **options: Any) -> Model:
+    return Model.assembled(kr270_chain(), kr270_cell(effects, observe, **options))
+
+
+def both(model: Model, table: Measurements, x: Array, steps: int = 2) -> tuple[Array, Array]:
+    """B of the table's single configuration: as an expression, and as the model has it."""
+    columns = np.arange(len(model.names))
+    rows = configuration_rows(SymbolicArm(model.chain, model.cell), table, columns, steps)
+    return rows.function(table.q[0], x).full(), model.regressor(table, x).B
+
+
+def somewhere(model: Model, seed: int) -> Array:
+    """Parameter values near the nominal ones, with compliances positive."""
+    rng = np.random.default_rng(seed)
+    x = model.nominal
+    return np.where(x == 0, 1e-3 * rng.normal(size=len(x)), x * rng.uniform(0.8, 1.2, len(x)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("effects", "observe", "options"),
+    [
+        (GEOMETRY, "position", {"nominal": BASE}),
+        (("joint_compliance",), "deflection", {"deflection_model": "linear"}),
+        ((*GEOMETRY, "joint_compliance"), "position", {"deflection_model": "linear"}),
+        (("distance_sensor", "joint_offset", "marker_position"), "distance", {}),
+    ],
+)
+def test_explicit_models_agree_to_rounding(
+    effects: tuple[str, ...], observe: str, options: dict[str, Any], seed: int
+) -> None:
+    model = model_of(effects, observe, **options)
+    q = random_poses(model.chain, 1, seed)
+    table = replace(table_of(q, SLANTED, both=True), distance=np.ones(6))
+    symbolic, reference = both(model, table, somewhere(model, seed))
+    assert np.abs(symbolic - reference).max() <= 1e-12 * np.abs(reference).max()
+
+
+@pytest.mark.parametrize("pose", [0, 6, 14])
+def test_equilibrium_is_approached_geometrically(pose: int) -> None:
+    model = model_of(("joint_compliance",), "deflection")
+    table = table_of(TABLE_2[[pose]], DOWN, both=True)
+    errors = []
+    for steps in (1, 2, 3, 4):
+        symbolic, reference = both(model, table, model.nominal, steps)
+        errors.append(np.abs(symbolic - reference).max() / np.abs(reference).max())
+    assert errors[1] < 1e-3
+    assert all(later < 0.05 * earlier for earlier, later in pairwise(errors))
+
+
+def test_measured_rotation_is_the_predicted_one() -> None:
+    model = model_of(("base_frame", "joint_offset", "marker_orientation"), "pose", nominal=BASE)
+    x = somewhere(model, 4)
+    table = table_of(random_poses(model.chain, 1, 4), DOWN)
+    table = replace(table, rotation=np.zeros_like(table.position))
+    rotation = model.target_poses(table, x)[0]
+    table = replace(table, rotation=Rotation.from_matrix(rotation).as_rotvec())
+    symbolic, reference = both(model, table, x)
+    np.testing.assert_allclose(symbolic, reference, atol=1e-11)
+    # A template that says otherwise changes nothing: q decides.
+    other, _ = both(model, replace(table, rotation=np.ones_like(table.position)), x)
+    np.testing.assert_array_equal(other, symbolic)
+
+
+def test_levels_and_columns_come_from_the_caller() -> None:
+    levels = {"joint2": (-0.4, -1.6)}
+    model = model_of(
+        ("joint_compliance",), "deflection", compliance_levels=levels, deflection_model="linear"
+    )
+    q = random_poses(model.chain, 1, 5)
+    q[0, 1] = -1.6
+    table = table_of(q, DOWN, both=True)
+    columns = np.array([2, 4])
+    rows = configuration_rows(SymbolicArm(model.chain, model.cell), table, columns)
+    B = rows.function(q[0], model.nominal).full()
+    np.testing.assert_allclose(B, model.regressor(table).B[:, columns], atol=1e-14)
+    first = list(model.names).index("joint2.compliance_level1")
+    second = list(model.names).index("joint2.compliance_level2")
+    B = both(model, table, model.nominal)[0]
+    assert not B[:, first].any() and B[:, second].any()
+
+
+def test_adjoint_is_the_slope_of_the_weighted_sum() -> None:
+    model = model_of((*GEOMETRY, "joint_compliance"), "position")
+    table = table_of(random_poses(model.chain, 1, 6), DOWN, both=True)
+    columns = np.arange(len(model.names))
+    rows = configuration_rows(SymbolicArm(model.chain, model.cell), table, columns)
+    W = np.random.default_rng(6).normal(size=rows.B.shape)
+    q, h = table.q[0], 1e-5
+    slopes = [
+        (W * (rows.function(q + step, model.nominal) - rows.function(q - step, model.nominal)))
+        .full()
+        .sum()
+        / (2 * h)
+        for step in h * np.eye(len(q))
+    ]
+    found = rows.adjoint(q, model.nominal, W).full().ravel()
+    np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())

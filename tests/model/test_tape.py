@@ -1,0 +1,325 @@
+"""A replayed tape computes what CasADi computes: every operation, chunk, shape, complex step."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.expressions import X, Y, built
+
+from elastocal.model import BatchFunction
+from elastocal.model import numpy_engine as backend_operations
+from elastocal.model.evaluate import CHUNK
+
+UNARY = {
+    "neg": -X, "exp": ca.exp(X), "log": ca.log(X), "sqrt": ca.sqrt(X), "sq": X * X,
+    "sin": ca.sin(X), "cos": ca.cos(X), "tan": ca.tan(X), "asin": ca.asin(X / 4),
+    "acos": ca.acos(X / 4), "atan": ca.atan(X), "fabs": ca.fabs(X), "sign": ca.sign(X),
+    "sinh": ca.sinh(X), "cosh": ca.cosh(X), "tanh": ca.tanh(X), "inv": 1 / X,
+    "log1p": ca.log1p(X), "expm1": ca.expm1(X), "floor": ca.floor(X), "ceil": ca.ceil(X),
+    "twice": 2 * X, "identity": X, "power 3": X**3, "power 2.5": X**2.5, "constant": X * 0 + 3,
+}  # fmt: skip
+BINARY = {
+    "add": X + Y, "sub": X - Y, "mul": X * Y, "div": X / Y, "pow": X**Y,
+    "atan2": ca.atan2(X, Y), "fmin": ca.fmin(X, Y), "fmax": ca.fmax(X, Y),
+    "hypot": ca.hypot(X, Y), "fmod": ca.fmod(X, Y), "lt": X < Y, "le": X <= Y, "eq": X == Y,
+    "ne": X != Y, "and": ca.logic_and(X, Y), "or": ca.logic_or(X, Y),
+    "copysign": ca.copysign(X, Y), "if_else_zero": ca.if_else(X > Y, X, 0),
+}  # fmt: skip
+# Both branches of CasADi's if_else are multiplied by their condition, the second by its negation.
+BRANCHES = ca.if_else(X > Y, ca.sin(X), ca.cos(Y))
+
+# Equal operands, zeros, half-integers and both signs: where comparisons and rounding decide.
+POINTS = np.array(
+    [[a, b] for a in (-2.5, -1.0, 0.0, 0.5, 2.0, 3.25) for b in (-2.0, -0.5, 0.0, 0.5, 2.0)]
+)
+
+
+def casadi_values(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> np.ndarray:
+    """(n, rows, columns): one CasADi call per row."""
+    function = ca.Function("f", inputs, [output])
+    n = max(len(v) for v in values if v.ndim == 2)
+    rows = [[v[i] if v.ndim == 2 else v for v in values] for i in range(n)]
+    return np.array([function(*row).full() for row in rows])
+
+
+def assert_replays(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> None:
+    with np.errstate(all="ignore"):
+        replayed = BatchFunction(inputs, [output])(*values)[0]
+    np.testing.assert_allclose(
+        replayed, casadi_values(inputs, output, *values), rtol=4e-15, atol=1e-300
+    )
+
+
+# --- every operation -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", UNARY)
+def test_unary_operations(name: str) -> None:
+    """NaN and infinity included: log(−1), 1/0."""
+    assert_replays([X], UNARY[name], POINTS[:, :1])
+
+
+@pytest.mark.parametrize("name", BINARY)
+def test_binary_operations(name: str) -> None:
+    assert_replays([X, Y], BINARY[name], POINTS[:, :1], POINTS[:, 1:])
+
+
+@pytest.mark.parametrize("name", BINARY)
+def test_binary_operations_of_a_row_quantity_and_a_scalar(name: str) -> None:
+    """One operand varies by row, the other does not; and the other way round."""
+    for scalar in (np.array([0.5]), np.array([-2.0]), np.array([0.0])):
+        assert_replays([X, Y], BINARY[name], POINTS[:, :1], scalar)
+        assert_replays([X, Y], BINARY[name], scalar, POINTS[:, 1:])
+
+
+def test_the_operations_above_are_all_that_the_tape_knows() -> None:
+    used = set()
+    for expression in [*UNARY.values(), *BINARY.values()]:
+        f = ca.Function("f", [X, Y], [expression])
+        used |= {f.instruction_id(k) for k in range(f.n_instructions())}
+    # The first two are written by other CasADi versions for x and x**c; if_else has its own test.
+    spare = {ca.OP_ASSIGN, ca.OP_CONSTPOW, ca.OP_NOT}
+    assert set(backend_operations.UNARY) | set(backend_operations.BINARY) <= used | spare
+
+
+def test_if_else_with_two_branches() -> None:
+    assert_replays([X, Y], BRANCHES, POINTS[:, :1], POINTS[:, 1:])
+
+
+def test_a_branch_not_taken_may_be_undefined() -> None:
+    guarded = ca.if_else(X > 0, ca.log(X), 0)
+    assert_replays([X], guarded, POINTS[:, :1])
+
+
+def test_unknown_operations_are_refused() -> None:
+    with pytest.raises(NotImplementedError, match=f"operation {ca.OP_ERF}"):
+        BatchFunction([X], [ca.erf(X)], "numpy")(np.zeros((1, 1)))
+
+
+# --- whole expressions ---------------------------------------------------------------------
+
+numbers = st.floats(-3, 3, allow_subnormal=False)
+leaves = st.sampled_from(["x", "y", "p"]) | numbers.map(lambda v: round(v, 2))
+smooth = ("sin", "cos", "tanh", "atan", "fabs", "sign", "neg", "sq", "floor")
+paired = ("add", "sub", "mul", "fmin", "fmax", "atan2", "if_else_zero", "hypot")
+expressions = st.recursive(
+    leaves,
+    lambda inner: (
+        st.tuples(st.sampled_from(smooth), inner) | st.tuples(st.sampled_from(paired), inner, inner)
+    ),
+    max_leaves=25,
+)
+
+
+@given(tree=expressions, seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=150, deadline=None)
+def test_random_expressions_and_their_derivatives(tree, seed: int) -> None:
+    """x and y vary by row, p is the same in all: registers of both sorts get reused."""
+    symbols = {name: ca.SX.sym(name) for name in "xyp"}
+    expression = built(tree, symbols, {**UNARY, **BINARY})
+    inputs = list(symbols.values())
+    slopes = ca.jacobian(expression, ca.vertcat(*inputs))
+    rng = np.random.default_rng(seed)
+    values = (rng.normal(size=(5, 1)), rng.normal(size=(5, 1)), rng.normal(size=1))
+    for output in (expression, slopes):
+        with np.errstate(all="ignore"):
+            replayed = BatchFunction(inputs, [output])(*values)[0]
+        expected = casadi_values(inputs, output, *values)
+        defined = np.isfinite(expected)
+        # Common subexpressions change the order of additions, hence the absolute part.
+        tolerance = 1e-12 * max(1.0, np.abs(expected[defined]).max(initial=0.0))
+        np.testing.assert_allclose(replayed[defined], expected[defined], rtol=0, atol=tolerance)
+
+
+def three_outputs() -> tuple[list[ca.SX], list[ca.SX]]:
+    q, p = ca.SX.sym("q", 3), ca.SX.sym("p", 2)
+    dense = ca.vertcat(ca.horzcat(q[0] * p[0], ca.sin(q[1])), ca.horzcat(q[2], p[1] + 1))
+    sparse = ca.SX(3, 2)
+    sparse[2, 0], sparse[0, 1] = ca.cos(q[0]), p[0]
+    return [q, p], [dense, sparse, ca.sumsqr(q)]
+
+
+def evaluated(q: np.ndarray, p: np.ndarray) -> list[np.ndarray]:
+    """What three_outputs means, by numpy."""
+    dense = np.array([[[a * p[0], np.sin(b)], [c, p[1] + 1]] for a, b, c in q])
+    sparse = np.zeros((len(q), 3, 2))
+    sparse[:, 2, 0], sparse[:, 0, 1] = np.cos(q[:, 0]), p[0]
+    return [dense, sparse, (q**2).sum(axis=1)[:, None, None]]
+
+
+# --- shapes and chunks ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", [1, 7, CHUNK])
+@pytest.mark.parametrize("beyond", [None, -1, 0, 1])
+def test_chunk_boundaries(chunk: int, beyond: int | None) -> None:
+    """n = 1, one below, at and above a chunk, and a last chunk of one row."""
+    n = 1 if beyond is None else max(chunk + beyond, 1)
+    rng = np.random.default_rng(n)
+    q, p = rng.normal(size=(n, 3)), rng.normal(size=2)
+    inputs, outputs = three_outputs()
+    for found, expected in zip(BatchFunction(inputs, outputs)(q, p, chunk=chunk), evaluated(q, p),
+                               strict=True):  # fmt: skip
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found, expected, rtol=1e-15, atol=1e-15)
+
+
+def test_several_chunks_in_a_row() -> None:
+    rng = np.random.default_rng(0)
+    q, p = rng.normal(size=(23, 3)), rng.normal(size=2)
+    function = BatchFunction(*three_outputs())
+    for whole, pieces in zip(function(q, p), function(q, p, chunk=5), strict=True):
+        np.testing.assert_array_equal(whole, pieces)
+
+
+def test_a_quantity_given_per_row_or_once_for_all() -> None:
+    rng = np.random.default_rng(1)
+    q, p = rng.normal(size=(6, 3)), rng.normal(size=2)
+    function = BatchFunction(*three_outputs())
+    for once, per_row in zip(function(q, p), function(q, np.tile(p, (6, 1))), strict=True):
+        np.testing.assert_array_equal(once, per_row)
+
+
+def test_only_scalars_make_one_row() -> None:
+    q, p = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.5])
+    for found, expected in zip(
+        BatchFunction(*three_outputs())(q, p), evaluated(q[None], p), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-15)
+
+
+def test_a_tape_has_no_memory() -> None:
+    """Called again, also with fewer rows, it starts afresh; results are the caller's own."""
+    rng = np.random.default_rng(2)
+    q, p = rng.normal(size=(9, 3)), rng.normal(size=2)
+    function = BatchFunction(*three_outputs())
+    first = function(q, p)
+    kept = [found.copy() for found in first]
+    function(rng.normal(size=(4, 3)), p)
+    for found, before, again in zip(first, kept, function(q, p), strict=True):
+        np.testing.assert_array_equal(found, before)
+        np.testing.assert_array_equal(found, again)
+
+
+def test_inputs_are_left_alone() -> None:
+    q, p = np.ones((4, 3)), np.ones(2)
+    x = ca.SX.sym("x", 3)
+    BatchFunction([x], [ca.vertcat(-x[0], 2 * x[0] + x[1], x[2])])(q)
+    BatchFunction(*three_outputs())(q, p)
+    np.testing.assert_array_equal(q, np.ones((4, 3)))
+
+
+def test_outputs_that_do_not_depend_on_the_inputs() -> None:
+    function = BatchFunction([X], [ca.SX([1.5, -2.0]), ca.SX(2, 2), X])
+    constant, nothing, same = function(np.arange(3.0)[:, None])
+    np.testing.assert_array_equal(constant[..., 0], [[1.5, -2.0]] * 3)
+    np.testing.assert_array_equal(nothing, np.zeros((3, 2, 2)))
+    np.testing.assert_array_equal(same[:, 0, 0], [0, 1, 2])
+
+
+def test_an_output_is_also_an_operand_and_is_put_out_twice() -> None:
+    """A value stands in its first output, is read from there, and copied to the second."""
+    x, p = ca.SX.sym("x", 2), ca.SX.sym("p")
+    product = x[0] * x[1]
+    outputs = [ca.vertcat(product, ca.sin(product) + x[0], product), ca.vertcat(p * 2, x[1])]
+    rows = np.random.default_rng(4).normal(size=(9, 2))
+    first, second = BatchFunction([x, p], outputs, "numpy")(rows, np.array([0.5]), chunk=4)
+    expected = rows.prod(axis=1)
+    np.testing.assert_array_equal(first[:, [0, 2], 0], np.stack([expected, expected], axis=1))
+    np.testing.assert_array_equal(first[:, 1, 0], np.sin(expected) + rows[:, 0])
+    np.testing.assert_array_equal(second[..., 0], np.stack([np.ones(9), rows[:, 1]], axis=1))
+
+
+def test_division_by_zero_among_the_values_in_common_is_infinite() -> None:
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    with np.errstate(all="ignore"):
+        found = BatchFunction([x, p], [x / p, x * (1 / p)], "numpy")(np.ones((2, 1)), np.zeros(1))
+    assert np.isposinf(found).all()
+
+
+def test_a_long_sum_needs_few_registers() -> None:
+    """Registers are taken again as soon as what they held has been read for the last time."""
+    x = ca.SX.sym("x", 40)
+    total = ca.SX(0)
+    for k in range(40):
+        total = ca.sin(total + x[k])
+    function = BatchFunction([x], [total], "numpy")
+    rows = np.random.default_rng(5).normal(size=(3, 40))
+    assert_replays([x], total, rows)
+    function(rows)
+    assert function._replay._plan((True,)).n_registers <= 2
+
+
+def test_a_table_without_rows_gives_no_rows() -> None:
+    found = BatchFunction(*three_outputs())(np.zeros((0, 3)), np.ones(2))
+    assert [f.shape for f in found] == [(0, 2, 2), (0, 3, 2), (0, 1, 1)]
+
+
+# --- complex steps -------------------------------------------------------------------------
+
+ANALYTIC = ("neg", "exp", "log", "sqrt", "sq", "sin", "cos", "tan", "asin", "acos", "atan",
+            "sinh", "cosh", "tanh", "inv", "log1p", "expm1", "twice", "identity",
+            "power 3", "power 2.5")  # fmt: skip
+REAL_ONLY = {"floor": UNARY["floor"], "ceil": UNARY["ceil"], "atan2": ca.atan2(X, 2),
+             "hypot": ca.hypot(X, 2), "fmod": ca.fmod(X, 2),
+             "copysign": ca.copysign(X, 2)}  # fmt: skip
+PIECEWISE = {"fmax": ca.fmax(X, 1.0), "fmin": ca.fmin(X, 1.0), "lt": (X < 1) * X,
+             "if_else_zero": ca.if_else(X > 1, X * X, 0)}  # fmt: skip
+
+
+def assert_complex_step(expression: ca.SX, at: np.ndarray) -> None:
+    step = 1e-30
+    found = BatchFunction([X], [expression])(at + 1j * step)[0]
+    np.testing.assert_allclose(found.real, casadi_values([X], expression, at), rtol=4e-15)
+    slope = casadi_values([X], ca.jacobian(expression, X), at)
+    np.testing.assert_allclose(found.imag / step, slope, rtol=4e-14)  # 1 − tanh² cancels
+
+
+@pytest.mark.parametrize("name", [*ANALYTIC, *PIECEWISE])
+def test_complex_step_is_the_derivative(name: str) -> None:
+    expression = UNARY[name] if name in ANALYTIC else PIECEWISE[name]
+    assert_complex_step(expression, np.array([[0.3], [0.9], [1.7], [3.1]]))
+
+
+def test_complex_scalars_with_real_rows() -> None:
+    rng = np.random.default_rng(3)
+    q, p = rng.normal(size=(4, 3)), rng.normal(size=2)
+    dense, sparse, squares = BatchFunction(*three_outputs())(q, p + np.array([1e-30j, 0]))
+    np.testing.assert_allclose(dense[:, 0, 0].imag / 1e-30, q[:, 0], rtol=1e-15)
+    np.testing.assert_array_equal(sparse[:, 0, 1].imag, np.full(4, 1e-30))
+    np.testing.assert_array_equal(squares.imag, np.zeros_like(squares.real))
+
+
+@pytest.mark.parametrize("name", REAL_ONLY)
+def test_what_numpy_has_for_real_numbers_only_is_refused_not_wrong(name: str) -> None:
+    with pytest.raises(TypeError):
+        BatchFunction([X], [REAL_ONLY[name]])(np.array([[0.3 + 1e-30j]]))
+
+
+@pytest.mark.parametrize("name", ["fabs", "sign"])
+def test_complex_step_of_kinks(name: str) -> None:
+    assert_complex_step(UNARY[name], np.array([[-1.3], [0.9]]))
+
+
+@pytest.mark.parametrize("columns", [[], [1], [3, 0], [0, 1, 2, 3]])
+def test_columns_of_a_known_tape_have_the_same_values(columns: list[int]) -> None:
+    """The instructions taken from a tape of all columns are those CasADi would be asked for."""
+    v = ca.SX.sym("v", 4)
+    head = ca.sin(v[0]) * v[1]
+    matrix = ca.jacobian(ca.vertcat(head * v[2], ca.exp(v[3]) * head, v[1]), v)
+    rows = np.random.default_rng(4).normal(size=(7, 4))
+    whole = BatchFunction([v], [head, matrix])
+    whole_head, whole_matrix = whole(rows)
+    part = BatchFunction([v], [head, matrix[:, columns]], None, whole, columns)
+    alone = BatchFunction([v], [head, matrix[:, columns]])
+    for found, expected in zip(part(rows), alone(rows), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(part(rows)[0], whole_head)
+    np.testing.assert_array_equal(part(rows)[1], whole_matrix[:, :, columns])
+    unused = BatchFunction(
+        [v], [head, matrix[:, columns]], None, BatchFunction([v], [head, matrix]), columns
+    )
+    np.testing.assert_array_equal(unused(rows)[1], alone(rows)[1])

@@ -1,0 +1,172 @@
+"""The cache folder: where it is, whole entries or none, the least recently used go first."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from elastocal.model import HashedFunction, cache_folder, content_key, fetch, store
+from elastocal.model import function_cache as tape_cache
+from elastocal.model import numpy_engine as backend_instructions
+
+KEY = content_key("a test")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("ELASTOCAL_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_what_is_stored_is_found(folder: Path) -> None:
+    stored = store(KEY, ".bin", b"content")
+    assert stored is not None and stored.parent == folder
+    assert fetch(KEY, ".bin") == stored
+    assert stored.read_bytes() == b"content"
+
+
+def test_nothing_else_is_found() -> None:
+    store(KEY, ".bin", b"content")
+    assert fetch(content_key("another"), ".bin") is None
+    assert fetch(KEY, ".so") is None
+
+
+@pytest.mark.parametrize("damage", [b"", b"conten", b"c0ntent"])
+def test_a_damaged_entry_is_not_found_and_removed(damage: bytes) -> None:
+    stored = store(KEY, ".bin", b"content")
+    assert stored is not None
+    stored.write_bytes(damage)
+    assert fetch(KEY, ".bin") is None
+    assert not stored.exists()
+
+
+def test_keys_tell_parts_apart() -> None:
+    keys = {content_key("ab", "c"), content_key("a", "bc"), content_key("abc"), content_key(b"x")}
+    assert len(keys) == 4
+
+
+def test_the_format_is_part_of_the_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tape_cache, "FORMAT", "another")
+    assert content_key("a test") != KEY
+
+
+def test_a_folder_that_cannot_be_made_is_no_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("ELASTOCAL_CACHE", str(tmp_path / "file" / "cache"))
+    assert store(KEY, ".bin", b"content") is None
+    assert fetch(KEY, ".bin") is None
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_folder_of_somebody_else_is_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    store(KEY, ".bin", b"content")
+    monkeypatch.setattr(os, "getuid", lambda: 12345678)
+    assert fetch(KEY, ".bin") is None
+
+
+def test_no_part_is_left_behind(folder: Path) -> None:
+    store(KEY, ".bin", b"content")
+    store(KEY, ".bin", b"content")
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_the_least_recently_used_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tape_cache, "LARGEST_TOTAL", 250)
+    keys = [content_key(str(k)) for k in range(3)]
+    for age, key in zip((300, 200), keys[:2], strict=True):
+        stored = store(key, ".bin", bytes(100))
+        assert stored is not None
+        os.utime(stored, (stored.stat().st_mtime - age,) * 2)
+    fetch(keys[0], ".bin")  # used: now the second is the oldest
+    store(keys[2], ".bin", bytes(100))
+    assert [fetch(key, ".bin") is not None for key in keys] == [True, False, True]
+
+
+def test_pruning_leaves_files_of_others_alone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tape_cache, "LARGEST_TOTAL", 0)
+    folder.mkdir()
+    (folder / "thesis.final.pdf").write_bytes(bytes(1000))
+    assert store(KEY, ".bin", b"content") is not None
+    assert (folder / "thesis.final.pdf").exists()
+
+
+def test_abandoned_parts_are_removed(folder: Path) -> None:
+    folder.mkdir()
+    old, new = folder / f".{KEY}.old.tmp", folder / f".{KEY}.new.tmp"
+    for path in (old, new):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    store(KEY, ".bin", b"content")
+    assert not old.exists() and new.exists()
+
+
+# --- where it is ---------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="the XDG rule is Linux's")
+@pytest.mark.parametrize("xdg, expected", [
+    ("/somewhere", "/somewhere/elastocal"), ("", "~/.cache/elastocal"),
+    ("relative", "~/.cache/elastocal"),
+])  # fmt: skip
+def test_xdg_folder(monkeypatch: pytest.MonkeyPatch, xdg: str, expected: str) -> None:
+    monkeypatch.delenv("ELASTOCAL_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", xdg)
+    assert cache_folder() == Path(expected).expanduser()
+
+
+@pytest.mark.parametrize("platform, tail", [
+    ("darwin", "Library/Caches/elastocal"), ("win32", "AppData/Local/elastocal"),
+])  # fmt: skip
+def test_folder_of_other_systems(monkeypatch: pytest.MonkeyPatch, platform: str, tail: str) -> None:
+    monkeypatch.delenv("ELASTOCAL_CACHE")
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    monkeypatch.setattr(sys, "platform", platform)
+    assert cache_folder() == Path.home() / tail
+
+
+# --- instructions --------------------------------------------------------------------------
+
+
+def long_function(factor: float) -> HashedFunction:
+    x = ca.SX.sym("x")
+    y = x
+    for k in range(backend_instructions.SMALLEST_CACHED):
+        y = ca.sin(factor * y) + k
+    return HashedFunction([x], [y])
+
+
+def test_long_tapes_are_read_from_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = backend_instructions.instructions(long_function(3.0))
+    monkeypatch.setattr(backend_instructions, "_extracted", None)  # not asked again
+    second = backend_instructions.instructions(long_function(3.0))
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
+    assert first[2] == second[2]
+
+
+def test_another_constant_is_another_tape() -> None:
+    first = backend_instructions.instructions(long_function(3.0))
+    second = backend_instructions.instructions(long_function(3.5))
+    assert not np.array_equal(first[1], second[1])
+
+
+def test_short_tapes_are_not_cached(folder: Path) -> None:
+    x = ca.SX.sym("x")
+    backend_instructions.instructions(HashedFunction([x], [ca.sin(x)]))
+    assert not folder.exists()
+
+
+def test_entries_differ_between_versions_of_casadi(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = ca.SX.sym("x")
+    before = HashedFunction([x], [ca.sin(x)]).digest
+    monkeypatch.setattr("elastocal.model.function_cache.casadi_version", lambda: "0")
+    assert HashedFunction([x], [ca.sin(x)]).digest != before

@@ -1,0 +1,74 @@
+"""Cells to test rules on: a KR 270-2 among bodies, and a gantry whose geometry is plain."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+from support.robots import KR270
+
+from elastocal.cell.arm_description import Robot, Tool, Tracker
+from elastocal.cell.work_cell import Cell
+from elastocal.cell.workspace_rules import Solid, Workspace
+from elastocal.model import Chain, Joint, read_urdf
+from elastocal.planning import Feasibility
+
+CHECK = Path(__file__).resolve().parents[3] / "experiment_design" / "feasibility_check"
+DOWN = np.array([0.0, 0.0, -2600.0])
+NOTHING = np.zeros(3)
+KR270_CHAIN = read_urdf(KR270)
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def box(name: str, size: tuple[float, float, float], centre: tuple[float, float, float]) -> Solid:
+    return Solid(name, "box", np.array(size), at(*centre))
+
+
+def sphere(name: str, radius: float, centre: tuple[float, float, float]) -> Solid:
+    return Solid(name, "sphere", np.array([radius]), at(*centre))
+
+
+def gantry() -> Chain:
+    """x, y, z slides and a turn about z; at q the flange stands at q[:3], its axes the data's."""
+    axes = ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))
+    slides = [
+        Joint(f"slide{i}", "prismatic", np.eye(4), np.array(axis), -3.0, 3.0)
+        for i, axis in enumerate(axes)
+    ]
+    turn = Joint("turn", "revolute", np.eye(4), np.array([0, 0, 1.0]), -np.pi, np.pi)
+    return Chain("gantry", (*slides, turn), np.eye(4))
+
+
+def cell(workspace: Workspace, tool: Tool | None = None, tracker: Tracker | None = None) -> Cell:
+    return Cell("test", None, Robot(), tool or Tool(), tracker or Tracker(), workspace=workspace)
+
+
+def gantry_rules(
+    workspace: Workspace, tool: Tool | None = None, tracker: Tracker | None = None
+) -> Feasibility:
+    return Feasibility(cell(workspace, tool, tracker), gantry())
+
+
+def gantry_at(*positions: tuple[float, float, float]) -> np.ndarray:
+    """Joint values that bring the flange to these positions."""
+    return np.hstack([np.array(positions, dtype=float), np.zeros((len(positions), 1))])
+
+
+def broken(feasibility: Feasibility, q: np.ndarray, force: np.ndarray) -> list[set[str]]:
+    """The rules that each pose breaks."""
+    verdict = feasibility.check(q, force)
+    return [{r for r, hit in zip(verdict.rules, row, strict=True) if hit} for row in verdict.broken]
+
+
+def study_module(name: str):
+    """A module of experiment_design/feasibility_check, whose scripts import one another."""
+    if str(CHECK) not in sys.path:
+        sys.path.append(str(CHECK))
+    return importlib.import_module(name)

@@ -1,0 +1,189 @@
+"""The list of bodies: where each stands, what carries it, and wrong input by name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planning.feasibility.small_cells import KR270_CHAIN, at, box, cell, gantry, sphere
+from support.robots import packaged_urdf
+
+from elastocal.cell.arm_description import Nominal, Robot
+from elastocal.cell.workspace_rules import CarriedBody, HangingLoad, Solid, Workspace
+from elastocal.errors import InputError
+from elastocal.model import read_urdf
+from elastocal.planning import cell_bodies, hull, support
+from elastocal.planning.bodies import HANGING, WORLD
+
+RADII = (0.3, 0.2, 0.2, 0.15, 0.14, 0.12)
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def named(workspace, chain=KR270_CHAIN, **changes):
+    given = replace(cell(workspace), **changes)
+    return {body.name: body for body in cell_bodies(given, chain)}
+
+
+def test_the_skeleton_joins_the_joints_origins():
+    """KR 270-2: d1 = 0.75, a1 = 0.35, a2 = 1.25, d4 = 1.1, a3 = −0.055, d6 = 0.23 m."""
+    found = named(Workspace(link_radius=RADII))
+    spans = {name: np.ptp(hull(body.solid)[0], axis=0) for name, body in found.items()}
+    assert np.allclose(spans["base"], [0, 0, 0.75])
+    assert np.allclose(spans["link1"], [0.35, 0, 0])
+    assert np.allclose(spans["link2"], [1.25, 0, 0])
+    assert np.allclose(spans["link3"], [1.1, 0, 0.055])
+    assert np.allclose(spans["link6"], [0.23, 0, 0])
+    assert found["link4"].solid.shape == found["link5"].solid.shape == "sphere"
+    assert [found[f"link{i + 1}"].carrier for i in range(6)] == list(range(6))
+    assert [hull(found[f"link{i + 1}"].solid)[1] for i in range(6)] == list(RADII)
+    assert found["base"].carrier == WORLD
+
+
+def test_one_radius_is_for_all_links_and_none_is_no_body():
+    assert len(named(Workspace(link_radius=(0.1,)))) == 7
+    assert "link4" not in named(Workspace(link_radius=(0.1, 0.1, 0.1, 0.0, 0.1, 0.1)))
+    assert named(Workspace()) == {}
+
+
+def test_the_base_stands_where_the_cell_puts_it():
+    model = cell(Workspace()).model
+    turned = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    nominal = Nominal(base_position=np.array([1.0, 2.0, 0.5]), base_rotation=turned)
+    workspace = Workspace(
+        bodies=(CarriedBody(sphere("foot", 0.1, (0.3, 0, 0)), "base"),), link_radius=RADII
+    )
+    found = named(workspace, model=replace(model, nominal=nominal))
+    assert np.allclose(found["foot"].solid.placement[:3, 3], [1.0, 2.3, 0.5])
+    assert np.allclose(hull(found["base"].solid)[0].mean(axis=0), [1.0, 2.0, 0.875])
+
+
+def test_what_sits_on_the_flange_is_carried_by_the_last_joint():
+    found = named(Workspace(bodies=(CarriedBody(box("tool", (0.1, 0.1, 0.4), (0, 0, 0.2))),)))
+    centre = KR270_CHAIN.flange_placement @ at(0, 0, 0.2)
+    assert found["tool"].carrier == 5
+    assert np.allclose(found["tool"].solid.placement, centre)
+
+
+@pytest.mark.parametrize("shape", ["box", "sphere", "cylinder", "capsule"])
+def test_the_load_hangs_by_its_top_at_the_end_of_the_rope(shape):
+    size = {"box": [0.3, 0.2, 0.5], "sphere": [0.2], "cylinder": [0.2, 0.6], "capsule": [0.1, 0.4]}
+    tilted = at(0, 0, 7.0)
+    tilted[:3, :3] = [[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]
+    solid = Solid("load", shape, np.array(size[shape]), tilted)
+    found = named(Workspace(load=HangingLoad(solid, rope=0.7, rope_radius=0.02)))
+    assert support(found["load"].solid, -DOWN) == pytest.approx(-0.7)
+    points, radius = hull(found["rope"].solid)
+    assert radius == 0.02
+    assert np.allclose(sorted(points.tolist()), [[0, 0, -0.7], [0, 0, 0]])
+    assert found["load"].carrier == found["rope"].carrier == HANGING
+    assert "rope" not in named(Workspace(load=HangingLoad(solid)))
+
+
+@pytest.mark.parametrize(
+    ("workspace", "message"),
+    [
+        (Workspace(link_radius=(0.1, 0.2)), "link_radius has 2 values.*6 links"),
+        (
+            Workspace(bodies=(CarriedBody(sphere("a", 1, (0, 0, 0)), "link33"),)),
+            "'a' is on 'link33' .did you mean 'link3'",
+        ),
+        (
+            Workspace(obstacles=(sphere("link2", 1, (0, 0, 0)),), link_radius=(0.1,)),
+            "two bodies named 'link2'",
+        ),
+        (Workspace(urdf_geometry=True), "the robot has no URDF"),
+        (Workspace(urdf_geometry=True, link_radius=(0.1,)), "only one"),
+    ],
+)
+def test_wrong_workspaces_are_refused_by_name(workspace, message):
+    with pytest.raises(InputError, match=message):
+        named(workspace)
+
+
+URDF = """<robot name="r">
+<link name="world"/><link name="base"/>{links}<link name="finger"><collision>
+<geometry><sphere radius="0.05"/></geometry></collision></link>
+<joint name="lift" type="prismatic"><parent link="world"/><child link="base"/>
+<origin xyz="0 0 1"/><axis xyz="0 0 1"/><limit lower="0" upper="1" effort="0" velocity="0"/></joint>
+{joints}
+<joint name="grip" type="prismatic"><parent link="l4"/><child link="finger"/>
+<origin xyz="0 0.1 0"/><axis xyz="0 1 0"/>
+<limit lower="0" upper="1" effort="0" velocity="0"/></joint>
+</robot>"""
+SHAPES = {
+    1: '<box size="0.1 0.2 0.3"/>',
+    2: '<cylinder radius="0.1" length="0.5"/>',
+    3: '<sphere radius="0.2"/>',
+    4: '<mesh filename="{mesh}" scale="0.001 0.001 0.001"/>',
+}
+
+
+def write_urdf(folder, mesh):
+    links = '<link name="pedestal"><collision><geometry><box size="1 1 1"/></geometry>'
+    links += "</collision></link>"
+    joints = '<joint name="fix" type="fixed"><parent link="base"/><child link="pedestal"/>'
+    joints += '<origin xyz="0 0 -0.5"/></joint>'
+    for i, shape in SHAPES.items():
+        parent = "base" if i == 1 else f"l{i - 1}"
+        links += f'<link name="l{i}"><collision><origin xyz="0 0 0.1"/><geometry>'
+        links += shape.format(mesh=mesh) + "</geometry></collision></link>"
+        joints += (
+            f'<joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="l{i}"/>'
+        )
+        joints += '<origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>'
+        joints += '<limit lower="-1" upper="1" effort="0" velocity="0"/></joint>'
+    path = folder / "arm.urdf"
+    path.write_text(URDF.format(links=links, joints=joints))
+    return path
+
+
+def urdf_named(path):
+    robot = Robot(urdf=path, base="base", flange="l4")
+    chain = read_urdf(path, base="base", flange="l4")
+    return named(Workspace(urdf_geometry=True), chain, robot=robot)
+
+
+def test_urdf_geometry_is_carried_by_the_joints_of_the_chain(tmp_path):
+    """In a URDF whose base is itself lifted and whose gripper moves: both stand still."""
+    folder = tmp_path / "arm_description" / "urdf"
+    folder.mkdir(parents=True)
+    (folder.parent / "part.obj").write_text(
+        "v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 2 3\nf 1 2 4\n"
+    )
+    found = urdf_named(write_urdf(folder, "package://arm_description/part.obj"))
+    carriers = {name: body.carrier for name, body in found.items()}
+    assert carriers == {
+        "pedestal_0": WORLD, "l1_0": 0, "l2_0": 1, "l3_0": 2, "l4_0": 3, "finger_0": 3,
+    }  # fmt: skip
+    assert np.allclose(found["pedestal_0"].solid.placement[:3, 3], [0, 0, -0.5])
+    assert np.allclose(found["l1_0"].solid.size, [0.1, 0.2, 0.3])
+    assert np.allclose(found["l2_0"].solid.size, [0.1, 0.5])
+    assert np.allclose(found["finger_0"].solid.placement[:3, 3], [0, 0.1, 0])
+    assert np.allclose(hull(found["l4_0"].solid)[0].max(axis=0), [0.009, 0.009, 0.109])
+
+
+def test_a_missing_mesh_of_the_urdf_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match=r"nowhere\.stl.*put the mesh files"):
+        urdf_named(write_urdf(tmp_path, "package://arm_description/nowhere.stl"))
+
+
+def test_a_urdf_without_collision_elements_says_so():
+    from support.robots import KR270
+
+    with pytest.raises(InputError, match="no <collision> elements"):
+        named(Workspace(urdf_geometry=True), robot=Robot(urdf=KR270))
+
+
+@pytest.mark.parametrize("name", ["UR5", "Panda"])
+def test_packaged_robots_bring_their_geometry(name):
+    path, flange = packaged_urdf(name)
+    chain = read_urdf(path, flange=flange)
+    found = named(Workspace(urdf_geometry=True), chain, robot=Robot(urdf=path, flange=flange))
+    assert {body.carrier for body in found.values()} >= set(range(chain.n_joints - 1))
+    assert all(np.isfinite(hull(body.solid)[0]).all() for body in found.values())
+
+
+def test_a_gantry_has_sliding_links_of_its_own():
+    """All its joints coincide at zero: spheres at the joints, none for the base."""
+    found = named(Workspace(link_radius=(0.1,)), gantry())
+    assert [found[f"link{i + 1}"].carrier for i in range(4)] == [0, 1, 2, 3]
+    assert "base" not in found

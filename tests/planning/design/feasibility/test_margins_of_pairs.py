@@ -1,0 +1,231 @@
+"""Collision: margins to the tenth of a millimetre, and the pairs that are looked at."""
+
+from dataclasses import replace
+from itertools import combinations, pairwise
+
+import coal
+import numpy as np
+import pytest
+from planning.feasibility.small_cells import (
+    DOWN,
+    KR270_CHAIN,
+    NOTHING,
+    at,
+    box,
+    broken,
+    cell,
+    gantry,
+    gantry_at,
+    gantry_rules,
+    sphere,
+)
+from scipy.spatial.transform import Rotation
+
+from elastocal.cell.arm_description import Tool
+from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.errors import InputError
+from elastocal.planning import Collisions, Feasibility, coal_shape
+from elastocal.planning.feasibility import POSE_SLACK
+
+RADII = (0.28, 0.2, 0.18, 0.15, 0.15, 0.11)
+SIZES = {"box": [0.4, 0.2, 0.6], "sphere": [0.3], "cylinder": [0.2, 0.6], "capsule": [0.2, 0.2]}
+# How far each of these reaches along x, y, z from its centre.
+REACH = {
+    "box": (0.2, 0.1, 0.3), "sphere": (0.3, 0.3, 0.3),
+    "cylinder": (0.2, 0.2, 0.3), "capsule": (0.2, 0.2, 0.3),
+}  # fmt: skip
+
+
+def solid(shape, name, centre=(0, 0, 0)):
+    return Solid(name, shape, np.array(SIZES[shape]), at(*centre))
+
+
+@pytest.mark.parametrize("shape", SIZES)
+@pytest.mark.parametrize("other", SIZES)
+@pytest.mark.parametrize("axis", range(3))
+def test_an_obstacle_is_kept_away_from_by_exactly_the_clearance(shape, other, axis):
+    clearance = 0.05
+    rules = gantry_rules(
+        Workspace(
+            bodies=(CarriedBody(solid(shape, "tool")),),
+            obstacles=(solid(other, "rock"),),
+            clearance=clearance,
+        )
+    )
+    touch = REACH[shape][axis] + REACH[other][axis] + clearance + POSE_SLACK
+    positions = np.zeros((2, 3))
+    positions[:, axis] = touch - 1e-5, touch + 1e-5
+    found = broken(rules, gantry_at(*positions), NOTHING)
+    assert found == [{"obstacle"}, set()]
+
+
+@pytest.mark.parametrize("shape", SIZES)
+@pytest.mark.parametrize("axis", range(3))
+def test_a_half_space_is_kept_out_of_without_a_margin(shape, axis):
+    normal = -np.eye(3)[axis]
+    rules = gantry_rules(
+        Workspace(
+            bodies=(CarriedBody(solid(shape, "tool")),),
+            keep_out=(HalfSpace("people", -1.5 * normal, normal),),
+            clearance=0.2,
+        )
+    )
+    touch = 1.5 - REACH[shape][axis] - POSE_SLACK
+    positions = np.zeros((2, 3))
+    positions[:, axis] = touch + 1e-5, touch - 1e-5
+    assert broken(rules, gantry_at(*positions), NOTHING) == [{"keep_out"}, set()]
+
+
+def test_the_arm_keeps_the_self_clearance_and_no_more():
+    """A post on the base against the tool: a pair of the arm's own bodies."""
+    own = (
+        CarriedBody(sphere("tool", 0.1, (0, 0, 0))),
+        CarriedBody(sphere("post", 0.2, (0, 0, 0)), "base"),
+    )
+    rules = gantry_rules(Workspace(bodies=own, clearance=0.5, self_clearance=0.03))
+    q = gantry_at((0.33 + POSE_SLACK - 1e-5, 0, 0), (0.33 + POSE_SLACK + 1e-5, 0, 0))
+    assert broken(rules, q, NOTHING) == [{"self_collision"}, set()]
+    rules = gantry_rules(Workspace(bodies=own, self_collision=False))
+    assert broken(rules, q * 0, NOTHING) == [set(), set()]
+
+
+def test_the_load_is_a_body_where_it_hangs_and_only_there():
+    """A weight of 0.4 m below a rope of 0.5 m: its bottom is 0.9 m under the load point."""
+    weight = HangingLoad(
+        Solid("load", "cylinder", np.array([0.2, 0.4])), 0.5, 0.01, min_height=-1.5
+    )
+    table = box("table", (1, 1, 1), (2, 0, -1.5))
+    rules = gantry_rules(Workspace(load=weight, obstacles=(table,)), Tool(np.array([0, 0, -0.1])))
+    above, touching = 0.1 - 1 + 0.9 + 2e-4, 0.1 - 1 + 0.9 - 1e-5
+    q = gantry_at((2, 0, above), (2, 0, touching), (0, 0, -0.5 + 2e-4), (0, 0, -0.5 - 1e-5))
+    assert broken(rules, q, DOWN) == [set(), {"obstacle"}, set(), {"load_height"}]
+    assert broken(rules, q, NOTHING) == [set()] * 4
+    # The rope alone passes the edge of the table.
+    wire = gantry_at((1.495, 0, -0.4), (1.485, 0, -0.4))
+    thin = replace(weight, solid=Solid("load", "sphere", np.array([0.001])))
+    rules = gantry_rules(Workspace(load=thin, obstacles=(box("t", (1, 1, 0.1), (2, 0, -0.8)),)))
+    assert broken(rules, wire, DOWN) == [{"obstacle"}, set()]
+
+
+def kr270_cell(**changes):
+    workspace = Workspace(
+        link_radius=RADII,
+        bodies=(CarriedBody(box("tool", (0.3, 0.3, 0.2), (0, 0, 0.1))),),
+        obstacles=(box("table", (1, 1, 0.8), (1.8, 0.8, 0.4)), sphere("lamp", 0.3, (0.5, -1, 2.2))),
+        load=HangingLoad(Solid("load", "cylinder", np.array([0.2, 0.4])), 0.5),
+        clearance=0.04,
+        self_clearance=0.02,
+    )
+    return cell(replace(workspace, **changes), Tool(np.array([0.2, 0, 0.25])))
+
+
+def kr270_poses(n: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    lower = np.array([joint.lower for joint in KR270_CHAIN.joints])
+    upper = np.array([joint.upper for joint in KR270_CHAIN.joints])
+    return rng.uniform(lower, upper, (n, 6))
+
+
+def test_the_batch_says_what_one_distance_after_the_other_says():
+    rules = Feasibility(kr270_cell(), KR270_CHAIN)
+    poses = rules.kinematics.poses(kr270_poses(150), DOWN)
+    hits = Collisions(rules.kinematics, rules.pairs).hits(poses)
+    for hit, frames in zip(hits, poses.frames, strict=True):
+        assert hit == any(
+            _distance(pair.body, pair.other, frames) < pair.margin for pair in rules.pairs
+        )
+    assert 0 < hits.mean() < 1
+
+
+def _distance(a, b, frames):
+    placed = [
+        (coal_shape(body.solid), frames[body.carrier] @ body.solid.placement) for body in (a, b)
+    ]
+    (one, T), (two, U) = placed
+    return coal.distance(
+        one, coal.Transform3s(T[:3, :3].copy(), T[:3, 3].copy()),
+        two, coal.Transform3s(U[:3, :3].copy(), U[:3, 3].copy()),
+        coal.DistanceRequest(), coal.DistanceResult(),
+    )  # fmt: skip
+
+
+def test_extra_margin_is_per_pair():
+    rules = Feasibility(kr270_cell(), KR270_CHAIN)
+    poses = rules.kinematics.poses(kr270_poses(300), NOTHING)
+    collisions = Collisions(rules.kinematics, rules.pairs)
+    extra = np.array([1.0 if "lamp" in pair.names else 0.0 for pair in rules.pairs])
+    lamp = Collisions(rules.kinematics, [p for p in rules.pairs if "lamp" in p.names])
+    expected = collisions.hits(poses) | lamp.hits(poses, 1.0)
+    assert (collisions.hits(poses, extra) == expected).all()
+    assert (expected != collisions.hits(poses)).any()
+
+
+def pair_names(given_cell, chain=KR270_CHAIN):
+    return {frozenset(pair.names) for pair in Feasibility(given_cell, chain).pairs}
+
+
+def test_neighbours_and_a_spherical_wrist_are_not_paired():
+    """Joints 4, 5 and 6 of the KR 270 meet in one point: links 3 to 6 always touch."""
+    found = pair_names(kr270_cell())
+    chain = ["base", "link1", "link2", "link3", "link4", "link5", "link6"]
+    own = {pair for pair in found if pair <= set(chain)}
+    joined = {frozenset(p) for p in combinations(chain, 2)} - own
+    neighbours = {frozenset(p) for p in pairwise(chain)}
+    wrist = {frozenset(p) for p in combinations(chain[3:], 2)}
+    # The shoulder's 0.35 m are shorter than the radii of base and link 2.
+    assert joined == neighbours | wrist | {frozenset(("base", "link2"))}
+    for link in chain[1:]:
+        assert {frozenset((link, "table")), frozenset((link, "lamp"))} <= found
+    assert frozenset(("base", "table")) not in found
+    assert frozenset(("tool", "link6")) not in found and frozenset(("tool", "link5")) in found
+
+
+def test_links_that_a_slide_can_part_are_paired_except_neighbours():
+    found = pair_names(cell(Workspace(link_radius=(0.1,))), gantry())
+    assert found == {
+        frozenset(p) for p in (("link1", "link3"), ("link1", "link4"), ("link2", "link4"))
+    }
+
+
+def test_pairs_that_are_left_out_touch_in_every_pose():
+    """All but neighbours: leaving them out hides nothing."""
+    rules = Feasibility(kr270_cell(), KR270_CHAIN)
+    bodies = {body.name: body for body in rules.bodies}
+    poses = rules.kinematics.poses(kr270_poses(200), DOWN)
+    for names in [("base", "link2"), ("link3", "link5"), ("link3", "link6"), ("link4", "link6")]:
+        for frames in poses.frames:
+            assert _distance(bodies[names[0]], bodies[names[1]], frames) <= 0.02
+
+
+def test_the_rope_is_not_paired_with_what_holds_its_hook():
+    beam = CarriedBody(box("beam", (0.1, 0.1, 0.5), (0.2, 0, 0.0)))
+    found = pair_names(kr270_cell(bodies=(beam,)))
+    assert frozenset(("rope", "beam")) not in found and frozenset(("load", "beam")) in found
+    assert frozenset(("rope", "link6")) in found
+    short = replace(kr270_cell().workspace.load, rope=0.0)
+    assert frozenset(("load", "beam")) not in pair_names(kr270_cell(bodies=(beam,), load=short))
+
+
+def test_ignored_pairs_may_touch_and_unknown_ones_are_named():
+    ignored = kr270_cell(ignored_pairs=(("table", "link3"), ("tool", "base")))
+    assert pair_names(kr270_cell()) - pair_names(ignored) == {
+        frozenset(("table", "link3")), frozenset(("tool", "base"))
+    }  # fmt: skip
+    with pytest.raises(InputError, match=r"names 'tabel'.*did you mean 'table'"):
+        Feasibility(kr270_cell(ignored_pairs=(("tabel", "link3"),)), KR270_CHAIN)
+
+
+def test_turned_bodies_stand_as_their_placement_says():
+    """A long box turned about x by 30°, met from above at its highest corner."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("x", 30, degrees=True).as_matrix()
+    rock = Solid("rock", "box", np.array([0.2, 2.0, 0.2]), T)
+    top = 1.0 * np.sin(np.pi / 6) + 0.1 * np.cos(np.pi / 6)
+    y = 1.0 * np.cos(np.pi / 6) - 0.1 * np.sin(np.pi / 6)
+    rules = gantry_rules(
+        Workspace(bodies=(CarriedBody(sphere("tool", 0.1, (0, 0, 0))),), obstacles=(rock,))
+    )
+    touch = top + 0.1 + POSE_SLACK
+    assert broken(rules, gantry_at((0, y, touch - 1e-5), (0, y, touch + 1e-5)), NOTHING) == [
+        {"obstacle"}, set()
+    ]  # fmt: skip

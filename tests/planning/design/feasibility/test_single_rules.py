@@ -1,0 +1,274 @@
+"""Each rule by cases whose answer is known; together they do not depend on their order."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from planning.feasibility.small_cells import (
+    DOWN,
+    KR270_CHAIN,
+    NOTHING,
+    box,
+    broken,
+    cell,
+    gantry_at,
+    gantry_rules,
+    sphere,
+)
+from planning.feasibility.test_frames_of_poses import random_chain
+from planning.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
+
+from elastocal.cell.arm_description import EffectChoice, Tool, Tracker
+from elastocal.cell.workspace_rules import (
+    CarriedBody,
+    HalfSpace,
+    HangingLoad,
+    Visibility,
+    Workspace,
+)
+from elastocal.errors import InputError
+from elastocal.planning import Feasibility, Kinematics, PoseFeasibility, StaticTorque
+
+EYE = Tracker(position=np.array([3.0, 0.0, 0.0]))
+MARKER = Tool(markers={"M1": np.zeros(3)})
+
+
+def test_joint_limits_are_the_robots_narrowed_by_the_cells():
+    narrowed = replace(cell(Workspace()), limits={"joint2": (-2.0, -1.0), "joint1": (-9.0, 9.0)})
+    rules = Feasibility(narrowed, KR270_CHAIN)
+    base = np.array([0, -1.5, 0, 0, 0, 0])
+    q = np.tile(base, (5, 1))
+    q[1, 1], q[2, 1], q[3, 1], q[4, 0] = -1.0, -0.999, -2.001, np.radians(185.01)
+    assert [bool(b) for b in broken(rules, q, NOTHING)] == [False, False, True, True, True]
+
+
+def test_range():
+    sight = Visibility(range=(1.0, 2.0), line_of_sight=False)
+    rules = gantry_rules(Workspace(visibility=sight), MARKER, EYE)
+    q = gantry_at((0.99, 0, 0), (1.01, 0, 0), (1.99, 0, 0), (2.01, 0, 0), (3, 1.5, 0))
+    assert broken(rules, q, NOTHING) == [{"range"}, set(), set(), {"range"}, set()]
+
+
+def test_incidence_is_the_angle_between_the_reflectors_axis_and_the_beam():
+    sight = Visibility({"M1": np.array([2.0, 0, 0])}, np.radians(30), line_of_sight=False)
+    rules = gantry_rules(Workspace(visibility=sight), MARKER, EYE)
+    q = gantry_at(*[(0, 0, 0)] * 6, (0, 3 * np.tan(np.radians(29)), 0), (0, 0, 3.0))
+    q[:6, 3] = np.radians([0, 29.99, -29.99, 30.01, -30.01, 180])
+    assert [bool(b) for b in broken(rules, q, NOTHING)] == [
+        False, False, False, True, True, True, False, True,
+    ]  # fmt: skip
+
+
+def test_a_beam_passes_at_its_radius():
+    """A ball of 0.2 m half way: the beam of 5 mm misses it at 0.205 m from its centre."""
+    sight = Visibility(beam_radius=0.005)
+    ball = sphere("ball", 0.2, (1.5, 0, 0))
+    rules = gantry_rules(Workspace(obstacles=(ball,), visibility=sight), MARKER, EYE)
+    # Half way from (3, 0, 0) to (0, y, 0) the beam is y/2 off the centre, foreshortened.
+    y = np.array([0.2049, 0.2051]) * 2
+    y /= np.sqrt(1 - (y / 3) ** 2)
+    assert broken(rules, gantry_at((0, y[0], 0), (0, y[1], 0)), NOTHING) == [
+        {"line_of_sight"}, set()
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("x", np.linspace(-2.9, 2.4, 12))
+def test_the_beam_reaches_from_the_tracker_to_the_marker_and_no_further(x):
+    """Whatever its length: walls behind tracker and marker do not hide, one between does."""
+    sight = Visibility(beam_radius=0.005)
+    for wall, hides in ((3.2, False), (x - 0.2, False), (2.9, True), (x + 0.1, True)):
+        screen = box("wall", (0.02, 1, 1), (wall, 0, 0))
+        rules = gantry_rules(Workspace(obstacles=(screen,), visibility=sight), MARKER, EYE)
+        assert broken(rules, gantry_at((x, 0, 0)), NOTHING) == [
+            {"line_of_sight"} if hides else set()
+        ]
+
+
+def test_the_body_under_a_marker_hides_it_from_behind_only():
+    plate = CarriedBody(box("plate", (0.1, 0.5, 0.5), (-0.05, 0, 0)))
+    rules = gantry_rules(Workspace(bodies=(plate,), visibility=Visibility()), MARKER, EYE)
+    q = gantry_at(*[(0, 0, 0)] * 4)
+    q[:, 3] = np.radians([0, 70, -70, 180])
+    assert [bool(b) for b in broken(rules, q, NOTHING)] == [False, False, False, True]
+
+
+def test_the_instrument_itself_hides_nothing_and_the_load_hides_where_it_hangs():
+    stand = box("stand", (0.3, 0.3, 2), (3, 0, -0.9))
+    load = HangingLoad(sphere("load", 0.3, (0, 0, 0)), rope=0.5)
+    tool = Tool(np.array([0.6, 0, 0.8]), {"M1": np.zeros(3)})
+    rules = gantry_rules(
+        Workspace(obstacles=(stand,), load=load, visibility=Visibility()), tool, EYE
+    )
+    assert broken(rules, gantry_at((0, 0, 0)), NOTHING) == [set()]
+    assert broken(rules, gantry_at((0, 0, 0)), DOWN) == [{"line_of_sight"}]
+
+
+def test_one_hidden_marker_of_several_is_enough():
+    """Beams end at (0, 0, 0) and (0, 0.5, 0); the screen stands half way to the second."""
+    tool = Tool(markers={"M1": np.zeros(3), "M2": np.array([0, 0.5, 0])})
+    screen = box("screen", (0.1, 0.1, 0.1), (1.5, 0.25, 0))
+    rules = gantry_rules(Workspace(obstacles=(screen,), visibility=Visibility()), tool, EYE)
+    q = gantry_at((0, 0, 0), (0, 0.5, 0), (0, 1.0, 0))
+    assert broken(rules, q, NOTHING) == [{"line_of_sight"}, {"line_of_sight"}, set()]
+    causes = rules.rules[-1].causes(rules.kinematics.poses(q, NOTHING))
+    assert causes["M1 behind screen"].tolist() == [False, True, False]
+    assert causes["M2 behind screen"].tolist() == [True, False, False]
+
+
+def test_the_rope_may_deviate_from_the_vertical_by_its_angle():
+    """The KR 270 stretched out, its flange's z along +x turned by joint 5 downwards."""
+    axis = np.array([0.0, 0.0, 3.0])
+    load = HangingLoad(
+        sphere("load", 0.1, (0, 0, 0)), 0.5, rope_axis=axis, max_angle=np.radians(40)
+    )
+    rules = Feasibility(cell(Workspace(load=load)), KR270_CHAIN)
+    q = np.zeros((4, 6))
+    q[:, 4] = np.radians([49.9, 50.1, 90, 125])
+    assert broken(rules, q, DOWN) == [{"rope_angle"}, set(), set(), set()]
+    assert broken(rules, q, NOTHING) == [set()] * 4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_static_torque_is_pinocchios_gravity_and_the_transposed_jacobian(seed, tmp_path):
+    chain = random_chain(seed, tmp_path)
+    tool = Tool(np.array([0.2, 0.1, 0.3]))
+    weighing = cell(Workspace(), tool)
+    weighing = replace(weighing, model=replace(weighing.model, link_gravity=bool(chain.masses)))
+    rng = np.random.default_rng(seed)
+    q, force = rng.uniform(-2, 2, (20, chain.n_joints)), rng.normal(size=(20, 3)) * 500
+    found = StaticTorque(weighing, chain)(Kinematics(weighing, chain).poses(q, force))
+    assert np.allclose(found, reference_torque(chain, tool.load_point, q, force), atol=1e-8)
+    assert np.abs(found).max() > 10
+
+
+def reference_torque(chain, load_point, q, force):
+    """g(q) − Jᵀ f by pinocchio."""
+    model, parent = pin.Model(), 0
+    for i, joint in enumerate(chain.joints):
+        kind = (
+            pin.JointModelRevoluteUnaligned
+            if joint.kind == "revolute"
+            else pin.JointModelPrismaticUnaligned
+        )
+        parent = model.addJoint(parent, kind(joint.axis), pin.SE3(joint.placement), f"j{i}")
+        if chain.masses:
+            mass = chain.masses[i]
+            inertia = pin.Inertia(mass.mass, mass.com, np.zeros((3, 3)))
+            model.appendBodyToJoint(parent, inertia, pin.SE3.Identity())
+    model.gravity.linear = np.array([0, 0, -9.80665])
+    data, torque = model.createData(), []
+    hook = pin.SE3(np.eye(3), (chain.flange_placement @ [*load_point, 1.0])[:3])
+    frame = model.addFrame(pin.Frame("hook", parent, 0, hook, pin.FrameType.OP_FRAME))
+    data = model.createData()
+    for qi, f in zip(q, force, strict=True):
+        gravity = pin.computeGeneralizedGravity(model, data, qi)
+        J = pin.computeFrameJacobian(model, data, qi, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+        torque.append(gravity - J.T @ f)
+    return np.array(torque)
+
+
+def test_torque_limits_hold_in_both_directions_and_the_compensator_counts():
+    """A KR 270 stretched out by 2.68 m: a weight of 1000 N asks joint 2 for 2330 N m."""
+    tool = Tool(np.zeros(3))
+    limits = Workspace(torque_limits=(1e5, 2331.0, 1e5, 1e5, 1e5, 1e5))
+    rules = Feasibility(cell(limits, tool), KR270_CHAIN)
+    q = np.zeros((1, 6))
+    lever = 1.25 + 1.1 + 0.23
+    assert broken(rules, q, np.array([0, 0, -2330.0 / lever])) == [set()]
+    assert broken(rules, q, np.array([0, 0, -2332.0 / lever])) == [{"torque"}]
+    assert broken(rules, q, np.array([0, 0, 2332.0 / lever])) == [{"torque"}]
+    spring = {
+        "joint": "joint2", "stiffness_N_per_m": 1e5, "anchor_m": (0.0, 0.7), "arm_m": 0.2,
+        "free_length_m": 0.3,
+    }  # fmt: skip
+    plain = cell(limits, tool)
+    nominal = replace(plain.model.nominal, gravity_compensator=spring)
+    helped = replace(plain.model, effects=(EffectChoice("gravity_compensator"),), nominal=nominal)
+    torque = StaticTorque(replace(plain, model=helped), KR270_CHAIN)
+    kinematics = Kinematics(plain, KR270_CHAIN)
+    force = np.array([0, 0, -1000.0])
+    unhelped = StaticTorque(plain, KR270_CHAIN)(kinematics.poses(q, force))[0, 1]
+    s = np.hypot(0.7, 0.2)  # at q₂ = 0 the arm is square to the line of the anchors
+    moment = 1e5 * (1 - 0.3 / s) * 0.7 * 0.2
+    assert torque(kinematics.poses(q, force))[0, 1] - unhelped == pytest.approx(moment)
+
+
+def full_cell():
+    given = kr270_cell(
+        keep_out=(HalfSpace("walkway", np.array([-1.5, 0, 0]), np.array([1.0, 0, 0])),),
+        visibility=Visibility({"M1": np.array([0, 0, 1.0])}, 1.4, (1.0, 5.0)),
+        torque_limits=(1e4, 5e3, 4e3, 1e3, 1e3, 1e3),
+    )
+    load = replace(
+        given.workspace.load, rope_axis=np.array([0, 0, 1.0]), max_angle=1.8, min_height=0.1
+    )
+    return replace(
+        given,
+        workspace=replace(given.workspace, load=load),
+        tool=replace(given.tool, markers={"M1": np.array([0.2, 0.1, 0.2])}),
+        tracker=Tracker(position=np.array([3.5, 0.5, 1.5])),
+        limits={"joint1": (-2.0, 2.0)},
+    )
+
+
+def test_the_order_of_rules_changes_who_removes_but_not_what_remains():
+    rules = Feasibility(full_cell(), KR270_CHAIN)
+    q = kr270_poses(4000)
+    verdict = rules.check(q, DOWN)
+    assert verdict.ok.any() and all(verdict.alone.values())
+    shuffled = Feasibility(full_cell(), KR270_CHAIN)
+    for order in np.random.default_rng(0).permuted([range(len(rules.rules))] * 5, axis=1):
+        shuffled.rules = tuple(rules.rules[k] for k in order)
+        other = shuffled.check(q, DOWN)
+        assert (other.ok == verdict.ok).all() and other.alone == verdict.alone
+        assert (shuffled.feasible(q, DOWN) == verdict.ok).all()
+
+
+def test_counts_add_up():
+    rules = Feasibility(full_cell(), KR270_CHAIN)
+    q, force = kr270_poses(3000), np.where(np.arange(3000)[:, None] % 2 == 0, DOWN, NOTHING)
+    verdict = rules.check(q, force)
+    assert sum(verdict.removed_by.values()) + verdict.ok.sum() == len(q)
+    parts = [rules.check(q[a : a + 1000], force[a : a + 1000]) for a in (0, 1000, 2000)]
+    joined = PoseFeasibility.join(parts)
+    assert (joined.ok == verdict.ok).all() and joined.removed_by == verdict.removed_by
+    for rule in verdict.rules:
+        assert verdict.freed[rule] <= verdict.removed_by[rule] <= verdict.alone[rule]
+    # Rows are judged each by its own force.
+    assert (rules.check(q[::2], DOWN).ok == verdict.ok[::2]).all()
+    assert (rules.check(q[1::2], NOTHING).ok == verdict.ok[1::2]).all()
+
+
+def test_a_copy_in_another_process_judges_alike():
+    rules = Feasibility(full_cell(), KR270_CHAIN)
+    q = kr270_poses(500)
+    again = pickle.loads(pickle.dumps(rules))
+    assert (again.check(q, DOWN).broken == rules.check(q, DOWN).broken).all()
+
+
+def test_a_cell_without_rules_lets_all_pass_within_the_limits():
+    rules = Feasibility(cell(Workspace()), KR270_CHAIN)
+    assert rules.check(kr270_poses(50), DOWN).ok.all()
+    assert rules.paths_free(kr270_poses(5), kr270_poses(5, 1), True).all()
+
+
+@pytest.mark.parametrize(
+    ("workspace", "message"),
+    [
+        (Workspace(torque_limits=(1.0, 2.0)), "torque_limits_Nm has 2 values.*6 joints"),
+        (Workspace(visibility=Visibility()), "needs the markers"),
+    ],
+)
+def test_workspaces_that_do_not_fit_are_refused(workspace, message):
+    with pytest.raises(InputError, match=message):
+        Feasibility(cell(workspace), KR270_CHAIN)
+
+
+def test_poses_that_are_none_are_refused():
+    rules = Feasibility(cell(Workspace()), KR270_CHAIN)
+    with pytest.raises(InputError, match=r"5 joint values.*6 joints"):
+        rules.check(np.zeros((2, 5)), NOTHING)
+    with pytest.raises(InputError, match="pose 1 is not finite"):
+        rules.check(np.array([[0.0] * 6, [np.nan] * 6]), NOTHING)

@@ -1,0 +1,159 @@
+"""Robot programs: what they move to is what was planned, in the controllers' own syntax."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import kr270_chain, random_poses
+from support.discs import Discs
+
+from elastocal.cell.plan_wishes import Motion
+from elastocal.errors import InputError
+from elastocal.model import Chain
+from elastocal.planning import krl_program, load_name, number, plain, schedule, urscript_program
+
+FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
+HOME = np.radians([0.0, -90, 90, 0, 45, 0])
+NAMES = [f"c{i}" for i in range(1, 6)]
+NUMBER = r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]*[1-9])?"
+KRL_LINE = re.compile(
+    rf"&[A-Z]+ \w+|DEF \w+\(\)|;[ -~]*|DECL INT \w+|FOR \w+ = 1 TO 6|  \$\w+\[\w+\] = [0-9]+|ENDFOR"
+    rf"|PTP \{{A1 {NUMBER}(?:, A[2-6] {NUMBER}){{5}}\}}|HALT|WAIT SEC {NUMBER}|END"
+)
+UR_LINE = re.compile(
+    rf"#[ -~]*|def \w+\(\):|  #[ -~]*|  movej\(\[{NUMBER}(?:, {NUMBER}){{5}}\], a={NUMBER}, "
+    rf'v={NUMBER}\)|  popup\("[^"]*", title="Load", blocking=True\)|  textmsg\("[^"]*"\)'
+    rf"|  sleep\({NUMBER}\)|end||\w+\(\)"
+)
+
+
+class Fence:
+    """Straight moves between the poses 0 and 1 are blocked, everything else is free."""
+
+    def __init__(self, q):
+        self.q = q
+
+    def paths_free(self, q_from, q_to, loaded):
+        fenced = {tuple(self.q[0]), tuple(self.q[1])}
+        ends = [{tuple(a), tuple(b)} for a, b in zip(q_from, q_to, strict=True)]
+        return np.array([end != fenced for end in ends])
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return kr270_chain()
+
+
+def execution_of(chain, **motion):
+    q = random_poses(chain, 5, seed=1)
+    limits = np.full(6, -9.0), np.full(6, 9.0)
+    return schedule(q, Motion(**motion), Discs(), loads=FORCES, limits=limits, iterations=100)
+
+
+def planned(execution):
+    """Joint values of every move, from the execution itself."""
+    home = execution.motion.home
+    moves = [] if home is None else [home]
+    for stop in execution.stops:
+        moves += [*stop.via, stop.q]
+    return np.array(moves if home is None else [*moves, *execution.home_via, home])
+
+
+@pytest.mark.parametrize("motion", [{}, {"home": HOME}, {"home": HOME, "both_directions": True}])
+def test_krl_moves_where_the_plan_says_line_by_line(chain, motion):
+    execution = execution_of(chain, **motion)
+    lines = krl_program(execution, chain, NAMES, FORCES).splitlines()
+    assert all(KRL_LINE.fullmatch(line) for line in lines)
+    assert lines[2] == "DEF elastocal_plan()" and lines[-1] == "END"
+    moves = [re.findall(rf"A[1-6] ({NUMBER})", line) for line in lines if line.startswith("PTP")]
+    angles = np.radians(np.array(moves, dtype=float))
+    assert np.allclose(angles, planned(execution), rtol=0, atol=1e-8)
+    assert lines.count("HALT") == execution.load_changes == 2
+    assert lines.count("WAIT SEC 30") == len(execution.stops)
+
+
+@pytest.mark.parametrize("motion", [{}, {"home": HOME}, {"home": HOME, "both_directions": True}])
+def test_urscript_moves_where_the_plan_says_line_by_line(chain, motion):
+    execution = execution_of(chain, dwell=2.5, **motion)
+    text = urscript_program(execution, chain, NAMES, FORCES, speed=0.25)
+    lines = text.splitlines()
+    assert all(UR_LINE.fullmatch(line) for line in lines)
+    moves = [re.findall(NUMBER, line.split("]")[0]) for line in lines if "movej" in line]
+    assert np.allclose(np.array(moves, dtype=float), planned(execution), rtol=0, atol=1e-9)
+    assert text.count("popup(") == 2 and text.count("sleep(2.5)") == len(execution.stops)
+    assert "v=0.25" in text and lines[-1] == "elastocal_plan()"
+
+
+def test_the_load_is_hung_before_the_first_loaded_reading_and_taken_off_after_the_last(chain):
+    lines = krl_program(execution_of(chain, home=HOME), chain, NAMES, FORCES).splitlines()
+    events = [
+        "load" if "load of" in line else "free"
+        for line in lines
+        if line.startswith("; measure")
+    ]  # fmt: skip
+    assert events == ["free"] * 5 + ["load"] * 5
+    hang, off = (k for k, line in enumerate(lines) if line == "HALT")
+    first = next(k for k, line in enumerate(lines) if "; measure" in line and "load of" in line)
+    last = max(k for k, line in enumerate(lines) if "; measure" in line)
+    assert lines[hang - 1].startswith("; hang the load of (0, 0, -2600) N")
+    assert lines[off - 1].startswith("; take the load off")
+    assert max(k for k in range(first) if "; measure" in lines[k]) < hang < first < last < off
+
+
+def test_via_points_are_moved_through_and_not_measured(chain):
+    q = random_poses(chain, 2, seed=5)
+    execution = schedule(q, Motion(home=HOME), Fence(q), iterations=50)
+    via = schedule(q, Motion(), Fence(q), via=HOME[None], iterations=50)
+    assert sum(len(s.via) for s in via.stops) == 1
+    text = krl_program(via, chain, NAMES)
+    assert text.count("PTP") == 3 and text.count("WAIT SEC") == 2
+    assert text.count("via point, not measured") == 1
+    assert krl_program(execution, chain, NAMES).count("PTP") == 5
+
+
+@pytest.mark.parametrize("write", [krl_program, urscript_program])
+def test_the_text_is_the_same_every_time_and_names_cannot_break_it(chain, write):
+    execution = execution_of(chain)
+    assert write(execution, chain, NAMES, FORCES) == write(execution, chain, NAMES, FORCES)
+    evil = ['"; HALT', "a\nEND", 'b")\nend', "Höhe µ", "\x00"]
+    text = write(execution, replace(chain, name='r"\nEND'), evil, FORCES)
+    assert text.isascii()
+    ours = write(execution, chain, NAMES, FORCES)
+    assert text.count("\n") == ours.count("\n") and text.count('"') == ours.count('"')
+
+
+@pytest.mark.parametrize("write", [krl_program, urscript_program])
+def test_other_arms_than_six_revolute_joints_are_refused(chain, write):
+    execution = execution_of(chain)
+    seven = Chain("seven", (*chain.joints, chain.joints[0]), np.eye(4))
+    sliding = replace(chain, joints=(replace(chain.joints[0], kind="prismatic"), *chain.joints[1:]))
+    with pytest.raises(InputError, match="has 7"):
+        write(execution, seven, NAMES)
+    with pytest.raises(InputError, match=f"joint {chain.joints[0].name} slides"):
+        write(execution, sliding, NAMES)
+
+
+@pytest.mark.parametrize("name", ["", "1plan", "my plan", "a" * 25, "plän", "a\nb"])
+def test_names_that_no_module_can_have(chain, name):
+    with pytest.raises(InputError, match="name of a KRL module"):
+        krl_program(execution_of(chain), chain, NAMES, name=name)
+    if name != "a" * 25:
+        with pytest.raises(InputError, match="name of a URScript function"):
+            urscript_program(execution_of(chain), chain, NAMES, name=name)
+
+
+def test_speeds_out_of_range(chain):
+    with pytest.raises(InputError, match="1 to 100 %"):
+        krl_program(execution_of(chain), chain, NAMES, percent=0)
+    with pytest.raises(InputError, match="at least"):
+        urscript_program(execution_of(chain), chain, NAMES, speed=0.0)
+
+
+def test_numbers_and_text_for_controllers():
+    assert [number(v, 6) for v in (-0.0, 1e-9, -1e-9, 1.5, -2600, 1e-6)] == [
+        "0", "0", "0", "1.5", "-2600", "0.000001",
+    ]  # fmt: skip
+    assert plain(' a "b"\t\n ü ') == "a 'b' ?"
+    assert load_name(np.array([-0.0, 0, 0])) == "no load"
+    assert load_name(np.array([-0.0, 1.5, -2600])) == "load of (0, 1.5, -2600) N"

@@ -1,0 +1,150 @@
+"""Measurements already done count as what identification would make of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
+from support.design_cells import FULL, all_loads, as_table, plan_cell, setup_of
+
+from elastocal.cell.arm_description import PolarNoise
+from elastocal.cell.work_cell import Cell
+from elastocal.measurements import Measurements
+from elastocal.model import Model
+from elastocal.planning import Known, PoseInformation, load_states, measured, next_number, predicted
+from elastocal.simulation import expand_plan
+from elastocal.simulation.simulate import simulate
+
+CHAIN = kr270_chain()
+BOTH = np.array([[0.0, 0, 0], DOWN])
+POLAR = PolarNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
+POSES = random_poses(CHAIN, 80, seed=1)
+FEW = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
+
+
+def campaign(cell: Cell, q: NDArray, noise: bool = False, x: NDArray | None = None) -> Measurements:
+    """The readings of poses q, each repeated, in the cell's load states."""
+    model = Model.assembled(CHAIN, cell)
+    table = expand_plan(as_table(q), tuple(cell.tool.markers), cell.design.repeats, DOWN)
+    return simulate(model, table, model.nominal if x is None else x, 7, noise=noise)
+
+
+def gathered(cell: Cell, q: NDArray, x: NDArray) -> NDArray:
+    """Σ B_iᵀ Σ_i⁻¹ B_i over poses to come, in the parameters' units."""
+    n = len(x)
+    found = PoseInformation(
+        Model.assembled(CHAIN, cell), load_states(cell), x[None], np.arange(n), np.ones(n)
+    ).blocks(q, all_loads(q))[0]
+    return np.einsum("nri,nrj->ij", found, found)
+
+
+def relative(found: NDArray, expected: NDArray) -> float:
+    scale = np.sqrt(np.diag(expected))
+    scale[scale == 0] = 1.0
+    return float(np.abs((found - expected) / np.outer(scale, scale)).max())
+
+
+@pytest.mark.parametrize(
+    ("observed", "repeatability", "shuffled"),
+    [
+        ("deflection", 0.0, True),
+        ("deflection", 4e-5, True),
+        ("position", 0.0, False),
+        ("position", 4e-5, True),
+        ("pose", 4e-5, False),
+    ],
+)
+def test_a_campaign_tells_what_its_poses_would(
+    observed: str, repeatability: float, shuffled: bool
+) -> None:
+    effects = ("joint_compliance",) if observed == "deflection" else FEW
+    cell = plan_cell(effects, observed, POLAR, loads=BOTH, repeats=3, repeatability=repeatability)
+    table = campaign(cell, TABLE_2)
+    if shuffled:
+        table = table.take(np.random.default_rng(0).permutation(len(table)))
+    done = measured(Model.assembled(CHAIN, cell), table, ())
+    assert relative(done.information, gathered(cell, TABLE_2, done.x)) < 1e-6
+    assert "identified" in done.note
+    assert done.numbers == len(table) * {"deflection": 1.5, "position": 3, "pose": 6}[observed]
+
+
+def test_markers_noise_of_their_own_counts_for_what_is_done_too() -> None:
+    """The cell may state a σ per marker instead of the tracker's."""
+    sigmas = {"M1": 10e-6, "M2": 20e-6, "M3": 40e-6}
+    cell = plan_cell(noise=None, loads=DOWN[None], marker_sigma=sigmas)
+    done = measured(Model.assembled(CHAIN, cell), campaign(cell, TABLE_2), ())
+    assert relative(done.information, gathered(cell, TABLE_2, done.x)) < 1e-6
+    stated = replace(campaign(cell, TABLE_2), sigma=np.full((90, 3), 1e-5))
+    own = measured(Model.assembled(CHAIN, cell), stated, ())
+    assert own.information[1, 1] > 1.5 * done.information[1, 1]
+
+
+def test_the_same_campaign_again_halves_the_variances() -> None:
+    cell = plan_cell(loads=DOWN[None], repeats=2)
+    once = setup_of(cell, POSES)
+    done = measured(once.information.model, campaign(cell, TABLE_2), ())
+    twice = setup_of(cell, POSES, known=Known(done=done))
+    plan = (TABLE_2, all_loads(TABLE_2))
+    assert twice.value(*plan) == pytest.approx(once.value(*plan) / 2, rel=1e-6)
+
+    def variances(setup: Any) -> NDArray:
+        M = setup.gathered(setup.information.blocks(*plan))[0]
+        return np.array([p.std**2 for p in predicted(setup.information.model, setup.found, M, 270)])
+
+    assert np.allclose(variances(twice), variances(once) / 2, rtol=1e-6)
+
+
+def test_what_is_done_is_linearised_where_it_says_the_arm_is() -> None:
+    cell = plan_cell(loads=DOWN[None])
+    model = Model.assembled(CHAIN, cell)
+    truth = model.nominal * np.array([1, 1.3, 0.8, 1.2, 0.9, 1.1])
+    done = measured(model, campaign(cell, TABLE_2, noise=True, x=truth), ())
+    assert done.x == pytest.approx(truth, rel=0.02)
+    setup = setup_of(cell, POSES, known=Known(done=done))
+    assert np.array_equal(setup.information.scenarios, done.x[None])
+
+
+def test_a_campaign_shows_what_no_pose_to_come_would() -> None:
+    """The load once pulled from the side; a plan with a vertical load needs joint 1 no more."""
+    cell = plan_cell(loads=DOWN[None])
+    pulled = campaign(cell, TABLE_2)
+    force = np.where(pulled.force.any(axis=1)[:, None], [0.0, 1500.0, -500.0], 0.0)
+    model = Model.assembled(CHAIN, cell)
+    done = measured(model, simulate(model, replace(pulled, force=force), model.nominal, 0), ())
+    setup = setup_of(cell, POSES, known=Known(done=done))
+    assert setup.information.names == model.names
+    assert setup.warnings == ()
+
+
+def test_too_few_measurements_count_at_the_nominal_arm() -> None:
+    cell = plan_cell(FULL, "position", loads=BOTH)
+    model = Model.assembled(CHAIN, cell)
+    table = campaign(cell, TABLE_2[:1])
+    done = measured(model, table, ())
+    assert np.array_equal(done.x, model.nominal)
+    assert "nominal arm" in done.note
+    assert "do not suffice" in done.note
+    assert relative(done.information, gathered(cell, TABLE_2[:1], done.x)) < 1e-6
+
+
+def test_held_parameters_stay_where_they_are() -> None:
+    cell = plan_cell(loads=DOWN[None])
+    model = Model.assembled(CHAIN, cell)
+    done = measured(model, campaign(cell, TABLE_2, x=model.nominal * 1.2), ("joint4",))
+    assert done.x[3] == model.nominal[3]
+    assert done.x[5] != pytest.approx(model.nominal[5], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("labels", "number"), [(("1", "2"), 3), (("7+", "7-"), 8), (("warm-up", "12", "3b"), 13)]
+)
+def test_new_poses_are_numbered_after_those_measured(labels, number):
+    class Table:
+        configuration_labels = labels
+
+    assert next_number(Table()) == number
+    assert next_number(None) == 1

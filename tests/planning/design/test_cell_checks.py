@@ -1,0 +1,132 @@
+"""What the cell asks of a plan is held against the robot: numbers of joints, units, limits."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.calibration import random_chain
+from support.cells import kr270_cell, kr270_chain
+from support.robots import KR270
+
+from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetPose
+from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell.workspace_rules import CarriedBody, Solid, Workspace
+from elastocal.errors import InputError
+from elastocal.planning import check_cell
+from elastocal.planning import test_poses as target_poses
+
+HOME = np.radians([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
+HIGH = np.radians([0.0, 10.0, 90.0, 0.0, 0.0, 0.0])  # joint 2 ends at 0°
+BALL = Solid("ball", "sphere", np.array([0.1]))
+
+
+def cell(workspace: Workspace | None = None, model: Any = None, **design: Any) -> Cell:
+    found = kr270_cell()
+    spec = found.model if model is None else replace(found.model, **model)
+    return replace(
+        found, workspace=workspace or Workspace(), design=DesignSpec(**design), model=spec
+    )
+
+
+@pytest.mark.parametrize(
+    "good",
+    [
+        cell(),
+        cell(Workspace(link_radius=(0.1,), torque_limits=(1e3,) * 6)),
+        cell(Workspace(link_radius=(0.1,) * 6)),
+        cell(Workspace(bodies=(CarriedBody(BALL, "link6"), CarriedBody(BALL, "base")))),
+        cell(levels={"joint2": (-np.pi / 2, 0.0)}),
+        cell(model={"compliance_levels": {"joint2": (-1.0, 0.0)}}, levels={"joint2": (-1.0,)}),
+        cell(motion=Motion(home=HOME, speed=np.ones(6))),
+        cell(motion=Motion(speed=np.ones(1), degrees=True)),
+        cell(test_poses=(TargetPose(HOME, degrees=True), TargetPose(HOME))),
+    ],
+)
+def test_what_fits_passes(good: Cell) -> None:
+    check_cell(good, kr270_chain())
+
+
+@pytest.mark.parametrize(
+    ("bad", "told"),
+    [
+        (cell(Workspace(link_radius=(0.1, 0.1))), ["link_radius_mm has 2", "6 joints", "for all"]),
+        (cell(Workspace(torque_limits=(1e3,))), ["torque_limits_Nm has 1 numbers", "give 6"]),
+        (
+            cell(Workspace(bodies=(CarriedBody(BALL, "link7"),))),
+            ["on of [[workspace.body]] no. 1 is 'link7'", "link1 to link6"],
+        ),
+        (cell(levels={"joint7": (0.0,)}), ["[design.levels] names joint7", "6 joints"]),
+        (cell(levels={"joint2": (-1.0, 0.2)}), ["joint2 at 11.4592°", "-146° to 0°"]),
+        (
+            cell(model={"compliance_levels": {"joint2": (-1.0,)}}, levels={"joint2": (-0.9,)}),
+            ["none of its levels in [model.compliance_levels]", "-51.5662°"],
+        ),
+        (cell(motion=Motion(home=HOME[:5])), ["design.motion.home_si has 5 numbers", "give 6"]),
+        (cell(motion=Motion(home=HIGH)), ["design.motion.home_si: joint2", "at 10°", "to 0°"]),
+        (cell(motion=Motion(speed=np.ones(1))), ["design.motion.speed_si has 1 numbers"]),
+        (
+            cell(motion=Motion(speed=np.ones(2), degrees=True)),
+            ["design.motion.speed_deg_per_s has 2 numbers", "or one for all"],
+        ),
+        (
+            cell(test_poses=(TargetPose(HOME), TargetPose(HIGH, degrees=True))),
+            ["q_deg of [[design.test_pose]] no. 2: joint2", "at 10°", "correct the posture"],
+        ),
+        (cell(test_poses=(TargetPose(HOME[:1]),)), ["q_si of [[design.test_pose]] no. 1 has 1"]),
+    ],
+)
+def test_what_does_not_fit_is_told_with_key_found_and_remedy(bad: Cell, told: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        check_cell(bad, kr270_chain())
+    assert not [part for part in told if part not in str(caught.value)], str(caught.value)
+
+
+def test_the_cells_own_limits_count() -> None:
+    narrow = replace(cell(motion=Motion(home=HOME)), limits={"joint2": (-1.0, -0.5)})
+    with pytest.raises(InputError, match=r"joint2 .* at -90° is beyond its limits"):
+        check_cell(narrow, kr270_chain())
+
+
+@pytest.mark.parametrize(
+    ("bad", "told"),
+    [
+        (cell(test_poses=(TargetPose(HOME, degrees=True),)), "q_deg of .* use q_si of"),
+        (cell(motion=Motion(home=HOME, degrees=True)), "home_deg gives degrees.* use .*home_si"),
+        (cell(motion=Motion(speed=np.ones(6), degrees=True)), "speed_deg_per_s .* use .*speed_si"),
+    ],
+)
+def test_degrees_do_not_fit_a_prismatic_joint(bad: Cell, told: str) -> None:
+    chain = random_chain(seed=1)
+    slide = replace(chain.joints[2], kind="prismatic")
+    chain = replace(chain, joints=(*chain.joints[:2], slide, *chain.joints[3:]))
+    with pytest.raises(InputError, match=rf"joint3 \(q3\) is prismatic|{told}") as caught:
+        check_cell(bad, chain)
+    assert "prismatic" in str(caught.value)
+
+
+def test_the_cell_shown_in_the_documentation_fits_its_robot(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "file-formats.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```toml(?: workspace| design)?\n(.*?)```", page, re.S)
+    assert len(blocks) == 3
+    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
+    (tmp_path / "fixture.stl").write_text("read by the collision check", encoding="utf-8")
+    joints = ",".join(f"q{i}_deg" for i in range(1, 7))
+    (tmp_path / "path.csv").write_text(f"{joints}\n0,-90,90,0,30,0\n", encoding="utf-8")
+    (tmp_path / "cell.toml").write_text("\n".join(blocks), encoding="utf-8")
+    shown = read_cell(tmp_path / "cell.toml")
+    check_cell(shown, kr270_chain())
+    targets = target_poses.test_poses(shown, kr270_chain())
+    assert len(targets.q) == 1 + 1 + 20
+
+
+def test_a_prismatic_joint_beyond_its_limits_is_told_in_metres() -> None:
+    chain = random_chain(seed=1)
+    slide = replace(chain.joints[2], kind="prismatic", lower=0.0, upper=0.5)
+    chain = replace(chain, joints=(*chain.joints[:2], slide, *chain.joints[3:]))
+    with pytest.raises(InputError, match=r"joint3 .* at 0\.8 m is beyond its limits, 0 m to"):
+        check_cell(cell(test_poses=(TargetPose(np.array([0, 0, 0.8, 0, 0, 0])),)), chain)

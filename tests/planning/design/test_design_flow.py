@@ -1,0 +1,330 @@
+"""From a cell to a plan: what is asked for is what comes, feasible, and worth what it says."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.calibration import placement, random_chain
+from support.cells import DOWN
+from support.design_cells import FULL, any_cell, plan_cell, scara, sliding_chain
+from support.robots import packaged_urdf
+
+from elastocal.cell.arm_description import Robot
+from elastocal.cell.plan_wishes import Motion, TargetPose
+from elastocal.cell.work_cell import Cell
+from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.errors import InputError, InsufficientDataError
+from elastocal.model import Chain, joint_limits, read_urdf
+from elastocal.planning import DesignOptions, DesignSearch, Effort, Feasibility, Plan, Setup, set_up
+from elastocal.planning import design as design_module
+from elastocal.planning.design import design
+from elastocal.planning.information import ALL_LOADS
+from elastocal.planning.search import EFFORTS
+
+BOTH = np.array([[0.0, 0, 0], DOWN])
+LIGHT = np.array([[0.0, 0, 0], [0.0, 0, -60.0]])
+GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")
+FEW = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
+
+
+def packaged(name: str, effects: Any, **design_: Any) -> Cell:
+    path, flange = packaged_urdf(name)
+    chain = read_urdf(path, flange=flange)
+    return replace(any_cell(chain, effects, **design_), robot=Robot(path, flange=flange))
+
+
+def at(x: float, y: float, z: float) -> NDArray:
+    return placement([x, y, z])
+
+
+def work_cell(**design_: Any) -> Cell:
+    """The KR 270-2 between a pillar and a table, a weight hanging from it by a rope."""
+    workspace = Workspace(
+        obstacles=(
+            Solid("pillar", "cylinder", np.array([0.2, 3.0]), at(1.6, 1.3, 1.5)),
+            Solid("table", "box", np.array([1.0, 1.0, 0.8]), at(-1.2, 1.6, 0.4)),
+        ),
+        bodies=(CarriedBody(Solid("tool", "box", np.array([0.2, 0.2, 0.25]), at(0, 0, 0.125))),),
+        keep_out=(HalfSpace("floor", np.zeros(3), np.array([0.0, 0, 1])),),
+        load=HangingLoad(Solid("weight", "sphere", np.array([0.2])), rope=0.3, min_height=0.1),
+        link_radius=(0.25, 0.2, 0.2, 0.15, 0.12, 0.1),
+        clearance=0.02,
+    )
+    return replace(plan_cell(**design_), workspace=workspace)
+
+
+HOME = np.radians([0.0, -90, 90, 0, 45, 0])
+LEVELS = {"joint2": (-0.5, -1.2, -2.0)}
+CELLS: dict[str, Callable[[], Cell]] = {
+    "UR10, geometry": lambda: packaged("UR10", GEOMETRY, poses=12, candidates=200),
+    "7 axes, D": lambda: packaged(
+        "iiwa14", ("base_frame", "joint_compliance", "marker_position"),
+        loads=LIGHT, poses=8, candidates=150, criterion="D",
+    ),
+    "work cell": lambda: work_cell(
+        loads=DOWN[None], poses=7, candidates=150, levels=LEVELS,
+        motion=Motion(home=HOME, speed=np.radians([60.0] * 6)),
+    ),
+    "both directions": lambda: work_cell(
+        loads=DOWN[None], poses=5, candidates=100,
+        motion=Motion(home=HOME, both_directions=True, overshoot=0.05),
+    ),
+    "load chosen": lambda: plan_cell(
+        ("joint_compliance", "joint_offset"), "position", loads=BOTH, load_choice=True, poses=9,
+        candidates=200, levels=LEVELS,
+    ),
+    "full poses, A": lambda: plan_cell(
+        FEW, "pose", loads=BOTH, poses=6, candidates=120, criterion="A",
+        interest=("joint_compliance",),
+    ),
+}  # fmt: skip
+CHAINS: dict[str, tuple[Callable[[], Chain], Callable[[Chain], Cell]]] = {
+    "scara, E": (
+        scara, lambda c: any_cell(c, FEW, loads=LIGHT, poses=9, candidates=150, criterion="E")
+    ),
+    "sliding level": (
+        sliding_chain,
+        lambda c: any_cell(c, ("joint_compliance",), loads=LIGHT, poses=5, candidates=60,
+                           levels={"joint2": (-0.2, 0.1, 0.3)}, per_level=(1, 3, 1)),
+    ),
+    "robust": (
+        lambda: random_chain(2),
+        lambda c: any_cell(c, FEW, loads=LIGHT, poses=8, candidates=80, robust="worst",
+                           robust_samples=2),
+    ),
+}  # fmt: skip
+LONG = ("UR10, geometry", "full poses, A", "robust")
+ALL = [
+    pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in (*CELLS, *CHAINS)
+]
+
+
+@lru_cache
+def planned(name: str, effort: Effort = "quick", seed: int = 0) -> tuple[Plan, Setup, Feasibility]:
+    """The plan of a cell, what was known before it was chosen, and the cell's rules."""
+    observed: list[Setup] = []
+
+    def watched(*args: Any) -> Setup:
+        observed.append(set_up(*args))
+        return observed[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(design_module, "set_up", watched)
+        if name in CELLS:
+            cell = CELLS[name]()
+        else:
+            make, cell_for = CHAINS[name]
+            chain = make()
+            cell = cell_for(chain)
+            patch.setattr("elastocal.model.manipulator.load_chain", lambda cell: chain)
+        plan = design(cell, DesignOptions(effort, seed))
+    return plan, observed[0], Feasibility(plan.model.cell, plan.model.chain)
+
+
+def loads_of(plan: Plan, k: int) -> NDArray:
+    return plan.forces if plan.load[k] == ALL_LOADS else plan.forces[plan.load[k]][None]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_pose_is_allowed_in_every_state_it_is_measured_in(name: str) -> None:
+    plan, _, rules = planned(name)
+    lower, upper = joint_limits(plan.model.cell, plan.model.chain)
+    assert ((lower - 1e-12 <= plan.q) & (plan.q <= upper + 1e-12)).all()
+    for k in range(len(plan.q)):
+        for force in loads_of(plan, k):
+            verdict = rules.check(plan.q[k], force)
+            assert verdict.ok.all(), verdict.removed_by
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_reading_has_a_stop_and_every_move_is_free(name: str) -> None:
+    plan, _, rules = planned(name)
+    execution, motion = plan.execution, plan.model.cell.design.motion
+    here, loaded, moves = motion.home, False, []
+    for stop in execution.stops:
+        for done, goal in enumerate([*stop.via, stop.q]):
+            if stop.change_after == done:
+                loaded = bool(plan.forces[stop.load].any())
+            if here is not None:
+                moves.append((here, goal, loaded))
+            here = goal
+        if stop.change_after == len(stop.via) + 1:
+            loaded = bool(plan.forces[stop.load].any())
+        assert loaded == bool(plan.forces[stop.load].any())
+    if motion.home is not None:
+        for goal in [*execution.home_via, motion.home]:
+            moves.append((here, goal, False))
+            here = goal
+    start, end, hanging = (np.array(v) for v in zip(*moves, strict=True))
+    assert rules.paths_free(start, end, hanging).all()
+    visits = {(s.pose, s.load) for s in execution.stops}
+    states = np.arange(len(plan.forces))
+    wanted = {
+        (k, int(s))
+        for k, load in enumerate(plan.load)
+        for s in (states if load == ALL_LOADS else [load])
+    }
+    assert visits == wanted
+    assert len({(s.pose, s.load, s.side) for s in execution.stops}) == len(execution.stops)
+    most = 2 if motion.both_directions else 1
+    times = Counter((s.pose, s.load) for s in execution.stops)
+    assert set(times.values()) <= {1, most}
+    assert {pose for (pose, _), n in times.items() if n < most} == set(execution.one_sided)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_levels_have_their_shares(name: str) -> None:
+    plan, _, _ = planned(name)
+    spec = plan.model.cell.design
+    counts = np.bincount(plan.group)
+    if not spec.levels:
+        assert counts.tolist() == [spec.poses]
+        return
+    ((joint, levels),) = spec.levels.items()
+    assert plan.level_joint == joint
+    assert (plan.q[:, int(joint[-1]) - 1] == np.array(levels)[plan.group]).all()
+    if spec.per_level:
+        assert counts.tolist() == list(spec.per_level)
+    else:
+        assert counts.sum() == spec.poses
+        assert np.ptp(counts) <= 1
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_value_is_that_of_the_poses_and_no_less_than_its_bound(name: str) -> None:
+    plan, setup, _ = planned(name)
+    value = setup.value(plan.q, plan.load)
+    assert plan.value == pytest.approx(value, rel=1e-9)
+    assert (plan.reported, plan.unit) == setup.criterion.reported(plan.value)
+    c = plan.certificate
+    assert c.bound_pool is not None and c.efficiency_pool is not None
+    assert 0 < c.bound_pool <= value * (1 + 1e-9)
+    assert 0 < c.efficiency_pool <= 1
+    assert c.efficiency_pool == pytest.approx(min(c.bound_pool / value, 1.0), rel=1e-9)
+    assert 0 < c.efficiency_continuum <= c.efficiency_pool * (1 + 1e-9)
+    assert plan.bound_reported == setup.criterion.reported(c.bound_pool)[0]
+    assert c.pool == plan.model.cell.design.candidates
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_what_is_predicted_is_the_inverse_of_the_information(name: str) -> None:
+    plan, setup, _ = planned(name)
+    M = setup.gathered(setup.information.blocks(plan.q, plan.load))[0]
+    scale = np.sqrt(np.diag(M))
+    V = np.linalg.inv(M / np.outer(scale, scale)) / np.outer(scale, scale)
+    assert tuple(p.name for p in plan.predicted) == setup.information.names
+    std = np.sqrt(np.diag(V)) * setup.information.sizes
+    assert np.allclose([p.std for p in plan.predicted], std, rtol=1e-5)
+    assert all(r.loss >= 1 - 1e-9 for r in plan.reasons)
+    assert len(plan.reasons) == len(plan.q)
+
+
+def test_the_same_seed_gives_the_same_plan_and_another_another() -> None:
+    first, again, other = (
+        design(plan_cell(loads=DOWN[None], poses=5, candidates=60), DesignOptions("quick", seed))
+        for seed in (3, 3, 4)
+    )
+    assert np.array_equal(first.q, again.q)
+    assert first.to_json() == again.to_json()
+    assert not np.array_equal(first.q, other.q)
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        lambda: plan_cell(loads=DOWN[None], poses=6, candidates=80, levels=LEVELS),
+        lambda: plan_cell(("joint_offset", "joint_compliance"), "position", loads=BOTH, poses=6,
+                          candidates=60, criterion="D"),
+    ],
+)  # fmt: skip
+@pytest.mark.long
+def test_more_effort_is_never_worse(cell: Callable[[], Cell]) -> None:
+    quick, normal, thorough = (
+        design(cell(), DesignOptions(effort)) for effort in ("quick", "normal", "thorough")
+    )
+    assert thorough.value <= normal.value * (1 + 1e-9) <= quick.value * (1 + 2e-9)
+    assert thorough.value < quick.value
+    assert thorough.polished > 0
+    for plan in (quick, normal, thorough):
+        assert plan.certificate.bound_pool <= plan.value * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("make", [plan_cell, pytest.param(work_cell, marks=pytest.mark.long)])
+def test_normal_effort_polishes_off_the_pool_and_stays_inside_the_rules(
+    make: Callable[..., Cell], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if make is plan_cell:
+        monkeypatch.setitem(
+            EFFORTS, "normal", DesignSearch(rounds=1, starts=4, points=256, ascents=1)
+        )
+    n = 40 if make is plan_cell else 150
+    plans = {
+        effort: design(make(loads=DOWN[None], poses=4, candidates=n), DesignOptions(effort))
+        for effort in ("quick", "normal")
+    }
+    normal = plans["normal"]
+    assert normal.value <= plans["quick"].value
+    assert normal.polished > 0
+    rules = Feasibility(normal.model.cell, normal.model.chain)
+    for force in BOTH:
+        assert rules.check(normal.q, force).ok.all()
+
+
+# --- what the cell says and the plan heeds -----------------------------------------------------
+
+
+def test_measured_torques_are_computed_for_poses_to_come_and_it_is_said() -> None:
+    cell = plan_cell(loads=DOWN[None], poses=5, candidates=60)
+    own = replace(cell, model=replace(cell.model, torque="measured"))
+    plan, usual = design(own, DesignOptions("quick")), design(cell, DesignOptions("quick"))
+    assert [w for w in plan.warnings if "torques" in w]
+    assert plan.value == usual.value
+    assert np.array_equal(plan.q, usual.q)
+
+
+def test_test_poses_are_where_the_plan_makes_position_certain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A plan for one posture is better there than one for another, and worse elsewhere."""
+    here, there = np.radians([0.0, -90, 90, 0, 30, 0]), np.radians([60.0, -30, -40, 80, -50, 9])
+    plans, setups = [], []
+    for q in (here, there):
+        pose = TargetPose(q, np.array([0.0, 0, -1500.0]))
+        cell = plan_cell(loads=DOWN[None], poses=5, candidates=150, test_poses=(pose,))
+        name = f"posture {len(plans)}"
+        monkeypatch.setitem(CELLS, name, lambda cell=cell: cell)
+        plan, setup, _ = planned(name)
+        plans.append(plan)
+        setups.append(setup)
+    for k in (0, 1):
+        own = setups[k].value(plans[k].q, plans[k].load)
+        assert own < setups[k].value(plans[1 - k].q, plans[1 - k].load)
+
+
+@pytest.mark.parametrize(
+    ("cell", "error", "told"),
+    [
+        (plan_cell(poses=5, candidates=50), InputError, "needs a load"),
+        (plan_cell(loads=DOWN[None], noise=None, candidates=50), InputError, "noise of a reading"),
+        (
+            plan_cell(FULL, "position", loads=BOTH, poses=1, candidates=50),
+            InsufficientDataError,
+            "poses",
+        ),
+        (
+            plan_cell(loads=DOWN[None], criterion="D", interest=("joint1",), candidates=50),
+            InsufficientDataError,
+            "joint1.compliance",
+        ),
+    ],
+)
+def test_what_no_plan_can_do_is_said(cell: Cell, error: type[Exception], told: str) -> None:
+    with pytest.raises(error, match=told):
+        design(cell, DesignOptions("quick"))

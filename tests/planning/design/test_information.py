@@ -1,0 +1,139 @@
+"""The information of planned poses is what identification would find in their readings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import DOWN, TABLE_2, kr270_cell, kr270_chain
+
+from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError
+from elastocal.identification import weights_for
+from elastocal.model import Model, observe
+from elastocal.planning import PoseInformation, load_states
+from elastocal.planning.information import ALL_LOADS
+from elastocal.simulation import expand_plan
+from elastocal.simulation.simulate import simulate
+
+POLAR = PolarNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
+AXIS = CartesianNoise(np.array([10e-6, 15e-6, 20e-6]))
+GEOMETRY = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
+
+
+def cell_for(observe_: str, noise: object, **design: object) -> Cell:
+    effects = ("joint_compliance",) if observe_ == "deflection" else GEOMETRY
+    cell = kr270_cell(effects, observe_)
+    tracker = Tracker(np.array([3.0, -2.0, 0.5]), noise)
+    return replace(cell, tracker=tracker, design=DesignSpec(**design))
+
+
+def information_of(cell: Cell, x: np.ndarray | None = None) -> PoseInformation:
+    model = Model.assembled(kr270_chain(), cell)
+    x = model.nominal if x is None else x
+    n = len(model.parameters)
+    return PoseInformation(model, load_states(cell), x[None], np.arange(n), np.ones(n))
+
+
+def gathered(information: PoseInformation, q: np.ndarray) -> np.ndarray:
+    B = information.blocks(q, np.full(len(q), ALL_LOADS))[0].reshape(-1, len(information.columns))
+    return B.T @ B
+
+
+def relative(found: np.ndarray, expected: np.ndarray) -> float:
+    scale = np.sqrt(np.diag(expected))
+    scale[scale == 0] = 1.0
+    return float(np.abs((found - expected) / np.outer(scale, scale)).max())
+
+
+@pytest.mark.parametrize("noise", [POLAR, AXIS])
+@pytest.mark.parametrize("observed", ["position", "deflection"])
+def test_information_of_poses_is_that_of_their_readings(observed: str, noise: object) -> None:
+    """Σ B_iᵀΣ_i⁻¹B_i over poses equals BᵀΣ⁻¹B of the simulated table, three repeats and all."""
+    cell = cell_for(observed, noise, loads=np.array([[0.0, 0, 0], DOWN]), repeats=3)
+    information = information_of(cell)
+    model = information.model
+    poses = expand_plan(_plan(information), tuple(cell.tool.markers), 3, DOWN)
+    table = simulate(model, poses, model.nominal, 0, noise=False)
+    seen = observe(table, observed)
+    B = weights_for(seen, cell.tracker).apply(model.regressor(table, None, None, seen).B)
+    assert relative(gathered(information, TABLE_2), B.T @ B) < 1e-9
+
+
+def _plan(information: PoseInformation):
+    rows = information.rows(TABLE_2, np.full(len(TABLE_2), ALL_LOADS), information.scenarios[0])
+    first = np.unique(rows.configuration, return_index=True)[1]
+    return replace(rows.take(first), force=np.zeros((len(first), 3)), sigma=None)
+
+
+def test_loads_chosen_per_pose_share_the_information_of_all() -> None:
+    both = np.array([[0.0, 0, 0], DOWN])
+    every = information_of(cell_for("position", AXIS, loads=both))
+    one = information_of(cell_for("position", AXIS, loads=both, load_choice=True))
+    single = [one.blocks(TABLE_2, np.full(len(TABLE_2), k))[0] for k in range(2)]
+    summed = sum(np.einsum("nri,nrj->ij", B, B) for B in single)
+    assert relative(summed, gathered(every, TABLE_2)) < 1e-10
+
+
+def test_a_configuration_effect_bounds_what_repeats_can_tell() -> None:
+    """With τ ≫ σ a pose of M markers tells at most what one exact reading with τ would."""
+    tau = 1e-3
+    cell = cell_for("deflection", AXIS, loads=DOWN[None], repeats=1000, repeatability=tau)
+    model = Model.assembled(
+        kr270_chain(), replace(cell, tool=replace(cell.tool, markers={"M": np.zeros(3)}))
+    )
+    n = len(model.parameters)
+    x = model.nominal
+    found = PoseInformation(model, load_states(model.cell), x[None], np.arange(n), np.ones(n))
+    table = found.rows(TABLE_2, np.full(15, ALL_LOADS), x)
+    B = model.regressor(table, x).B
+    assert relative(gathered(found, TABLE_2), B.T @ B / tau**2) < 1e-4
+
+
+def test_both_directions_are_two_visits() -> None:
+    once = cell_for("deflection", AXIS, loads=DOWN[None], repeatability=40e-6)
+    motion = replace(once.design.motion, both_directions=True)
+    twice = replace(once, design=replace(once.design, motion=motion))
+    found = gathered(information_of(twice), TABLE_2)
+    assert relative(found, 2 * gathered(information_of(once), TABLE_2)) < 1e-12
+
+
+def test_markers_have_their_own_noise_where_stated() -> None:
+    sigmas = {"M1": 10e-6, "M2": 20e-6, "M3": 40e-6}
+    cell = cell_for("position", None, marker_sigma=sigmas)
+    own = information_of(cell).blocks(TABLE_2, np.full(15, ALL_LOADS))[0]
+    plain = information_of(cell_for("position", CartesianNoise(np.full(3, 10e-6))))
+    same = plain.blocks(TABLE_2, np.full(15, ALL_LOADS))[0]
+    assert np.allclose(
+        own.reshape(15, 3, 3, -1), same.reshape(15, 3, 3, -1) / [[[1]], [[2]], [[4]]]
+    )
+
+
+def test_scenarios_are_linearised_at_their_own_values() -> None:
+    cell = cell_for("deflection", AXIS, loads=DOWN[None])
+    base = information_of(cell)
+    soft = base.model.nominal * 2
+    two = replace(base, scenarios=np.stack([base.model.nominal, soft]))
+    load = np.full(15, ALL_LOADS)
+    blocks = two.blocks(TABLE_2, load)
+    assert np.allclose(blocks[0], base.blocks(TABLE_2, load)[0])
+    assert np.allclose(blocks[1], information_of(cell, soft).blocks(TABLE_2, load)[0])
+    assert not np.allclose(blocks[0], blocks[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        (cell_for("position", None), "needs the noise of a reading"),
+        (cell_for("deflection", AXIS), "needs a load"),
+        (cell_for("deflection", AXIS, loads=np.zeros((1, 3))), "needs a load"),
+        (cell_for("deflection", AXIS, loads=DOWN[None], load_choice=True), "load_choice"),
+        (cell_for("position", AXIS, marker_sigma={"M1": 1e-5}), "no σ for marker"),
+    ],
+)
+def test_what_a_plan_needs_to_know_is_asked_for(cell: Cell, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        information_of(cell).blocks(TABLE_2, np.full(15, ALL_LOADS))

@@ -1,0 +1,74 @@
+"""A pose that no move reaches does not cost the user the whole plan: the best other replaces it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.cells import DOWN, kr270_chain, random_poses
+from support.design_cells import all_loads, plan_cell, setup_of
+
+from elastocal.planning import Certificate, Feasibility, Selection, Unreachable, ordered
+from elastocal.planning.search import MOST_REPLACED
+
+CHAIN = kr270_chain()
+CELL = plan_cell(("joint_compliance",), loads=DOWN[None])
+SHARES = np.array([6])
+
+
+class Walled(Feasibility):
+    """No move begins or ends beyond joint1 = `wall`."""
+
+    wall = np.inf
+
+    def paths_free(self, q_from: Any, q_to: Any, loaded: Any) -> Any:
+        return (np.atleast_2d(q_from)[:, 0] < self.wall) & (np.atleast_2d(q_to)[:, 0] < self.wall)
+
+
+def selection() -> tuple[Any, Selection]:
+    q = random_poses(CHAIN, 60, seed=2)
+    setup = setup_of(CELL, q)
+    pool = setup.pool(q, all_loads(q), np.zeros(len(q), dtype=np.int64))
+    chosen = np.argsort(q[:, 0])[[0, 10, 20, 30, 40, 59]]
+    value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
+    certificate = Certificate(len(pool), value / 2, 0.5, value / 4, 0.25)
+    return setup, Selection(pool, chosen, value, certificate, 50)
+
+
+def walled(wall: float) -> Walled:
+    feasibility = Walled(CELL, CHAIN)
+    feasibility.wall = wall
+    return feasibility
+
+
+def test_a_plan_whose_moves_are_free_is_left_alone() -> None:
+    setup, found = selection()
+    after, execution, told = ordered(setup, found, SHARES, walled(np.inf), 0, lambda text: None)
+    assert set(after.chosen) == set(found.chosen) and told == []
+    assert {stop.pose for stop in execution.stops} == set(range(6))
+
+
+def test_unreachable_poses_are_replaced_and_the_bound_still_holds() -> None:
+    setup, found = selection()
+    wall = np.sort(found.pool.q[:, 0])[45]
+    after, _, told = ordered(setup, found, SHARES, walled(wall), 0, lambda text: None)
+    q = after.pool.q[after.chosen]
+    assert (q[:, 0] < wall).all() and len(q) == 6
+    assert after.value == pytest.approx(
+        float(setup.criterion.value(setup.gathered(after.pool.blocks[:, after.chosen])))
+    )
+    c = after.certificate
+    assert c.bound_pool == found.certificate.bound_pool
+    assert c.efficiency_pool == pytest.approx(c.bound_pool / after.value)
+    assert c.efficiency_continuum == pytest.approx(found.certificate.bound_continuum / after.value)
+    assert len(told) == 1 and "left out" in told[0]
+
+
+def test_a_cell_without_any_free_move_is_said_to_be_one() -> None:
+    setup, found = selection()
+    pool = found.pool.take(np.arange(len(found.pool)))
+    assert len(pool) > MOST_REPLACED
+    with pytest.raises(Unreachable, match="cannot be reached"):
+        ordered(setup, replace(found, pool=pool), SHARES, walled(-np.inf), 0, lambda text: None)

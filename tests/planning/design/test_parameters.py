@@ -1,0 +1,245 @@
+"""Which parameters a plan can make certain, and what is said of the others."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
+from support.design_cells import FULL, all_loads, any_cell, plan_cell, scara, setup_of, spread
+
+from elastocal.cell.plan_wishes import TargetPose
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError, InsufficientDataError
+from elastocal.identification import GaussianPrior, Options
+from elastocal.identification.identify import identify
+from elastocal.model import Model
+from elastocal.planning import Known, PoseInformation, Setup, load_states
+from elastocal.planning import information as parameters
+from elastocal.simulation.simulate import simulate
+
+CHAIN = kr270_chain()
+BOTH = np.array([[0.0, 0, 0], DOWN])
+SIDEWAYS = np.array([0.0, 1500.0, 0.0])
+POSES = random_poses(CHAIN, 120, seed=1)
+
+
+def stacked(cell: Cell, q: NDArray, chain: Any = CHAIN) -> tuple[Model, NDArray]:
+    """B of all parameters, scaled to columns of equal length."""
+    model = Model.assembled(chain, cell)
+    n = len(model.names)
+    found = PoseInformation(
+        model, load_states(cell), model.nominal[None], np.arange(n), np.ones(n)
+    ).blocks(q, all_loads(q))
+    B = found[0].reshape(-1, n)
+    length = np.linalg.norm(B, axis=0)
+    return model, B / np.where(length > 0, length, 1.0)
+
+
+def test_a_vertical_load_does_not_show_the_compliance_of_a_vertical_joint() -> None:
+    setup = setup_of(plan_cell(loads=DOWN[None]), POSES)
+    assert setup.information.names == tuple(f"joint{i}.compliance" for i in range(2, 7))
+    assert len(setup.warnings) == 1
+    assert "no feasible pose shows joint1.compliance" in setup.warnings[0]
+    slanted = setup_of(plan_cell(loads=np.array([DOWN, SIDEWAYS])), POSES)
+    assert len(slanted.information.names) == 6
+    assert slanted.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("chain", "cell"),
+    [
+        (CHAIN, plan_cell(FULL, "position", loads=BOTH)),
+        (CHAIN, plan_cell((*FULL, "marker_orientation"), "pose", loads=BOTH)),
+        (CHAIN, plan_cell(("distance_sensor", *FULL), "distance", loads=BOTH, criterion="D")),
+        (scara(), any_cell(scara(), FULL, loads=BOTH / 20)),
+    ],
+    ids=["positions", "full poses", "distances", "scara"],
+)
+def test_the_kept_parameters_are_as_many_as_the_readings_determine(chain: Any, cell: Cell) -> None:
+    """As many as the rank of all B together; the kept ones alone have that rank."""
+    q = spread(chain, 120, 2)
+    setup = setup_of(cell, q, chain)
+    model, B = stacked(cell, q, chain)
+    rank = np.linalg.matrix_rank(B, tol=1e-8 * np.sqrt(len(B)))
+    kept = setup.found.columns
+    assert len(kept) == rank < len(model.names)
+    assert np.linalg.matrix_rank(B[:, kept], tol=1e-8 * np.sqrt(len(B))) == rank
+
+
+def test_what_is_dropped_moves_the_readings_as_its_mixing_says() -> None:
+    setup = setup_of(plan_cell(FULL, "position", loads=BOTH), POSES)
+    model, r = setup.information.model, setup.found.reduction
+    n = len(model.names)
+    whole = PoseInformation(
+        model, setup.information.states, model.nominal[None], np.arange(n), setup.found.sizes
+    )
+    B = whole.blocks(TABLE_2, all_loads(TABLE_2))[0].reshape(-1, n) / setup.found.sizes
+    off = (B[:, r.dropped] - B[:, r.kept] @ r.mixing) * setup.found.sizes[r.dropped]
+    assert np.abs(off).max() < 1e-6 * np.abs(B * setup.found.sizes).max()
+
+
+def test_a_prior_keeps_every_parameter_that_it_knows() -> None:
+    typical = setup_of(plan_cell(FULL, "position", loads=BOTH, prior="typical"), POSES)
+    assert len(typical.information.names) == len(typical.information.model.names)
+    assert typical.warnings == ()
+    prior = GaussianPrior.independent(("joint1.compliance",), [3.5e-7], [1e-7])
+    told = setup_of(plan_cell(loads=DOWN[None]), POSES, known=Known(prior=prior))
+    assert len(told.information.names) == 6
+    std = np.sqrt(np.linalg.inv(told.gathered(told.information.blocks(*plan()))[0])[0, 0])
+    assert std * told.information.sizes[0] == pytest.approx(1e-7)
+
+
+def plan() -> tuple[NDArray, NDArray]:
+    return TABLE_2, all_loads(TABLE_2)
+
+
+def test_a_held_parameter_is_not_among_them() -> None:
+    cell = plan_cell(FULL, "position", loads=BOTH)
+    fixed = setup_of(cell, POSES, known=Known(fixed=("joint2", "joint5.offset")))
+    assert not [n for n in fixed.information.names if n.startswith(("joint2", "joint5.offset"))]
+    assert "joint3.compliance" in fixed.information.names
+
+
+def test_loads_that_are_chosen_per_pose_are_all_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Candidates alternate between the load states, as a step through them might."""
+    monkeypatch.setattr(parameters, "SAMPLE", 100)
+    cell = plan_cell(("joint_compliance",), "position", loads=BOTH, load_choice=True)
+    q = np.repeat(POSES, 2, axis=0)
+    setup = setup_of(cell, q, load=np.tile([0, 1], len(POSES)))
+    assert setup.information.names == tuple(f"joint{i}.compliance" for i in range(2, 7))
+
+
+@pytest.mark.parametrize("scarce", [0, 1, 4])
+def test_a_level_with_few_poses_is_looked_at(scarce: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each level has a compliance of its own, which its poses alone show."""
+    monkeypatch.setattr(parameters, "SAMPLE", 50)
+    levels = tuple(np.unique(TABLE_2[:, 1]).tolist())
+    cell = plan_cell(
+        loads=DOWN[None], levels={"joint2": levels}, model={"compliance_levels": {"joint2": levels}}
+    )
+    level = np.repeat(np.arange(5), np.where(np.arange(5) == scarce, 3, 100))
+    q = random_poses(CHAIN, len(level), seed=3)
+    q[:, 1] = np.array(levels)[level]
+    names = setup_of(cell, q).information.names
+    assert {f"joint2.compliance_level{k}" for k in range(1, 6)} <= set(names)
+
+
+# --- what counts --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("interest", "counted"),
+    [
+        ((), lambda p: p.effect not in ("base_frame", "marker_position")),
+        (("joint_compliance",), lambda p: p.effect == "joint_compliance"),
+        (("joint3", "base.x"), lambda p: p.where == "joint3" or p.name == "base.x"),
+        (("joint2.offset",), lambda p: p.name == "joint2.offset"),
+    ],
+)
+def test_interest_names_parameters_places_or_effects(interest: Any, counted: Any) -> None:
+    cell = plan_cell(FULL, "position", loads=BOTH, criterion="A", interest=interest)
+    setup = setup_of(cell, POSES)
+    model, kept = setup.information.model, setup.found.columns
+    chosen = parameters.interest_of(model, setup.found)
+    expected = [k for k, c in enumerate(kept) if counted(model.parameters[c])]
+    assert chosen.tolist() == expected
+    V = np.linalg.inv(setup.gathered(setup.information.blocks(*plan()))[0])
+    assert setup.value(*plan()) == pytest.approx(np.trace(V[np.ix_(chosen, chosen)]), rel=1e-8)
+
+
+def test_base_and_markers_count_where_there_is_nothing_else() -> None:
+    cell = plan_cell(("base_frame", "marker_position"), "position", criterion="D")
+    setup = setup_of(cell, POSES)
+    assert len(parameters.interest_of(setup.information.model, setup.found)) == 15
+
+
+@pytest.mark.parametrize(
+    ("interest", "error", "told"),
+    [
+        ("joint2.complience", InputError, ["did you mean 'joint2.compliance'", "interest"]),
+        ("joint1.compliance", InsufficientDataError, ["no feasible pose shows", "fixed=['joint1"]),
+        ("joint1.offset", InsufficientDataError, ["no set of poses tells", "base.rz", "fixed=["]),
+        ("joint4.compliance", InsufficientDataError, ["is held", "drop it from `fixed`"]),
+    ],
+)
+def test_interest_in_what_cannot_be_known_is_answered(
+    interest: str, error: type[Exception], told: list[str]
+) -> None:
+    effects = ("base_frame", "joint_offset", "joint_compliance")
+    cell = plan_cell(effects, "position", loads=BOTH, criterion="D", interest=(interest,))
+    with pytest.raises(error) as caught:
+        setup_of(cell, POSES, known=Known(fixed=("joint4.compliance",)))
+    assert interest in str(caught.value)
+    assert not [part for part in told if part not in str(caught.value)], str(caught.value)
+
+
+def test_readings_that_show_nothing_are_refused() -> None:
+    """Compliances alone, and no load hangs."""
+    cell = plan_cell(("joint_compliance",), "position", criterion="D")
+    with pytest.raises(InsufficientDataError, match=r"no feasible pose shows any .* loads_N"):
+        setup_of(cell, POSES)
+
+
+def test_a_combination_has_the_variance_of_its_terms() -> None:
+    terms = {"joint2.compliance": 1.0, "joint3.compliance": -2.0}
+    cell = plan_cell(loads=DOWN[None], criterion="c", combination=terms)
+    setup = setup_of(cell, POSES)
+    V = np.linalg.inv(setup.gathered(setup.information.blocks(*plan()))[0])
+    V = V * np.outer(setup.information.sizes, setup.information.sizes)
+    expected = V[0, 0] - 4 * V[0, 1] + 4 * V[1, 1]
+    assert setup.value(*plan()) == pytest.approx(expected, rel=1e-9)
+    assert setup.criterion.reported(setup.value(*plan())) == pytest.approx(
+        (np.sqrt(expected), "rad/(N*m)")
+    )
+
+
+def test_a_combination_of_what_the_readings_add_up_is_known_and_its_parts_are_not() -> None:
+    """base.rz and joint1.offset turn the arm alike: their difference is known, neither alone."""
+    effects = ("base_frame", "joint_offset")
+    cell = plan_cell(effects, "position", criterion="c")
+    both = {"base.rz": 1.0, "joint1.offset": -1.0}  # axis 1 points down
+    sum_of = replace(cell, design=replace(cell.design, combination=both))
+    assert np.isfinite(setup_of(sum_of, POSES).value(*plan()))
+    alone = replace(cell, design=replace(cell.design, combination={"joint1.offset": 1.0}))
+    with pytest.raises(InsufficientDataError, match=r"combination depends on joint1.offset.*base"):
+        setup_of(alone, POSES)
+
+
+def test_a_plan_estimates_what_identification_will() -> None:
+    """Of fifteen poses both keep the same parameters; joint 6's offset, which only the load point
+    tells from the markers, is below the noise and held by both."""
+    cell = plan_cell(
+        ("base_frame", "joint_offset", "joint_compliance", "marker_position"),
+        "position",
+        loads=BOTH,
+    )
+    setup = setup_of(cell, TABLE_2, n_poses=len(TABLE_2))
+    model = setup.information.model
+    rows = setup.information.rows(*plan(), model.nominal)
+    data = simulate(model, rows, model.nominal, 3)
+    result = identify(model, data, Options(method="wls", faulty="keep"))
+    assert set(setup.information.names) == set(result.determined)
+    assert "joint6.offset" not in setup.information.names
+
+
+def test_what_is_held_and_moves_a_stated_point_is_told() -> None:
+    effects = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
+    told = TargetPose(TABLE_2[0], force=DOWN, point=np.array([0.2, 0.0, 0.25]))
+    cell = plan_cell(effects, "position", loads=BOTH, test_poses=(told,))
+    of_point = remaining(setup_of(cell, TABLE_2, n_poses=15))
+    cell = plan_cell(effects, "position", loads=BOTH, test_poses=(replace(told, point=None),))
+    of_markers = remaining(setup_of(cell, TABLE_2, n_poses=15))
+    # A milliradian about the flange, 0.2 m away; markers move as the readings told.
+    assert 100 < of_point < 400
+    assert of_markers < 5
+
+
+def remaining(setup: Setup) -> float:
+    """µm that held parameters move the test points by, as the warning tells; 0 without one."""
+    told = [text for text in setup.warnings if "joint6.offset" in text]
+    return float(re.findall(r"by ([0-9.]+) µm", told[0])[0]) if told else 0.0

@@ -1,0 +1,219 @@
+"""plan.csv and plan.json: read back exactly, and taken by simulate and identify."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.cells import TABLE_2, kr270_chain
+from support.discs import Discs
+from support.files import write_campaign
+from typer.testing import CliRunner
+
+from elastocal.cell.plan_wishes import Motion
+from elastocal.cli.app import app
+from elastocal.errors import InputError
+from elastocal.measurements import read_plan
+from elastocal.planning import PlanRows, plan_rows, schedule, write_plan, write_plan_json
+
+FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
+KINDS = kr270_chain().kinds
+NAMES = [str(i + 1) for i in range(len(TABLE_2))]
+LEVEL = np.repeat(np.arange(5), 3) + 1
+LIMITS = (np.full(6, -9.0), np.full(6, 9.0))
+
+
+def execution_of(q=TABLE_2, forces=FORCES, load=None, **motion):
+    return schedule(
+        q, Motion(**motion), Discs(), loads=forces, load=load, limits=LIMITS, iterations=100
+    )
+
+
+def header(path):
+    return path.read_text(encoding="utf-8").splitlines()[0].split(",")
+
+
+joint_values = st.floats(-6.3, 6.3) | st.sampled_from([0.0, -0.0, np.pi, 1e-12, -1e-300])
+labels = st.text(
+    st.characters(codec="utf-8", exclude_categories=("Cc", "Cs"), exclude_characters="\ufeff"),
+    min_size=1, max_size=12,
+).map(str.strip).filter(bool)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_what_is_written_is_read_back(tmp_path_factory, data):
+    kinds = data.draw(st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=4, max_size=9))
+    names = data.draw(st.lists(labels, min_size=1, max_size=8, unique=True))
+    n, joints = len(names), len(kinds)
+    numbers = st.lists(joint_values, min_size=n * joints, max_size=n * joints)
+    q = np.array(data.draw(numbers)).reshape(n, joints)
+    drawn = st.lists(st.floats(-1e5, 1e5), min_size=3 * n, max_size=3 * n)
+    force = data.draw(st.none() | drawn)
+    signs = st.lists(st.sampled_from([-1, 1]), min_size=n * joints, max_size=n * joints)
+    approach = data.draw(st.none() | signs)
+    rows = PlanRows(
+        configuration=tuple(names),
+        q=q,
+        level=np.ones(n, dtype=int),
+        order=np.arange(n) + 1,
+        force=None if force is None else np.reshape(force, (n, 3)),
+        approach=None if approach is None else np.reshape(approach, (n, joints)),
+        notes={"note_order_2": ["x"] * n},
+    )
+    path = tmp_path_factory.mktemp("plan") / "plan.csv"
+    write_plan(path, rows, kinds)
+    plan = read_plan(path, joint_kinds=tuple(kinds))
+    assert np.allclose(plan.q, q, rtol=0, atol=1e-9)
+    assert [plan.configuration_labels[k] for k in plan.configuration] == names
+    assert np.array_equal(plan.force, np.zeros((n, 3)) if force is None else rows.force)
+    assert (
+        plan.approach is None if approach is None else np.array_equal(plan.approach, rows.approach)
+    )
+
+
+def test_angles_in_degrees_read_as_they_were_stated(tmp_path):
+    path = tmp_path / "plan.csv"
+    write_plan(path, plan_rows(execution_of(), NAMES, LEVEL), KINDS)
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    assert rows[0][:3] == ["configuration", "q1_deg", "q2_deg"]
+    assert rows[0][-3:] == ["level", "order", "note_order_2"]
+    assert [float(row[2]) for row in rows[1:]] == [round(v, 2) for v in np.degrees(TABLE_2[:, 1])]
+    assert rows[1][:4] == ["1", "79.2", "-0.01", "-5.57"]
+    orders = [int(row[k]) for row in rows[1:] for k in (-2, -1)]
+    assert sorted(orders) == list(range(1, 31))
+
+
+def test_orders_follow_the_execution(tmp_path):
+    execution = execution_of()
+    rows = plan_rows(execution, NAMES, LEVEL, FORCES)
+    assert len(rows.order) == 30 and np.array_equal(np.unique(rows.level), np.arange(1, 6))
+    for k, stop in enumerate(execution.stops, start=1):
+        row = int(np.flatnonzero(rows.order == k)[0])
+        assert rows.configuration[row] == NAMES[stop.pose]
+        assert np.array_equal(rows.q[row], stop.q)
+        assert np.array_equal(rows.force[row], FORCES[stop.load])
+        assert rows.level[row] == LEVEL[stop.pose]
+
+
+def test_a_load_chosen_per_pose_stands_in_its_row(tmp_path):
+    path, load = tmp_path / "plan.csv", np.arange(15) % 2
+    write_plan(path, plan_rows(execution_of(load=load), NAMES, LEVEL, FORCES), KINDS)
+    plan = read_plan(path, joint_kinds=KINDS)
+    assert np.array_equal(plan.force, FORCES[load])
+    assert np.allclose(plan.q, TABLE_2, rtol=0, atol=1e-9)
+
+
+def test_both_directions_are_two_configurations_with_their_signs(tmp_path):
+    path = tmp_path / "plan.csv"
+    execution = execution_of(forces=FORCES[:1], both_directions=True)
+    write_plan(path, plan_rows(execution, NAMES, LEVEL), KINDS)
+    plan = read_plan(path, joint_kinds=KINDS)
+    assert len(plan) == 30
+    assert plan.configuration_labels[:4] == ("1+", "1-", "2+", "2-")
+    assert (plan.approach[::2] == 1).all() and (plan.approach[1::2] == -1).all()
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"q": np.full((2, 6), np.nan)}, "finite"),
+        ({"force": np.full((2, 3), np.inf)}, "finite"),
+        ({"configuration": ("a", " b")}, "cannot stand in a table"),
+        ({"configuration": ("a", "a")}, "same name"),
+    ],
+)
+def test_what_no_table_can_hold_is_refused_and_nothing_is_written(tmp_path, change, message):
+    rows = {"configuration": ("a", "b"), "q": np.zeros((2, 6)), "level": np.ones(2),
+            "order": np.arange(2)}  # fmt: skip
+    with pytest.raises(InputError, match=message):
+        write_plan(tmp_path / "plan.csv", PlanRows(**(rows | change)), KINDS)
+    with pytest.raises(InputError, match="does not exist"):
+        write_plan(tmp_path / "no" / "plan.csv", PlanRows(**rows), KINDS)
+    assert not list(tmp_path.iterdir())
+
+
+def test_json_has_the_schema_first_and_no_numbers_that_json_cannot_hold(tmp_path):
+    path = tmp_path / "plan.json"
+    summary = {
+        "criterion": "D",
+        "value": np.float64(2.5),
+        "n_poses": np.int64(15),
+        "candidates": {"removed_by": {"limits": np.int64(3)}},
+        "certificate": {"bound_pool": np.inf, "efficiency_continuum": None},
+        "predicted": ({"name": "joint2.compliance", "std": np.nan, "ok": np.True_},),
+        "q": np.eye(2),
+    }
+    write_plan_json(path, summary)
+    found = json.loads(path.read_text())
+    assert next(iter(found)) == "schema" and found.pop("schema") == "elastocal/plan/1"
+    assert found == {
+        "criterion": "D",
+        "value": 2.5,
+        "n_poses": 15,
+        "candidates": {"removed_by": {"limits": 3}},
+        "certificate": {"bound_pool": None, "efficiency_continuum": None},
+        "predicted": [{"name": "joint2.compliance", "std": None, "ok": True}],
+        "q": [[1.0, 0.0], [0.0, 1.0]],
+    }
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.stderr
+
+
+DEFLECTION = """
+[robot]
+urdf = "arm.urdf"
+[tool]
+load_point_m = [0.2, 0.0, 0.25]
+[tool.markers_m]
+M1 = [0.25, 0.0, 0.05]
+M2 = [-0.12, 0.22, 0.10]
+[tracker]
+sigma_um = 10
+[model]
+observe = "deflection"
+effects = ["joint_compliance"]
+[model.nominal]
+joint_compliance = [3.5e-7, 0.287e-6, 0.416e-6, 2.786e-6, 3.483e-6, 2.074e-6]
+"""
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_simulate_and_identify_take_a_plan_of_deflections(tmp_path, stated):
+    write_campaign(tmp_path)
+    cell, plan, data = (tmp_path / name for name in ("cell.toml", "plan.csv", "data.csv"))
+    cell.write_text(DEFLECTION, encoding="utf-8")
+    rows = plan_rows(execution_of(), NAMES, LEVEL, FORCES if stated else None)
+    write_plan(plan, rows, KINDS)
+    load = () if stated else ("--load", "0", "0", "-2600")
+    run(
+        "simulate",
+        cell,
+        plan,
+        "-o",
+        data,
+        "--set",
+        "joint3.compliance=5e-7",
+        "--repeats",
+        "2",
+        *load,
+    )
+    assert len(data.read_text().splitlines()) == 1 + 15 * 2 * 2 * 2
+    run("identify", cell, data, "-o", tmp_path / "result.json", "-q")
+    result = json.loads((tmp_path / "result.json").read_text())
+    found = {p["name"]: p["value"] for p in result["parameters"]}
+    assert found["joint3.compliance"] == pytest.approx(5e-7, rel=0.02)
+
+
+def test_simulate_and_identify_take_a_plan_from_both_sides(tmp_path):
+    cell, _ = write_campaign(tmp_path)
+    plan, data = tmp_path / "plan.csv", tmp_path / "data.csv"
+    execution = execution_of(forces=FORCES[:1], both_directions=True)
+    write_plan(plan, plan_rows(execution, NAMES, LEVEL), KINDS)
+    run("simulate", cell, plan, "-o", data)
+    assert {f"approach_{i}" for i in range(1, 7)} <= set(header(data))
+    run("identify", cell, data, "-o", tmp_path / "result.json", "-q")

@@ -1,0 +1,73 @@
+"""What a plan is compared with: plans of the same shares that chance draws from the same poses."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from support.design_commands import BARE, DEFLECTION, altered, planned, write_cell
+
+from elastocal.planning import Chance, DesignProblem, make_criterion, random_plans
+
+P, R = 4, 2  # parameters, rows of a pose
+
+
+def problem(shares=(3, 2), each=5, seed=0, name="D", prior=0.0) -> DesignProblem:
+    n = each * len(shares)
+    blocks = np.random.default_rng(seed).normal(size=(1, n, R, P))
+    criterion = make_criterion(name, parameters=P, interest=np.arange(P))
+    group = np.arange(n) // each
+    return DesignProblem(blocks, prior * np.eye(P)[None], group, np.array(shares), criterion)
+
+
+def every_value(of: DesignProblem) -> np.ndarray:
+    """Φ of every plan of these shares, by enumeration."""
+    first, second = (np.flatnonzero(of.group == k) for k in range(2))
+    return np.array([
+        float(of.criterion.value(of.prior + of.sum_of(np.array([*a, *b]))))
+        for a in combinations(first, int(of.shares[0]))
+        for b in combinations(second, int(of.shares[1]))
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["D", "A", "E", "O3"])
+def test_each_is_a_plan_of_these_shares_drawn_without_preference(name: str) -> None:
+    of = problem(name=name)
+    every = np.sort(every_value(of))
+    found = random_plans(of, seed=1, n=400)
+    gap = np.abs(found.values[:, None] - every[None]).min(axis=1)
+    assert (gap <= 1e-9 * found.values).all()
+    assert (np.diff(found.values) >= 0).all()
+    # The share of draws below the true median is binomial: 400 draws, 5 standard deviations.
+    below = int((found.values <= np.median(every)).sum())
+    assert abs(below - 200) < 50
+
+
+def test_a_seed_gives_the_same_plans_again() -> None:
+    one, same, other = (random_plans(problem(), seed=s) for s in (3, 3, 4))
+    assert (one.values == same.values).all() and (one.values != other.values).any()
+
+
+def test_plans_that_leave_a_parameter_open_are_counted_and_have_no_value() -> None:
+    of = problem(shares=(1, 0))
+    chance = Chance.of(random_plans(of, seed=0), 1.0, of.criterion)
+    assert chance == Chance(20, 0, None, None, None, None)
+    known = problem(shares=(1, 0), prior=1.0)
+    assert random_plans(known, seed=0).determined == 20
+
+
+def test_a_plan_says_what_chance_gives_and_beats_it(tmp_path) -> None:
+    plan = planned(write_cell(tmp_path, DEFLECTION))
+    chance = plan["random_plans"]
+    assert chance["n"] == chance["determined"] == 20
+    assert plan["value"] < chance["best"] <= chance["median"] <= chance["worst"]
+    # ρ₀ is the root of Φ.
+    assert chance["efficiency"] == pytest.approx((plan["value"] / chance["median"]) ** 2)
+
+
+def test_log_det_is_compared_as_an_efficiency_too(tmp_path) -> None:
+    plan = planned(write_cell(tmp_path, altered(BARE, criterion='"D"')))
+    chance = plan["random_plans"]
+    shown = len(plan["predicted"])
+    gain = np.exp((plan["value"] - chance["median"]) / shown)
+    assert plan["value"] < chance["best"] and 0 < chance["efficiency"] < 1
+    assert chance["efficiency"] == pytest.approx(gain, rel=0.05)

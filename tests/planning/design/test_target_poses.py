@@ -1,0 +1,357 @@
+"""Test poses from the cell, from a path, from a box, or drawn; and what is wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from support.calibration import placement
+from support.cells import kr270_cell, kr270_chain, nominal_flanges, random_poses
+
+from elastocal.cell.arm_description import Nominal, Tool
+from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPath, TargetPose
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError, InsufficientDataError
+from elastocal.planning import TargetPoses
+from elastocal.planning import test_poses as target_poses
+
+CHAIN = kr270_chain()
+LOADS = np.array([[0.0, 0, 0], [0, 0, -2600], [0, 900, -2600]])
+POINT = np.array([0.2, 0.0, 0.25])
+LOWER, UPPER = np.array([1.2, -0.3, 0.8]), np.array([1.7, 0.3, 1.3])
+
+
+def cell_of(tool: Tool | None = None, nominal: Nominal | None = None, **design: Any) -> Cell:
+    cell = replace(kr270_cell(), tool=tool or Tool(POINT), design=DesignSpec(**design))
+    return replace(cell, model=replace(cell.model, nominal=nominal or Nominal()))
+
+
+def poses_of(cell: Cell, rules: Any = None, seed: int = 0) -> TargetPoses:
+    found = target_poses.test_poses(cell, CHAIN, rules, seed)
+    T = len(found.q)
+    assert found.q.shape == (T, 6)
+    assert found.force.shape == found.point.shape == (T, 3)
+    assert found.weight.shape == (T,)
+    assert found.weight.sum() == pytest.approx(1.0)
+    return found
+
+
+def places(found: TargetPoses) -> NDArray:
+    T = nominal_flanges(CHAIN, found.q)
+    return np.einsum("tij,tj->ti", T[:, :3, :3], found.point) + T[:, :3, 3]
+
+
+# --- poses of the cell ---------------------------------------------------------------------
+
+
+def test_stated_poses_come_with_their_force_point_and_share() -> None:
+    q = random_poses(CHAIN, 2, seed=1)
+    own, force = np.array([0.0, 0.1, 0.0]), np.array([1.0, 2.0, 3.0])
+    found = poses_of(
+        cell_of(test_poses=(TargetPose(q[0], force, 3.0, own), TargetPose(q[1], force)))
+    )
+    np.testing.assert_array_equal(found.q, q)
+    np.testing.assert_array_equal(found.force, [force, force])
+    np.testing.assert_allclose(found.weight, [0.75, 0.25])
+    np.testing.assert_array_equal(found.point, [own, POINT])
+    assert "2 of [[design.test_pose]]" in found.source
+
+
+def test_a_pose_without_force_is_taken_under_each_load_that_is_not_zero() -> None:
+    q = random_poses(CHAIN, 2, seed=1)
+    stated = TargetPose(q[0], np.zeros(3), 1.0)
+    found = poses_of(cell_of(loads=LOADS, test_poses=(stated, TargetPose(q[1], weight=3.0))))
+    np.testing.assert_array_equal(found.q, q[[0, 1, 1]])
+    np.testing.assert_array_equal(found.force, LOADS)
+    np.testing.assert_allclose(found.weight, [0.25, 0.375, 0.375])
+
+
+def test_without_loads_there_is_no_force() -> None:
+    pose = TargetPose(random_poses(CHAIN, 1, seed=1)[0])
+    for loads in (None, np.zeros((1, 3))):
+        found = poses_of(cell_of(loads=loads, test_poses=(pose,)))
+        np.testing.assert_array_equal(found.force, np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize(
+    ("tool", "point"),
+    [
+        (Tool(POINT, {"M1": np.ones(3)}), POINT),
+        (Tool(markers={"M1": np.ones(3), "M2": np.zeros(3)}), np.full(3, 0.5)),
+        (Tool(), np.zeros(3)),
+    ],
+)
+def test_the_point_is_the_load_point_or_the_middle_of_the_markers(tool: Tool, point: Any) -> None:
+    pose = TargetPose(random_poses(CHAIN, 1, seed=1)[0])
+    np.testing.assert_array_equal(poses_of(cell_of(tool, test_poses=(pose,))).point, [point])
+
+
+def test_a_pose_beyond_the_limits_is_refused() -> None:
+    q = random_poses(CHAIN, 1, seed=1)[0]
+    q[1] = 0.5
+    with pytest.raises(InputError, match=r"q_si of \[\[design.test_pose\]\] no. 1: joint2"):
+        poses_of(cell_of(test_poses=(TargetPose(q),)))
+
+
+# --- a path --------------------------------------------------------------------------------
+
+
+def path_cell(folder: Path, text: str, nominal: Nominal | None = None, **options: Any) -> Cell:
+    file = folder / "path.csv"
+    file.write_text(text, encoding="utf-8")
+    return cell_of(nominal=nominal, test_path=TargetPath(file, **options))
+
+
+def csv(header: str, rows: NDArray) -> str:
+    return "\n".join([header, *(",".join(repr(float(v)) for v in row) for row in rows)]) + "\n"
+
+
+JOINTS = ",".join(f"q{i}_deg" for i in range(1, 7))
+
+
+def test_a_path_in_joints(tmp_path: Path) -> None:
+    q = random_poses(CHAIN, 3, seed=2)
+    rows = np.hstack([np.degrees(q), LOADS, [[1], [2], [5]]])
+    text = csv(JOINTS + ",force_x_N,force_y_N,force_z_N,weight", rows)
+    found = poses_of(path_cell(tmp_path, text))
+    np.testing.assert_allclose(found.q, q, rtol=1e-14)
+    np.testing.assert_array_equal(found.force, LOADS)
+    np.testing.assert_allclose(found.weight, [1 / 8, 2 / 8, 5 / 8])
+    assert "3 of path.csv" in found.source
+
+
+def test_the_path_may_say_its_force_once(tmp_path: Path) -> None:
+    q = random_poses(CHAIN, 2, seed=2)
+    cell = path_cell(tmp_path, csv(JOINTS, np.degrees(q)), force=LOADS[2], point=np.ones(3))
+    found = poses_of(cell)
+    np.testing.assert_array_equal(found.force, LOADS[[2, 2]])
+    np.testing.assert_array_equal(found.point, np.ones((2, 3)))
+
+
+@pytest.mark.parametrize("turned", ["free", "vector", "quaternion"])
+def test_a_path_of_places_is_reached_where_the_arm_stands(tmp_path: Path, turned: str) -> None:
+    T = placement([0.5, -2.0, 0.3], Rotation.from_euler("z", 2.0))
+    flange = T @ nominal_flanges(CHAIN, random_poses(CHAIN, 8, seed=3))
+    position = flange[:, :3, :3] @ POINT + flange[:, :3, 3]
+    rotation = Rotation.from_matrix(flange[:, :3, :3])
+    header, columns = "x_mm,y_mm,z_mm", [position * 1e3]
+    if turned == "vector":
+        header, columns = header + ",rx_deg,ry_deg,rz_deg", [*columns, rotation.as_rotvec(True)]
+    if turned == "quaternion":
+        w_first = np.roll(rotation.as_quat(), 1, axis=1)
+        header, columns = header + ",qw,qx,qy,qz", [*columns, w_first]
+    nominal = Nominal(base_position=T[:3, 3], base_rotation=T[:3, :3])
+    found = poses_of(path_cell(tmp_path, csv(header, np.hstack(columns)), nominal))
+    np.testing.assert_allclose(places(found) @ T[:3, :3].T + T[:3, 3], position, atol=2e-6)
+    if turned != "free":
+        reached = Rotation.from_matrix(T[:3, :3] @ nominal_flanges(CHAIN, found.q)[:, :3, :3])
+        assert (reached.inv() * rotation).magnitude().max() < 2e-6
+
+
+def test_a_path_is_followed_in_one_posture(tmp_path: Path) -> None:
+    """Along a short straight line no joint jumps to another branch."""
+    line = np.linspace([1500, -200, 1000], [1500, 200, 1000], 30)
+    found = poses_of(path_cell(tmp_path, csv("x_mm,y_mm,z_mm", line)))
+    assert np.abs(np.diff(found.q, axis=0)).max() < 0.1
+
+
+def test_parquet_says_the_same(tmp_path: Path) -> None:
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    q = random_poses(CHAIN, 3, seed=2)
+    frame = pd.DataFrame(np.degrees(q), columns=JOINTS.split(","))
+    frame.to_parquet(tmp_path / "path.parquet")
+    found = poses_of(cell_of(test_path=TargetPath(tmp_path / "path.parquet")))
+    np.testing.assert_allclose(found.q, q, rtol=1e-14)
+
+
+GOOD = "0,-90,90,0,30,0"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", ["empty file"]),
+        (f"{JOINTS}\n", ["no rows"]),
+        (f"{JOINTS},weight\n{GOOD},abc", ["line 2, column weight", "'abc' is not a number"]),
+        (f"{JOINTS},weight\n{GOOD},1\n{GOOD},0", ["line 3, column weight", "must be positive"]),
+        (f"{JOINTS},weight,weight\n{GOOD},1,1", ["'weight' appears 2 times"]),
+        (f"{JOINTS}\n0,-90,90,0,30", ["line 2 has 5 fields"]),
+        (f"{JOINTS}\n{GOOD}\n0,1,90,0,30,0", ["line 3, column q2_deg: joint2", "at 1° is beyond"]),
+        ("q1_deg,q2_deg\n0,0", ["2 joint columns", "6 joints"]),
+        ("q1,q2_deg\n0,0", ["'q1' has no unit"]),
+        ("x,y,z\n1,1,1", ["'x' has no unit", "x_mm"]),
+        ("x_mm,y_mm\n1,1", ["without z_mm"]),
+        ("x_mm,y_m,z_mm\n1,1,1", ["mix units"]),
+        ("weight\n1", ["q1_deg … or x_mm,y_mm,z_mm are missing"]),
+        (f"{JOINTS},x_mm,y_mm,z_mm\n{GOOD},1,1,1", ["two ways", "keep the joints or"]),
+        (f"{JOINTS},rx_deg,ry_deg,rz_deg\n{GOOD},1,1,1", ["says the rotation too", "rx_deg"]),
+        ("x_mm,y_mm,z_mm,repeat\n1,1,1,1", ["'repeat' has no meaning in a path"]),
+        ("x_mm,y_mm,z_mm,wieght\n1,1,1,1", ["unknown column 'wieght'"]),
+        ("x_mm,y_mm,z_mm,qw,qx,qy,qz\n1500,0,1000,1,1,0,0", ["line 2, column qw", "norm"]),
+        (
+            "x_mm,y_mm,z_mm\n1500,0,1000\n9000,0,1000",
+            ["line 3, columns x_mm, y_mm, z_mm: the place is out of reach", "(1 of 2", "base_pos"],
+        ),
+        ("x_m,y_m,z_m\n1500,0,1000", ["line 2", "out of reach", "no nearer than 1799", "unit?"]),
+    ],
+)
+def test_what_is_wrong_with_a_path_is_told_with_its_place(
+    tmp_path: Path, text: str, told: list[str]
+) -> None:
+    with pytest.raises(InputError) as caught:
+        poses_of(path_cell(tmp_path, text))
+    message = str(caught.value)
+    assert "path.csv" in message
+    assert not [part for part in told if part not in message], message
+
+
+def test_a_path_too_long_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="10001 poses; a path takes at most 10000"):
+        poses_of(path_cell(tmp_path, JOINTS + "\n" + f"{GOOD}\n" * 10_001))
+
+
+# --- a box ---------------------------------------------------------------------------------
+
+
+def test_a_box_is_filled_with_reached_places() -> None:
+    found = poses_of(cell_of(test_box=TargetBox(LOWER, UPPER, 32)))
+    at = places(found)
+    assert len(at) == 32
+    assert (at >= LOWER - 2e-6).all()
+    assert (at <= UPPER + 2e-6).all()
+    # Sobol points: every half of every edge holds half of them.
+    assert ((at > (LOWER + UPPER) / 2).sum(axis=0) == 16).all()
+
+
+def test_a_box_may_prescribe_rotation_force_and_point() -> None:
+    down, point = Rotation.from_euler("y", np.pi).as_matrix(), np.array([0.0, 0.1, 0.1])
+    box = TargetBox(LOWER, UPPER, 5, down, LOADS[2], point)
+    found = poses_of(cell_of(test_box=box, loads=LOADS))
+    turned = nominal_flanges(CHAIN, found.q)[:, :3, :3]
+    np.testing.assert_allclose(turned, np.broadcast_to(down, (5, 3, 3)), atol=2e-6)
+    np.testing.assert_array_equal(found.force, np.tile(LOADS[2], (5, 1)))
+    np.testing.assert_array_equal(found.point, np.tile(point, (5, 1)))
+
+
+def test_the_posture_is_the_one_near_home() -> None:
+    box = TargetBox(LOWER, UPPER, 4)
+    home = np.radians([0.0, -60.0, 100.0, 180.0, -40.0, 180.0])
+    mid = poses_of(cell_of(test_box=box))
+    near = poses_of(cell_of(test_box=box, motion=Motion(home=home)))
+    np.testing.assert_allclose(places(near), places(mid), atol=4e-6)
+    closer = np.linalg.norm(near.q - home, axis=1) - np.linalg.norm(mid.q - home, axis=1)
+    assert (closer < 0).all()
+
+
+def test_a_box_out_of_reach_is_told_with_a_place_and_a_remedy() -> None:
+    box = TargetBox(LOWER, np.array([1.7, 0.3, 30.0]), 8)
+    with pytest.raises(InputError) as caught:
+        poses_of(cell_of(test_box=box))
+    message = str(caught.value)
+    for part in (
+        "[design.test_box]: the place [1.",
+        "out of reach",
+        "mm (",
+        "make the box smaller",
+    ):
+        assert part in message
+    assert "leave out rpy_deg" not in message
+    with pytest.raises(InputError, match=r"leave out rpy_deg, move it, or check base_position_m"):
+        nominal = Nominal(base_position=np.zeros(3))
+        poses_of(cell_of(nominal=nominal, test_box=replace(box, rotation=np.eye(3))))
+
+
+# --- what the work cell allows -------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Elbow:
+    """Allows joint 3 on one side of `least` only, and the named force at most."""
+
+    least: float
+    forces: tuple[float, ...] = (0.0, -2600.0)
+
+    def check(self, q: NDArray, force: NDArray) -> Any:
+        assert force.shape == (len(q), 3)
+        return type(
+            "Verdict", (), {"ok": (q[:, 2] > self.least) & np.isin(force[:, 2], self.forces)}
+        )
+
+
+def test_a_posture_that_the_cell_allows_is_preferred() -> None:
+    cell = cell_of(loads=LOADS, test_box=TargetBox(LOWER, UPPER, 8))
+    free = poses_of(cell)
+    rules = Elbow(float(np.median(free.q[:, 2])))
+    chosen = poses_of(cell, rules)
+    np.testing.assert_allclose(places(chosen), places(free), atol=4e-6)
+    assert (free.q[:, 2] <= rules.least).any()
+    assert (chosen.q[:, 2] > rules.least).all()
+    kept = free.q[:, 2] > rules.least
+    np.testing.assert_allclose(chosen.q[kept], free.q[kept])
+    assert "no posture" not in chosen.source
+
+
+class Wrist:
+    """Allows joint 6 in a narrow range: one posture in forty."""
+
+    def check(self, q: NDArray, force: NDArray) -> Any:
+        return type("Verdict", (), {"ok": np.abs(q[:, 5] - 3.0) < 0.15})
+
+
+def test_a_rare_posture_that_the_cell_allows_is_found() -> None:
+    found = poses_of(cell_of(test_box=TargetBox(LOWER, UPPER, 8)), Wrist())
+    assert Wrist().check(found.q, found.force).ok.all()
+    free = poses_of(cell_of(test_box=TargetBox(LOWER, UPPER, 8)))
+    np.testing.assert_allclose(places(found), places(free), atol=4e-6)
+
+
+def test_places_without_an_allowed_posture_are_told() -> None:
+    found = poses_of(cell_of(test_box=TargetBox(LOWER, UPPER, 8)), Elbow(100.0))
+    assert "(8 of them in no posture that the work cell allows)" in found.source
+    other_load = poses_of(
+        cell_of(loads=LOADS, test_box=TargetBox(LOWER, UPPER, 8)), Elbow(-9.0, ())
+    )
+    assert "(8 of them in no posture" in other_load.source
+
+
+# --- none, several -------------------------------------------------------------------------
+
+
+def test_without_any_source_poses_are_drawn_over_the_limits_and_it_is_said() -> None:
+    cell = replace(cell_of(loads=LOADS[:2]), limits={"joint1": (-0.5, 0.5)})
+    found = poses_of(cell)
+    assert len(found.q) == 20
+    assert np.abs(found.q[:, 0]).max() <= 0.5
+    assert found.q[:, 0].min() < -0.3
+    assert found.q[:, 0].max() > 0.3
+    np.testing.assert_array_equal(found.force, np.tile(LOADS[1], (20, 1)))
+    assert "20 drawn over the joint limits (the cell states none)" in found.source
+    np.testing.assert_array_equal(poses_of(cell).q, found.q)
+    assert (poses_of(cell, seed=1).q != found.q).any()
+
+
+def test_drawn_poses_keep_to_the_rules() -> None:
+    found = poses_of(cell_of(loads=LOADS[:2]), Elbow(2.0))
+    assert (found.q[:, 2] > 2.0).all()
+    assert len(found.q) == 20
+    with pytest.raises(InsufficientDataError, match=r"allow none of .* postures"):
+        poses_of(cell_of(), Elbow(100.0))
+
+
+def test_several_sources_add_up(tmp_path: Path) -> None:
+    q = random_poses(CHAIN, 3, seed=2)
+    cell = path_cell(tmp_path, csv(JOINTS, np.degrees(q)))
+    pose = TargetPose(q[0], weight=5.0)
+    box = TargetBox(LOWER, UPPER, 2)
+    cell = replace(cell, design=replace(cell.design, test_poses=(pose,), test_box=box))
+    found = poses_of(cell)
+    np.testing.assert_allclose(found.q[:4], q[[0, 0, 1, 2]], rtol=1e-14)
+    np.testing.assert_allclose(found.weight, [0.5, *[0.1] * 5])
+    for part in ("1 of [[design.test_pose]]", "3 of path.csv", "2 in [design.test_box]"):
+        assert part in found.source

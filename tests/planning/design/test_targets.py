@@ -1,0 +1,209 @@
+"""How the parameters move the tool at the test poses, against derivatives of the arm itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
+from support.cells import table_of as rows_with_markers
+from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain, spread
+
+from elastocal.cell.arm_description import Nominal
+from elastocal.cell.plan_wishes import TargetPose
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InsufficientDataError
+from elastocal.model import Chain, Model, Parameter
+from elastocal.model.effects import CATALOGUE
+from elastocal.planning import PoseInformation, TargetPoses, load_states, prediction_rows
+from elastocal.planning import test_poses as target_poses
+
+CHAIN = kr270_chain()
+BOTH = np.array([[0.0, 0, 0], DOWN])
+SIDEWAYS = np.array([0.0, 1500.0, 0.0])
+POINT = np.array([0.1, -0.2, 0.4])
+LEVELS = tuple(np.unique(TABLE_2[:, 1]).tolist())
+
+
+def rows_at(cell: Cell, targets: TargetPoses, x: NDArray, chain: Chain = CHAIN) -> NDArray:
+    model = Model.assembled(chain, cell)
+    n = len(model.names)
+    information = PoseInformation(model, load_states(cell), x[None], np.arange(n), np.ones(n))
+    return prediction_rows(information, targets, x)
+
+
+def somewhere(model: Model, seed: int = 0) -> NDArray:
+    """The arm with every parameter off its nominal value by a plausible amount."""
+    turns = np.random.default_rng(seed).uniform(-1, 1, len(model.names))
+    return model.nominal + np.array([size(p) for p in model.parameters]) * turns
+
+
+def size(p: Parameter) -> float:
+    return 0.2 * abs(p.nominal) or (p.typical if "N" in p.unit else None) or 1e-3
+
+
+def moved(model: Model, targets: TargetPoses, x: NDArray, by_marker: NDArray) -> NDArray:
+    """Positions (T, M, 3) of what is to be predicted, times its share: point, or each marker."""
+    places = model.cell.tool.markers
+    table = rows_with_markers(targets.q, np.zeros(3), tuple(places))
+    force = np.repeat(targets.force, len(places), axis=0)
+    T = model.flange_poses(replace(table, force=force, rotation=np.zeros((len(table), 3))), x)
+    T = T.reshape(len(targets.q), len(places), 4, 4)
+    markers = np.array(
+        [
+            [x[model.names.index(f"marker:{m}.{a}")] for a in "xyz"]
+            if f"marker:{m}.x" in model.names
+            else places[m]
+            for m in places
+        ]
+    )
+    point = np.einsum("tij,tj->ti", T[:, 0, :3, :3], targets.point) + T[:, 0, :3, 3]
+    each = np.einsum("tmij,mj->tmi", T[:, :, :3, :3], markers) + T[..., :3, 3]
+    lone = np.concatenate([point[:, None], np.zeros_like(each)[:, 1:]], axis=1)
+    return np.where(by_marker[:, None, None], each / np.sqrt(len(places)), lone)
+
+
+def differences(model: Model, targets: TargetPoses, x: NDArray, by_marker: NDArray) -> NDArray:
+    """∂moved/∂x (T, M, 3, parameters) by central differences."""
+    columns = []
+    for k, p in enumerate(model.parameters):
+        step = np.zeros(len(x))
+        step[k] = 0.01 * size(p)
+        after, before = (moved(model, targets, x + s, by_marker) for s in (step, -step))
+        columns.append((after - before) / (2 * step[k]))
+    return np.stack(columns, axis=-1)
+
+
+SAGGING = {
+    "link_gravity": True,
+    "nominal": Nominal(joint_compliance=COMPLIANCE, gravity_compensator=COMPENSATOR),
+}
+CASES: dict[str, tuple[Chain, Cell]] = {
+    "everything": (CHAIN, plan_cell(FULL, "position", loads=BOTH)),
+    "markers known": (CHAIN, plan_cell(FULL[:-1], "position", loads=BOTH)),
+    "one marker fitted": (CHAIN, plan_cell((*FULL[:-1], "marker_position:marker:M2"), "position")),
+    "deflections": (CHAIN, plan_cell(loads=DOWN[None])),
+    "levels": (
+        CHAIN,
+        plan_cell((*FULL[1:2], *FULL[3:], "off_axis_compliance"), "position", loads=BOTH,
+                  model={"compliance_levels": {"joint2": LEVELS}}),
+    ),
+    "weights and compensator": (
+        CHAIN, plan_cell((*FULL, "gravity_compensator"), "position", model=SAGGING, loads=BOTH)
+    ),
+    "full poses": (CHAIN, plan_cell((*FULL, "marker_orientation"), "pose", loads=BOTH)),
+    "distances": (CHAIN, plan_cell((*FULL, "distance_sensor"), "distance", loads=BOTH)),
+    "sliding joints": (sliding_chain(), any_cell(sliding_chain(), FULL, loads=BOTH / 10)),
+}  # fmt: skip
+LONG = ("everything", "markers known", "distances")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=pytest.mark.long if c in LONG else ()) for c in CASES],
+)
+def test_the_rows_are_how_position_changes_with_the_parameters(case: str) -> None:
+    """Points that are stated, and the markers where they are fitted and none is stated."""
+    chain, cell = CASES[case]
+    q = TABLE_2[[0, 4, 8, 13]] if chain is CHAIN else spread(chain, 4, 1)
+    poses = [TargetPose(q[k], point=POINT if k % 2 else None, weight=1.0 + k) for k in range(4)]
+    cell = replace(cell, design=replace(cell.design, test_poses=tuple(poses)))
+    model = Model.assembled(chain, cell)
+    targets = target_poses.test_poses(cell, chain)
+    x = somewhere(model)
+    A = rows_at(cell, targets, x, chain)
+    fitted = any(p.effect == "marker_position" for p in model.parameters)
+    by_marker = np.array([True, False, True, False]) & fitted
+    expected = differences(model, targets, x, by_marker)
+    expected = expected[:, : 3 if fitted else 1].reshape(4, -1, len(x))
+    scale = np.abs(expected).max(axis=(0, 1))
+    assert np.abs(A - expected).max(axis=(0, 1)) == pytest.approx(0 * scale, abs=2e-6 * scale.max())
+    observed = scale > 0
+    assert (np.abs(A - expected).max(axis=(0, 1))[observed] < 1e-5 * scale[observed] + 1e-11).all()
+
+
+def remaining(cell: Cell, q: NDArray, **known: Any) -> tuple[float, tuple[str, ...]]:
+    setup = setup_of(cell, q, **known)
+    plan = q[:20]
+    return setup.value(plan, np.full(len(plan), -1)), setup.information.names
+
+
+@pytest.mark.parametrize("robust", ["none", "average"])
+def test_the_remaining_error_does_not_hang_on_which_parameters_are_kept(
+    robust: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever minimal complete set stands for the arm, the same poses leave the same error."""
+    cell = plan_cell(FULL, "position", loads=BOTH, robust=robust, robust_samples=2)
+    q = random_poses(CHAIN, 150, seed=1)
+    usual, names = remaining(cell, q)
+    for effect in CATALOGUE.values():
+        monkeypatch.setattr(type(effect), "rank", -effect.rank)
+    other, others = remaining(cell, q)
+    assert set(names) != set(others)
+    assert len(names) == len(others)
+    # Scenarios bend axes that are parallel in the nominal arm, which no set takes up exactly.
+    assert other == pytest.approx(usual, rel=1e-6 if robust == "none" else 1e-2)
+
+
+def test_the_remaining_error_does_not_hang_on_the_base_frame_chosen() -> None:
+    """Where the base is put beforehand changes no certainty: the tracker stays where it is."""
+    q = random_poses(CHAIN, 100, seed=2)
+    found = []
+    for height in (0.0, 0.7):
+        cell = plan_cell(FULL, "position", loads=BOTH)
+        nominal = replace(cell.model.nominal, base_position=np.array([0.0, 0.0, height]))
+        found.append(remaining(replace(cell, model=replace(cell.model, nominal=nominal)), q)[0])
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
+def test_several_markers_count_as_their_mean_square() -> None:
+    """One test pose: ρ₀² is the mean over the markers of each one's own."""
+    q = random_poses(CHAIN, 60, seed=3)
+    pose = TargetPose(TABLE_2[3], DOWN)
+    cell = plan_cell(("joint_offset", "marker_position"), "position", test_poses=(pose,))
+    together = remaining(cell, q)[0]
+    setup = setup_of(cell, q)
+    plan = q[:20]
+    M = setup.gathered(setup.information.blocks(plan, np.full(20, -1)))[0]
+    sizes, kept = setup.information.sizes, setup.found.columns
+    each = []
+    for name in cell.tool.markers:
+        table = rows_with_markers(TABLE_2[[3]], DOWN, (name,))
+        A = setup.information.model.regressor(table).B[:, kept] * sizes
+        each.append(np.trace(A @ np.linalg.inv(M) @ A.T))
+    assert together == pytest.approx(np.mean(each), rel=1e-9)
+
+
+@pytest.mark.parametrize("criterion", ["test_pose", "I", "G"])
+def test_a_test_load_that_no_reading_shows_is_refused_with_its_parameter(criterion: Any) -> None:
+    """Loads straight down never turn joint 1; a force from the side does."""
+    pose = TargetPose(TABLE_2[0], SIDEWAYS)
+    cell = plan_cell(loads=DOWN[None], criterion=criterion, test_poses=(pose,))
+    q = random_poses(CHAIN, 60, seed=4)
+    with pytest.raises(InsufficientDataError) as caught:
+        setup_of(cell, q)
+    message = str(caught.value)
+    for part in (
+        "test pose 1",
+        "joint1.compliance",
+        "load's direction",
+        "fixed=[",
+        'criterion = "D"',
+    ):
+        assert part in message
+    sideways = replace(cell.design, loads=np.array([DOWN, SIDEWAYS]))
+    assert np.isfinite(remaining(replace(cell, design=sideways), q)[0])
+
+
+def test_a_test_pose_that_parameters_move_together_is_fine_and_apart_is_refused() -> None:
+    """Deflections show no base: where position in the data's frame is wanted, that is told."""
+    cell = plan_cell(("base_frame", "joint_compliance"), "deflection", loads=DOWN[None])
+    with pytest.raises(InsufficientDataError, match=r"depends on base\.[xyz]"):
+        setup_of(cell, random_poses(CHAIN, 60, seed=5))
+    # joint1.offset and base.rz turn the arm alike: neither is known alone, every position is.
+    cell = plan_cell(("base_frame", "joint_offset"), "position")
+    setup = setup_of(cell, random_poses(CHAIN, 60, seed=5))
+    assert len(setup.information.names) < len(setup.information.model.names)
