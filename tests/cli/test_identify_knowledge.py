@@ -115,7 +115,7 @@ def test_bounded_is_still_there(campaign):
 @pytest.mark.parametrize(
     "code, text, fragments",
     [
-        (2, "bound = 1", ["known.toml", "unknown key bound;", "did you mean 'bounds'"]),
+        (2, "bound = 1", ["known.toml", "unknown key bound;", "did you mean bounds"]),
         (2, '[[bounds]]\nparameter = "joint2.complience"\nlower = 0',
          ["known.toml", "did you mean 'joint2.compliance'"]),
         (2, '[[bounds]]\nparameter = "joint2.compliance"\nlower = 1e-6\n[[equality]]\n'
