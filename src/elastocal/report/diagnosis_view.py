@@ -21,7 +21,7 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.report.formatting import (
-    TextTable,
+    ShownTable,
     capital,
     display,
     estimate,
@@ -505,4 +505,4 @@ def extra_visits(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any] | None:
         if plan.time is not None:
             row.append(f"{plan.time[i] / 60:.1f}")
         table.append(tuple(row))
-    return {"table": TextTable(tuple(heads), table, ()), "more": len(plan) - len(table)}
+    return {"table": ShownTable(tuple(heads), table, ()), "more": len(plan) - len(table)}

@@ -156,11 +156,12 @@ def together(parts: Sequence[str], last: str = "and") -> str:
 
 
 def capital(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}"
+    """As a sentence begins; a symbol such as ρ₀ stays as it is."""
+    return text if text.startswith("ρ") else f"{text[:1].upper()}{text[1:]}"
 
 
 @dataclass(frozen=True)
-class TextTable:
+class ShownTable:
     """A table of texts.  `words` are the columns that hold words; the others hold numbers.
 
     `groups` names the rows that follow, by the index of the first: {0: "base frame", 6: …}.

@@ -27,7 +27,7 @@ from elastocal.identification.result import (
     deviation,
 )
 from elastocal.report.formatting import (
-    TextTable,
+    ShownTable,
     Tone,
     counted,
     display,
@@ -324,7 +324,7 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Row:
+class ParameterRow:
     """A parameter or a combination as text; "–" where there is no number."""
 
     name: str
@@ -351,7 +351,7 @@ def parameter_rows(
     result: Calibration,
     truth: Truth | None,
     published: Mapping[str, tuple[float, float]] | None = None,
-) -> list[Row]:
+) -> list[ParameterRow]:
     """One row per parameter, all of them, in the model's order.
 
     `published`: values and half widths (SI) that others found, by name.
@@ -364,7 +364,7 @@ def parameter_rows(
         nominal = e.nominal if nominal_known(result, e.name) else None
         shown = "–" if nominal is None else minus(plain(display(nominal, e.unit)[0]))
         rows.append(
-            Row(
+            ParameterRow(
                 printable(e.name), e.identifiable, minus(value), minus(half), unit, minus(known),
                 inside(true, e.ci95), shown, minus(short_note(result, e)),
                 bar=_bar(e, true, nominal, truth is not None), effect=effects[e.name],
@@ -390,7 +390,7 @@ def budget_steps(
     return [(named.get(s.step, s.step), s.heldout_rms, s.ci95) for s in budget.steps]
 
 
-def budget_table(result: Calibration, budget: ErrorBudget) -> TextTable:
+def budget_table(result: Calibration, budget: ErrorBudget) -> ShownTable:
     """The steps with their intervals and what each changes; noise alone last."""
     rows: list[tuple[str, ...]] = []
     before: float | None = None
@@ -400,17 +400,17 @@ def budget_table(result: Calibration, budget: ErrorBudget) -> TextTable:
         before = rms
     if budget.floor is not None:
         rows.append((budget.floor_name, length(budget.floor), "", ""))
-    return TextTable(("model", "held-out rms", "95 %", "change"), rows)
+    return ShownTable(("model", "held-out rms", "95 %", "change"), rows)
 
 
-def combination_rows(result: Calibration, truth: Truth | None) -> list[Row]:
+def combination_rows(result: Calibration, truth: Truth | None) -> list[ParameterRow]:
     rows = []
     for c in result.combinations:
         true = None if truth is None else combination_truth(result, c, truth)
         value, half, unit, known = texts(c, true)
         short, whole = shortened(c), shortened(c, len(c.terms))
         rows.append(
-            Row(
+            ParameterRow(
                 minus(short), True, minus(value), minus(half), unit, minus(known),
                 inside(true, c.ci95), whole=minus(whole) if whole != short else "",
                 bar=_bar(c, true, None, truth is not None),

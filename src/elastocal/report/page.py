@@ -59,7 +59,7 @@ from elastocal.report.diagnosis_view import (
     untested_rows,
 )
 from elastocal.report.formatting import (
-    TextTable,
+    ShownTable,
     capital,
     counted,
     length,
@@ -399,7 +399,7 @@ def _faulty(o: Outlier) -> dict[str, str]:
 
 
 def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{capital(text)}."
 
 
 def write_plan_report(
@@ -438,7 +438,7 @@ def _plan_contents(plan: Plan) -> dict[str, Any]:
         "lead": plan_lead(plan),
         "headline": plan_headline(plan),
         "tone": plan_tone(plan),
-        "verdict": [(label, _sentence_start(text)) for label, text in lines if label != "Warning"],
+        "verdict": [(label, capital(text)) for label, text in lines if label != "Warning"],
         "warnings": [text for label, text in lines if label == "Warning"],
         "steps": plan_steps(plan),
         "poses": pose_rows(plan, reasons=False),
@@ -463,10 +463,6 @@ def _plan_figures(plan: Plan, space: Space) -> dict[str, str]:
         "removed": plan_removed(plan),
         "curve": plan_curve(plan) if plan.curve else "",
     }
-
-
-def _sentence_start(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}" if not text.startswith("ρ") else text
 
 
 MOST_CANDIDATES = 40
@@ -531,19 +527,19 @@ def _diagnosis_contents(d: Diagnosis, model: Model) -> dict[str, Any]:
         "box": BOX_WIDTH,
         "places": likeliest_places(d),
         "figures": {name: Markup(svg) for name, svg in _diagnosis_figures(d).items()},
-        "budget": TextTable(BUDGET_HEADS, gap_rows(d)),
-        "parameters": TextTable(PARAMETER_HEADS, added_parameter_rows(d.effects), (0, 3)),
-        "candidates": TextTable(CANDIDATE_HEADS, hypothesis_rows(d, MOST_CANDIDATES), (0, 5)),
+        "budget": ShownTable(BUDGET_HEADS, gap_rows(d)),
+        "parameters": ShownTable(PARAMETER_HEADS, added_parameter_rows(d.effects), (0, 3)),
+        "candidates": ShownTable(CANDIDATE_HEADS, hypothesis_rows(d, MOST_CANDIDATES), (0, 5)),
         "n_candidates": len(d.candidates),
         "alike": [capital(text) for text in alike],
-        "structure": TextTable(STRUCTURE_HEADS, structure_rows(d, MOST_TESTS)),
+        "structure": ShownTable(STRUCTURE_HEADS, structure_rows(d, MOST_TESTS)),
         "n_structure": len(d.structure),
         "noise": noise_floor_lines(d.noise, kinds),
-        "faulty": TextTable(FAULTY_HEADS, faulty_rows(d, MOST_FAULTY_LISTED), (1, 2)),
+        "faulty": ShownTable(FAULTY_HEADS, faulty_rows(d, MOST_FAULTY_LISTED), (1, 2)),
         "more_faulty": max(0, len(d.noise.faulty) - MOST_FAULTY_LISTED),
-        "untested": TextTable(UNTESTED_HEADS, untested_rows(d), (0, 1, 2)),
+        "untested": ShownTable(UNTESTED_HEADS, untested_rows(d), (0, 1, 2)),
         "extra": [] if d.extra is None else extra_lines(d.extra),
-        "pairs": TextTable(PAIR_HEADS, [] if d.extra is None else pair_rows(d.extra)),
+        "pairs": ShownTable(PAIR_HEADS, [] if d.extra is None else pair_rows(d.extra)),
         "visits": extra_visits(d, kinds),
     }
 

@@ -9,7 +9,7 @@ import numpy as np
 from elastocal.errors import option
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.plan import Plan, Predicted, Reason
-from elastocal.report.formatting import TextTable, Tone, counted, display, printable, significant
+from elastocal.report.formatting import ShownTable, Tone, counted, display, printable, significant
 
 TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "serves (standard deviation without it)"
@@ -20,7 +20,7 @@ def joint_text(value: float, kind: str, decimals: int = 2) -> str:
     return f"{np.degrees(value) if kind == 'revolute' else value * 1e3:.{decimals}f}"
 
 
-def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> TextTable:
+def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable:
     """Joint values, load, place in the order of execution, and what the pose is there for."""
     kinds = plan.model.chain.kinds
     loads = len(plan.forces) > 1 and bool((plan.load >= 0).any())
@@ -35,7 +35,7 @@ def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> TextTable:
         if loads:
             row.append(force_text(plan, int(plan.load[k])))
         rows.append((*row, str(order[k]), *([served(reason)] if reasons else [])))
-    return TextTable(tuple(heads), rows, (len(heads) - 1,) if reasons else ())
+    return ShownTable(tuple(heads), rows, (len(heads) - 1,) if reasons else ())
 
 
 def first_stops(plan: Plan) -> dict[int, int]:
@@ -47,12 +47,12 @@ def force_text(plan: Plan, load: int) -> str:
     return " ".join(f"{f:g}" for f in plan.forces[load])
 
 
-def reason_rows(plan: Plan) -> TextTable:
+def reason_rows(plan: Plan) -> ShownTable:
     """What each pose is there for."""
     rows: list[tuple[str, ...]] = [
         (name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)
     ]
-    return TextTable(("pose", SERVES), rows, (1,))
+    return ShownTable(("pose", SERVES), rows, (1,))
 
 
 def served(reason: Reason) -> str:
@@ -64,7 +64,7 @@ def served(reason: Reason) -> str:
     return ", ".join(parts) or "all a little"
 
 
-def interval_rows(plan: Plan) -> TextTable:
+def interval_rows(plan: Plan) -> ShownTable:
     """Predicted half widths of the 95 % intervals."""
     combined = any(p.combined_with for p in plan.predicted)
     rows: list[tuple[str, ...]] = []
@@ -73,7 +73,7 @@ def interval_rows(plan: Plan) -> TextTable:
         row = (printable(p.name), significant(shown, 2), unit)
         rows.append((*row, _partners(p)) if combined else row)
     heads = ("parameter", "± 95 %", "unit")
-    return TextTable((*heads, "together with") if combined else heads, rows, (0, 2, 3))
+    return ShownTable((*heads, "together with") if combined else heads, rows, (0, 2, 3))
 
 
 def _partners(p: Predicted) -> str:
@@ -81,17 +81,17 @@ def _partners(p: Predicted) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def curve_rows(plan: Plan) -> TextTable:
+def curve_rows(plan: Plan) -> ShownTable:
     """The criterion against the number of poses."""
     heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
     rows: list[tuple[str, ...]] = [
         (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
         for s in plan.curve
     ]
-    return TextTable(heads, rows, ())
+    return ShownTable(heads, rows, ())
 
 
-def removal_rows(plan: Plan) -> TextTable:
+def removal_rows(plan: Plan) -> ShownTable:
     """Which rule of the cell removed how many candidates, the hardest rule first."""
     c = plan.candidates
     removed = sorted(c.removed_by.items(), key=lambda item: -item[1])
@@ -101,10 +101,10 @@ def removal_rows(plan: Plan) -> TextTable:
         if n
     ]
     rows.append(("feasible", str(c.feasible), f"{100 * c.feasible / max(c.tried, 1):.1f} %"))
-    return TextTable(("rule", "candidates", "share"), rows)
+    return ShownTable(("rule", "candidates", "share"), rows)
 
 
-def stop_rows(plan: Plan) -> TextTable:
+def stop_rows(plan: Plan) -> ShownTable:
     """The stops in the order of execution: pose, load, how it is reached, what it takes."""
     kinds = plan.model.chain.kinds
     rows: list[tuple[str, ...]] = []
@@ -122,7 +122,7 @@ def stop_rows(plan: Plan) -> TextTable:
         )
     joints = tuple(f"q{i + 1} {'°' if k == 'revolute' else 'mm'}" for i, k in enumerate(kinds))
     heads = ("stop", "pose", "load N", "load change", "points in between", "travel s", *joints)
-    return TextTable(heads, rows, (2, 3))
+    return ShownTable(heads, rows, (2, 3))
 
 
 CLOSE = 0.95  # efficiency from which a plan is called near the best

@@ -12,7 +12,7 @@ from elastocal.identification.residuals import ResidualSummary, groupings, summa
 from elastocal.identification.result import Calibration
 from elastocal.identification.weighted_problem import WeightKind, weights_for
 from elastocal.model.observations import COMPONENTS, Observations
-from elastocal.report.formatting import TextTable, printable, significant
+from elastocal.report.formatting import ShownTable, printable, significant
 from elastocal.units import Array
 
 MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice of them
@@ -139,7 +139,7 @@ MOST_CONFIGURATIONS = 200
 Rows = list[tuple[str, ...]]
 
 
-def residual_table(observed: Observations, residuals: Residuals) -> TextTable:
+def residual_table(observed: Observations, residuals: Residuals) -> ShownTable:
     """Mean, rms and largest residual of every direction, marker, load state and configuration.
 
     Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
@@ -160,7 +160,7 @@ def residual_table(observed: Observations, residuals: Residuals) -> TextTable:
         code = labels.code[:: observed.size]
         groups[len(rows)] = labels.by
         rows += _group_rows(part, code, labels.names[:MOST_CONFIGURATIONS])
-    return TextTable(HEADS, rows, words=(0, 5), groups=groups)
+    return ShownTable(HEADS, rows, words=(0, 5), groups=groups)
 
 
 def _group_rows(part: NDArray[np.float64], code: NDArray[np.int64], names: tuple[str, ...]) -> Rows:

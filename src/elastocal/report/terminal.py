@@ -34,7 +34,7 @@ from elastocal.report.diagnosis_view import (
     untested_rows,
 )
 from elastocal.report.formatting import (
-    TextTable,
+    ShownTable,
     capital,
     display,
     length,
@@ -295,7 +295,7 @@ def curve_table(plan: Plan) -> Table:
     return _printed("Number of poses", curve_rows(plan))
 
 
-def _printed(title: str, table: TextTable) -> Table:
+def _printed(title: str, table: ShownTable) -> Table:
     """For the terminal: joints and words may wrap, other numbers may not."""
     shown = titled(title)
     for k, head in enumerate(table.heads):
