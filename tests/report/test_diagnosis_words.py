@@ -74,7 +74,7 @@ def test_an_ambiguous_verdict_names_the_whole_set_and_the_way_out():
     )
     assert "explain" not in text
     assert "Gear eccentricity at joint 2 (probability" not in diagnosis_headline(AMBIGUOUS)
-    assert "(`plan`)" in text
+    assert "plan='extra.csv'" in text
 
 
 def test_an_effect_that_is_certain_beside_an_open_set_is_told_apart_from_it():
@@ -103,7 +103,7 @@ def test_an_unknown_effect_has_a_place_a_driver_and_a_chance_but_no_name():
     # Tests that the whole family explains by chance are not told as findings.
     assert "joint 3 torque" not in text and "load (p" not in text
     assert not any(effect_at(c) in text for c in UNKNOWN.candidates)
-    assert "(`plan`)" in text
+    assert "plan='extra.csv'" in text
 
 
 def test_what_is_named_beside_something_unknown_has_to_prove_itself():
@@ -147,7 +147,7 @@ def test_nothing_says_what_hides_in_the_noise_and_what_does_not():
 def test_extra_poses_promise_or_say_that_none_helps():
     promise = " ".join(diagnosis_steps(replace(AMBIGUOUS, extra=EXTRA)))
     assert "2 more poses" in promise and "from 0.69 to > 0.99" in promise and "0.85" in promise
-    assert "(`plan`)" not in promise
+    assert "plan='extra.csv'" not in promise
     assert "count as one" not in promise
     grouped = replace(EXTRA, inseparable=(("backlash:joint2", "encoder_scale:joint2"),))
     lines = diagnosis_steps(replace(AMBIGUOUS, extra=grouped))

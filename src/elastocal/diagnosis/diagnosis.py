@@ -340,12 +340,12 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         names = {"effects": numbers["effects"]}
         yield Finding(
             "named_beside_unknown", "care", names,
-            f"The cell of {option('cell_out')} has the effects named added, and nothing for what "
-            "has no name: keep it only where it does better on poses kept back (identify with "
+            f"The cell that {option('cell_out')} writes has the effects named added, and nothing "
+            "for what has no name: keep it only where it does better on poses kept back (identify with "
             f"{option('test')}).",
         )  # fmt: skip
     if d.open and d.extra is None:
-        remedy = f"Plan the poses that tell the rivals apart ({option('plan')}), and measure them."
+        remedy = f"{option('plan', 'extra.csv')} designs the poses that tell the rivals apart."
         yield Finding("rivals_open", "note", {}, remedy)
     if d.dependences:
         yield Finding(
@@ -374,8 +374,8 @@ def _remedy(verdict: Verdict) -> str:
     """What to do after a verdict."""
     if verdict == "explained":
         return (
-            f"Identify with the cell of {option('cell_out')}, which has these effects added, and "
-            f"check the promise on poses that were never fitted (identify with {option('test')})."
+            f"Identify with the cell that {option('cell_out')} writes, and check the promise on "
+            f"poses that were never fitted (identify with {option('test')})."
         )
     if verdict == "ambiguous":
         return (
