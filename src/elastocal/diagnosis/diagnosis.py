@@ -341,8 +341,8 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         yield Finding(
             "named_beside_unknown", "care", names,
             f"The cell that {option('cell_out')} writes has the effects named added, and nothing "
-            "for what has no name: keep it only where it does better on poses kept back (identify with "
-            f"{option('test')}).",
+            "for what has no name: keep it only where it does better on poses kept back (identify "
+            f"with {option('test')}).",
         )  # fmt: skip
     if d.open and d.extra is None:
         remedy = f"{option('plan', 'extra.csv')} designs the poses that tell the rivals apart."
