@@ -134,7 +134,7 @@ def test_an_effect_that_the_catalogue_lacks_is_unknown_but_located(name: str) ->
     assert (d.location.stage, d.location.where) == (stage, fault.where)
     assert max(c.probability for c in d.candidates) < 0.1
     assert fault.effect not in {c.effect for c in d.candidates}
-    shown = {t.covariate: t.p_family for t in d.structure}
+    shown = {t.driver: t.p_family for t in d.structure}
     assert shown[covariate] <= 0.05
 
 
@@ -143,7 +143,7 @@ def test_the_shape_of_an_unknown_dependence_is_drawn() -> None:
     fault = FAULTS["gear_eccentricity:joint4"]
     d = diagnosed("gear_eccentricity:joint4", without=("gear_eccentricity",))
     (curve,) = d.curves
-    assert (curve.covariate, curve.x_unit, curve.y_unit) == ("joint4 angle", "rad", "rad")
+    assert (curve.driver, curve.x_unit, curve.y_unit) == ("joint4 angle", "rad", "rad")
     x, y, sd = (np.array(v) for v in (curve.x, curve.y, curve.sd))
     a, b = fault.values.values()
     true = a * np.sin(x) + b * np.cos(x)

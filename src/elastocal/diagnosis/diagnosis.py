@@ -167,7 +167,7 @@ class StructureTest:
     tests; `p_family` the same against the largest over all drivers.
     """
 
-    covariate: str
+    driver: str
     p_value: float
     p_family: float
 
@@ -180,7 +180,7 @@ class Curve:
     One curve per component of the entry that moves.
     """
 
-    covariate: str
+    driver: str
     x_unit: str
     entry: str
     y_unit: str
@@ -199,7 +199,7 @@ class Location:
     probability: float
     stages: dict[str, float]
     places: dict[str, float]
-    covariates: dict[str, float]
+    drivers: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -351,7 +351,7 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         yield Finding(
             "depends_on", "note",
             {
-                "drivers": tuple(t.covariate for t in d.dependences),
+                "drivers": tuple(t.driver for t in d.dependences),
                 "p_family": tuple(t.p_family for t in d.dependences),
             },
         )  # fmt: skip
@@ -490,7 +490,7 @@ def _location(location: Location) -> dict[str, Any]:
         "evidence": {
             "stages": location.stages,
             "places": location.places,
-            "drivers": location.covariates,
+            "drivers": location.drivers,
         },
     }
 

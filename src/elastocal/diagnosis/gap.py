@@ -37,13 +37,13 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     largest = np.max(list(observed.driver_flips.values()), axis=0)
     tests = [
         StructureTest(
-            covariate,
-            exceedance(observed.driver_flips[covariate], odds),
+            driver,
+            exceedance(observed.driver_flips[driver], odds),
             exceedance(largest, odds),
         )
-        for covariate, odds in observed.driver_odds.items()
+        for driver, odds in observed.driver_odds.items()
     ]
-    order = sorted(tests, key=lambda t: (t.p_family, t.p_value, -observed.driver_odds[t.covariate]))
+    order = sorted(tests, key=lambda t: (t.p_family, t.p_value, -observed.driver_odds[t.driver]))
     return tuple(order)
 
 
@@ -64,7 +64,7 @@ def location(found: SelectedEffects, tests: tuple[StructureTest, ...]) -> Locati
         stages[item.what.stage] = stages.get(item.what.stage, 0.0) + float(p)
         places[item.what.where] = places.get(item.what.where, 0.0) + float(p)
     what = items[own].what
-    shown = {t.covariate: t.p_value for t in tests}
+    shown = {t.driver: t.p_value for t in tests}
     return Location(
         what.stage, what.where, places.get(what.where, 0.0), _sorted(stages), _sorted(places), shown
     )

@@ -26,9 +26,8 @@ from elastocal.planning.bodies import (
 )
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
-from elastocal.report.figures import ARM, FAINT, SERIES, drawn
+from elastocal.report.figures import ARM, FAINT, INK, SERIES, drawn
 from elastocal.report.formatting import length, printable, short_name
-from elastocal.report.plan_picture import INK
 from elastocal.report.plan_view import first_stops, joint_text
 from elastocal.units import Array, IntArray
 

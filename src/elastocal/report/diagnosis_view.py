@@ -74,9 +74,9 @@ def name_of(text: str) -> str:
     return effect_at(EffectAt(effect, where)) if colon else driver_name(plain_name(text))
 
 
-def driver_name(covariate: str) -> str:
+def driver_name(driver: str) -> str:
     """ "joint2 angle" → "joint 2 angle"."""
-    return re.sub(r"\b(joint|link)([0-9]+)\b", r"\1 \2", printable(covariate))
+    return re.sub(r"\b(joint|link)([0-9]+)\b", r"\1 \2", printable(driver))
 
 
 def probability(p: float) -> str:
@@ -258,7 +258,7 @@ def _dependence(d: Diagnosis) -> list[str]:
     if not d.dependences:
         return ["no single driver that was tested shows it; see the curves for its shape."]
     told = d.dependences[:MOST_NAMED]
-    named = [f"{driver_name(t.covariate)} ({size_of(t.p_family)})" for t in told]
+    named = [f"{driver_name(t.driver)} ({size_of(t.p_family)})" for t in told]
     more = len(d.dependences) - len(named)
     return [together(named) + (f" and {more} more" if more else "") + "."]
 
@@ -267,7 +267,7 @@ def _shape(curve: Curve) -> str:
     """How much the driver moves the entry, from its lowest to its highest point."""
     moved = max(curve.y) - min(curve.y)
     how_far = length(moved) if curve.y_unit == "m" else _in_unit(moved, curve.y_unit)
-    return f"{driver_name(curve.covariate)} moves {driver_name(curve.entry)} by {how_far} in all."
+    return f"{driver_name(curve.driver)} moves {driver_name(curve.entry)} by {how_far} in all."
 
 
 def _in_unit(value: float, unit: str) -> str:
@@ -404,9 +404,7 @@ def added_parameter_rows(findings: Sequence[FoundEffect]) -> Rows:
 def structure_rows(d: Diagnosis, most: int) -> Rows:
     """Tests that name no effect, the most conspicuous first."""
     tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))
-    return [
-        (driver_name(t.covariate), p_value(t.p_value), p_value(t.p_family)) for t in tests[:most]
-    ]
+    return [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests[:most]]
 
 
 def faulty_rows(d: Diagnosis, most: int) -> Rows:

@@ -263,7 +263,7 @@ def _curve(axes: Axes, curve: Curve) -> None:
     axes.fill_between(x * wide, (y - 2 * sd) * high, (y + 2 * sd) * high, color=SERIES[0],
                       alpha=0.25, linewidth=0, label="± 2 standard deviations")  # fmt: skip
     axes.plot(x * wide, y * high, color=INK, linewidth=1.4, label="estimated shape")
-    axes.set_xlabel(f"{_axis_name(driver_name(curve.covariate))} in {x_unit}")
+    axes.set_xlabel(f"{_axis_name(driver_name(curve.driver))} in {x_unit}")
     axes.set_ylabel(f"{short_name(driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}")
 
 

@@ -14,10 +14,9 @@ from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.model.observations import Observations
 from elastocal.report.arm_view import Space
-from elastocal.report.figures import FAINT, SERIES, dots, drawn
+from elastocal.report.figures import FAINT, INK, SERIES, dots, drawn
 from elastocal.report.formatting import length, short_name, significant
 from elastocal.report.identification_view import rms_by_kind
-from elastocal.report.plan_picture import INK
 from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
 from elastocal.units import Array
 
