@@ -21,7 +21,7 @@ from elastocal.errors import InputError
 from elastocal.identification import Options, published
 from elastocal.identification.identify import identify
 from elastocal.identification.intervals import KINDS as INTERVALS
-from elastocal.identification.intervals import KINDS as NOISES
+from elastocal.identification.noise_structure import noise_models
 from elastocal.identification.options import METHODS, ROBUST
 from elastocal.model import Model, observe
 from elastocal.simulation.simulate import simulate
@@ -155,7 +155,7 @@ def test_robust_intervals_hold_with_outliers():
 # --- noise ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", [k for k in NOISES if k != "auto"])
+@pytest.mark.parametrize("noise", [k for k in noise_models() if k != "auto"])
 def test_every_noise_model_by_name(noise):
     model, table, truth = campaign(2, effect=1e-4)
     result = identify(model, table, Options(noise=noise))

@@ -304,9 +304,9 @@ def test_ratio_to_stated_noise():
     result = identify(model, simulate(model, plan, truth, rng))
     low, high = chi2_band(result.dof)
     assert low < result.noise.ratio_to_stated**2 * result.dof < high
-    assert result.noise["sigma_um"] is None
+    assert result.noise.sigma is None
     unit = identify(model, measured(model, plan, truth, 5e-5, rng), Options(weights="none"))
     # Unit weights do not make the stated 20, 20, 50 µm forgotten.
     assert unit.noise.ratio_to_stated == pytest.approx(np.sqrt((6.25 + 6.25 + 1) / 3), rel=0.2)
     low, high = chi2_band(unit.dof)
-    assert low < (unit.noise["sigma_um"] / 50) ** 2 * unit.dof < high
+    assert low < (unit.noise.sigma / 50e-6) ** 2 * unit.dof < high

@@ -170,5 +170,6 @@ def test_it_is_independent_of_our_kinematics() -> None:
         lines = Path(str(module.__file__)).read_text().splitlines()
         imported = {line.split()[1] for line in lines if line.startswith("from elastocal")}
         assert imported <= {
-            "elastocal.errors", "elastocal.model.chain", "elastocal.simulation.mujoco_arm"
+            "elastocal.errors", "elastocal.model.chain", "elastocal.simulation.mujoco_arm",
+            "elastocal.units",
         }  # fmt: skip
