@@ -28,7 +28,7 @@ endif
 
 help:
 	@echo "make demo       set up .venv if needed, then calibrate a simulated arm"
-	@echo "make test       the test suite              (PYTEST_ARGS=\"tests/manipulator -x\", WORKERS=2)"
+	@echo "make test       the test suite              (PYTEST_ARGS=\"tests/model -x\", WORKERS=2)"
 	@echo "make test-long  the long studies among the tests"
 	@echo "make bench      the benchmarks, to benchmarks/result.md      (BENCH_ARGS=--full: all sizes)"
 	@echo "make lint       ruff check, ruff format --check, mypy"

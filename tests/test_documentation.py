@@ -1,5 +1,6 @@
 """What the documentation shows is what the tool accepts."""
 
+import pkgutil
 import re
 import shlex
 from pathlib import Path
@@ -96,3 +97,16 @@ def test_the_site_is_built_strictly():
     """Without --quiet, under which mkdocs counts no warning."""
     assert "mkdocs build --strict\n" in (ROOT / "Makefile").read_text(encoding="utf-8")
     assert "make docs\n" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+
+
+def test_every_name_that_a_page_of_the_interface_takes_from_the_code_is_there():
+    for page in (DOCS / "reference" / "api").glob("*.md"):
+        for name in re.findall(r"^::: (\S+)$", page.read_text(encoding="utf-8"), re.M):
+            assert pkgutil.resolve_name(name), f"{page.name} shows {name}"
+
+
+def test_every_file_of_the_repository_that_a_page_names_is_there():
+    folders = "|".join(("src", "tests", "docs", "examples", "experiment_design", "benchmarks"))
+    for page in [*PAGES, *ROOT.glob("experiment_design/*/README.md")]:
+        for name in re.findall(rf"`((?:{folders})/[^`\s*]*)", page.read_text(encoding="utf-8")):
+            assert (ROOT / name).exists(), f"{page.name} names {name}"

@@ -6,9 +6,10 @@ import certificate
 import chain
 import coverage
 import diagnosis_distance
+import house
 import tutorial_valley
 from style import draw
 
 if __name__ == "__main__":
-    for module in (chain, tutorial_valley, coverage, certificate, diagnosis_distance):
+    for module in (chain, house, tutorial_valley, coverage, certificate, diagnosis_distance):
         draw(module.__name__, module.figure)

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 from elastocal import plugin_loader
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
+from elastocal.identification import noise_structure
 from elastocal.identification.noise_structure import NoiseModel, Readings
 from elastocal.model import effects, rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
@@ -46,12 +47,22 @@ from elastocal.model.effects.driven import (
     LinkLength,
     MarkerMotion,
 )
+from elastocal.planning import criteria
+from elastocal.planning.criteria import SpectralCriterion, TraceCriterion
+from elastocal.planning.criterion import (
+    CriterionInputs,
+    ScenarioCriterion,
+    SpectralTerm,
+    Term,
+    TraceTerm,
+)
 
 __all__ = [
     "Arm",
     "BaseMotion",
     "Cell",
     "Chain",
+    "CriterionInputs",
     "DrivenEffect",
     "Effect",
     "JointMotion",
@@ -62,10 +73,16 @@ __all__ = [
     "NoiseModel",
     "ParameterSpec",
     "Readings",
+    "ScenarioCriterion",
     "Setting",
+    "SpectralCriterion",
+    "SpectralTerm",
     "Spring",
     "Symbols",
+    "Term",
     "TorqueEffect",
+    "TraceCriterion",
+    "TraceTerm",
     "add_deflection",
     "index",
     "joints",
@@ -83,7 +100,8 @@ load_plugins = plugin_loader.load_plugins
 
 E = TypeVar("E", bound=Effect)
 N = TypeVar("N", bound=NoiseModel)
-C = TypeVar("C")
+C = TypeVar("C", bound=type[ScenarioCriterion])
+T = TypeVar("T")
 
 
 def register_effect(effect: E) -> E:
@@ -91,8 +109,35 @@ def register_effect(effect: E) -> E:
 
     It acts behind the last effect of its stage; cells name it by `effect.name`.
 
-    Raises InputError, with file and line of the call, where `effect` is none, says too little, or
-    has the name of another one.
+    Args:
+        effect: An object of a class derived from `Effect`.
+
+    Returns:
+        The effect itself.
+
+    Raises:
+        InputError: It is no effect, says too little, or has the name of another one; the message
+            names file and line of the call.
+
+    Examples:
+        >>> from elastocal.plugins import (
+        ...     DrivenEffect, JointMotion, ParameterSpec, index, turning_joints
+        ... )
+        >>> class SquareGear(DrivenEffect):
+        ...     "δq = a q² with the commanded joint angle q; a in 1/rad."
+        ...
+        ...     name, stage, entry = "square_gear", "transmission", JointMotion()
+        ...
+        ...     def places(self, chain, cell):
+        ...         return turning_joints(chain)
+        ...
+        ...     def parameters(self, place, chain, cell):
+        ...         return (ParameterSpec("square", "1/rad", 0.0, 1e-5),)
+        ...
+        ...     def drive(self, arm, place, p):
+        ...         return p["square"] * arm.q_commanded[index(place)] ** 2
+        >>> ec.register_effect(SquareGear()).name
+        'square_gear'
     """
     return _registered(effects.register, effect)
 
@@ -100,26 +145,63 @@ def register_effect(effect: E) -> E:
 def register_noise_model(model: N) -> N:
     """Make a noise model known to `identify`, which tries it beside the built-in ones.
 
-    Raises InputError, with file and line of the call, where `model` is none, or has the name of
-    another one.
-    """
-    from elastocal.identification.noise_structure import register
+    Args:
+        model: An object of a class derived from `NoiseModel`.
 
-    return _registered(register, model)
+    Returns:
+        The model itself.
+
+    Raises:
+        InputError: It is no noise model, or has the name of another one; the message names file
+            and line of the call.
+
+    Examples:
+        >>> from elastocal.plugins import NoiseModel
+        >>> class LoadedOrNot(NoiseModel):
+        ...     "One variance for the loaded readings, one for the others."
+        ...
+        ...     name, description = "loaded_or_not", "one variance with the load, one without"
+        ...
+        ...     def components(self, readings):
+        ...         loaded = readings.rows.force.any(axis=1)
+        ...         return {"loaded": loaded * 1.0, "unloaded": ~loaded * 1.0}
+        >>> model = ec.register_noise_model(LoadedOrNot())
+    """
+    return _registered(noise_structure.register, model)
 
 
 def register_criterion(criterion: C) -> C:
-    """Make a criterion known to `design`.
+    """Make a criterion known to `design`; usable as a decorator of its class.
 
-    Raises InputError, with file and line of the call, where `criterion` is none, or has the name of
-    another one.
+    Args:
+        criterion: A class derived from `ScenarioCriterion`, `TraceCriterion` or
+            `SpectralCriterion`.
+
+    Returns:
+        The class itself.
+
+    Raises:
+        InputError: It is no criterion, is not complete, or has the name of another one; the
+            message names file and line of the call.
+
+    Examples:
+        >>> from elastocal.plugins import TraceCriterion
+        >>> @ec.register_criterion
+        ... class ElbowAlone(TraceCriterion):
+        ...     "Φ = std(k_3)², the variance of the compliance of joint 3."
+        ...
+        ...     name, unit = "elbow_alone", "rad/(N·m)"
+        ...     title = "standard deviation of the compliance of joint 3"
+        ...
+        ...     @classmethod
+        ...     def of(cls, inputs):
+        ...         row = inputs.row({"joint3.compliance": 1.0})
+        ...         return cls(np.stack([np.outer(row, row)] * inputs.scenarios))
     """
-    from elastocal.planning.criteria import register  # type: ignore[import-not-found, unused-ignore]
-
-    return _registered(register, criterion)
+    return _registered(criteria.register, criterion)
 
 
-def _registered(register: Callable[[C], Any], what: C) -> C:
+def _registered(register: Callable[[T], Any], what: T) -> T:
     """What was registered, so that a criterion's class can be decorated."""
     try:
         register(what)

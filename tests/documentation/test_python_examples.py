@@ -3,7 +3,10 @@
 import re
 from pathlib import Path
 
+import pytest
+
 import elastocal as ec
+from elastocal.demo import run_demo
 
 DOCS = Path(__file__).parents[2] / "docs"
 # In the order in which they build on each other; design and diagnosis have tests of their own.
@@ -34,6 +37,21 @@ def test_the_front_door_is_as_its_page_shows_it(course, monkeypatch, capsys):
     exec(compile(example, "front", "exec"), {})
     assert "<Calibration" in capsys.readouterr().out
     assert {"front.csv", "calibrated.urdf"} <= {path.name for path in course.folder.iterdir()}
+
+
+def test_the_readme_s_first_screen_runs_and_its_numbers_are_those_found(tmp_path, monkeypatch):
+    (example,) = examples(DOCS.parent / "README.md")
+    assert "B_i" in (DOCS.parent / "README.md").read_text(encoding="utf-8").split("```", 1)[0]
+    run_demo(tmp_path / "demo_out")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(compile(example, "README", "exec"), names)
+    low, high = names["fit"]["joint3.compliance"].ci95
+    assert f"({low:.3e}, {high:.3e})" in example and str(names["B"].shape) in example
+    (efficiency,) = re.findall(r"efficiency_pool +# ([0-9.]+):", example)
+    assert names["plan"].certificate.efficiency_pool == pytest.approx(float(efficiency), abs=1e-3)
+    written = {path.name for path in tmp_path.iterdir()}
+    assert {"report.html", "commands.csv", "calibrated.urdf", "plan.csv"} <= written
 
 
 def test_every_name_of_the_front_door_that_a_page_uses_is_there():

@@ -10,6 +10,7 @@ from pathlib import Path
 from elastocal import plugin_loader
 from elastocal.identification import noise_structure as structure
 from elastocal.model.effects import CATALOGUE
+from elastocal.planning.criteria import CRITERIA
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -38,9 +39,9 @@ def write_example(folder: Path, file: str) -> Path:
 
 @contextmanager
 def forgotten() -> Iterator[None]:
-    """Catalogue, noise models and files that were run are afterwards as they were before."""
+    """Catalogue, noise models, criteria and files that were run are afterwards as before."""
     registries = (
-        CATALOGUE, structure.STRUCTURES, structure.REGISTERED, plugin_loader._files
+        CATALOGUE, structure.STRUCTURES, structure.REGISTERED, CRITERIA, plugin_loader._files
     )  # fmt: skip
     before = [dict(each) for each in registries]
     try:

@@ -1,0 +1,39 @@
+"""The picture of the house shows every package, and every arrow of it leads downwards."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "explanation" / "house.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def house():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "path", [str(ROOT / "docs" / "figures"), *sys.path])
+        import house
+
+        return house
+
+
+def test_every_package_has_a_room_and_a_line_of_text(house):
+    packages = {path.parent.name for path in (ROOT / "src" / "elastocal").glob("*/__init__.py")}
+    told = set(re.findall(r"`(\w+)`", PAGE))
+    assert packages - {"demo"} <= set(house.ROOMS) & told
+
+
+def test_every_arrow_leads_downwards(house):
+    uses = house.uses()
+    assert uses["model"] == {"cell", "measurements"} and "model" in uses["identification"]
+    for room, direct in uses.items():
+        assert all(house.ROOMS[target][1] < house.ROOMS[room][1] for target in direct), room
+
+
+def test_modules_that_the_page_names_are_there():
+    named = re.findall(r"`(\w+/[\w/]+\.py)`", PAGE.replace("`docs/figures/house.py`", ""))
+    assert len(named) >= 8
+    for name in named:
+        assert (ROOT / "src" / "elastocal" / name).is_file(), name
