@@ -21,7 +21,7 @@ from elastocal.errors import require
 from elastocal.planning.candidates import CHUNK, sobol
 from elastocal.planning.criterion import Gradient
 from elastocal.planning.polish import Searches, Sensitivity, distinct, search_all, trials
-from elastocal.planning.selection_problem import DesignProblem
+from elastocal.planning.selection import DesignProblem
 from elastocal.units import Array, IntArray, Progress
 
 LOT = 256  # of the best fresh points that are checked for feasibility at a time

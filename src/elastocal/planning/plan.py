@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
 from elastocal.planning.criterion import Criterion
-from elastocal.planning.exact_plan import RandomPlans
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text
@@ -281,14 +280,15 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Chance:
-    """The same number of random feasible poses: criteria of `drawn` such plans in the plan's unit.
+    """The same number of random feasible poses: criteria of `n` such plans in the plan's unit.
 
     `determined` of them determine every parameter; `median`, `best` and `worst` are None where
     that plan does not.  `efficiency` is the plan's Φ over the median's, None where the criterion
-    has no bound: such a Φ does not count poses.
+    has no bound: such a Φ does not count poses.  Φ is homogeneous of degree −1 in the number of
+    readings: without prior knowledge random plans need 1/efficiency times as many readings.
     """
 
-    drawn: int
+    n: int
     determined: int
     median: float | None
     best: float | None
@@ -296,18 +296,13 @@ class Chance:
     efficiency: float | None
 
     @classmethod
-    def of(cls, found: RandomPlans, value: float, criterion: Criterion) -> Chance:
-        """What `found` is beside a plan of Φ = `value`."""
-
-        def known(phi: float) -> float | None:
-            return criterion.reported(phi)[0] if np.isfinite(phi) else None
-
-        values = found.values
-        return cls(
-            len(values), found.determined, known(found.median), known(float(values[0])),
-            known(float(values[-1])),
-            found.efficiency(value) if criterion.certifiable else None,
-        )  # fmt: skip
+    def of(cls, values: Array, value: float, criterion: Criterion) -> Chance:
+        """What random plans of Φ = `values` (n,), ascending, are beside a plan of Φ = `value`."""
+        phi = (float(np.median(values)), float(values[0]), float(values[-1]))
+        known = [criterion.reported(v)[0] if np.isfinite(v) else None for v in phi]
+        counts = criterion.certifiable and np.isfinite(phi[0])
+        efficiency = value / phi[0] if counts else None
+        return cls(len(values), int(np.isfinite(values).sum()), *known, efficiency)
 
 
 @dataclass(frozen=True)
@@ -432,11 +427,7 @@ class Plan(Result):
             "value": self.reported,
             "unit": self.unit,
             "n_poses": len(self.q),
-            "candidates": {
-                "tried": self.candidates.tried,
-                "feasible": self.candidates.feasible,
-                "removed_by": self.candidates.removed_by,
-            },
+            "candidates": asdict(self.candidates),
             "certificate": {
                 "efficiency_pool": c.efficiency_pool,
                 "bound_pool": self.bound_reported,
@@ -447,14 +438,7 @@ class Plan(Result):
                 "searched": c.searched,
                 "ascents": c.ascents,
             },
-            "random_plans": None if self.chance is None else {
-                "n": self.chance.drawn,
-                "determined": self.chance.determined,
-                "median": self.chance.median,
-                "best": self.chance.best,
-                "worst": self.chance.worst,
-                "efficiency": self.chance.efficiency,
-            },
+            "random_plans": None if self.chance is None else asdict(self.chance),
             "predicted": [
                 {
                     "name": p.name,

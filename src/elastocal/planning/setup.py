@@ -25,7 +25,7 @@ from elastocal.planning.information import (
     typical_sizes,
     why,
 )
-from elastocal.planning.selection_problem import DesignProblem
+from elastocal.planning.selection import DesignProblem
 from elastocal.planning.test_poses import (
     TargetPoses,
     on_kept,
