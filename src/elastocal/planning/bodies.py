@@ -95,15 +95,14 @@ def coal_shape(solid: Solid) -> Any:
     """
     import coal
 
-    size = [float(s) for s in solid.size]
-    if solid.shape == "box":
-        return coal.Box(*size)
-    if solid.shape == "sphere":
-        return coal.Sphere(size[0])
-    if solid.shape == "cylinder":
-        return coal.Cylinder(size[0], size[1])
-    if solid.shape == "capsule":
-        return coal.Capsule(size[0], size[1])
+    if solid.shape != "mesh":
+        kind, numbers = {
+            "box": (coal.Box, 3),
+            "sphere": (coal.Sphere, 1),
+            "cylinder": (coal.Cylinder, 2),
+            "capsule": (coal.Capsule, 2),
+        }[solid.shape]
+        return kind(*(float(s) for s in solid.size[:numbers]))
     points, triangles = mesh_hull(solid)
     corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     for point in points:
@@ -287,14 +286,14 @@ def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
         *(() if workspace.load is None else hanging(workspace.load)),
         *(Body(solid, WORLD, "obstacle") for solid in workspace.obstacles),
     )
-    observed: set[str] = set()
+    names: set[str] = set()
     for body in bodies:
-        if body.name in observed:
+        if body.name in names:
             raise InputError(
                 f"{cell.path or cell.name}: [workspace] has two bodies named '{body.name}'; "
                 "rename one (base, link1 … and rope are taken)"
             )
-        observed.add(body.name)
+        names.add(body.name)
     return bodies
 
 
@@ -420,10 +419,8 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
     pairs = [Pair(body, space, 0.0, "keep_out") for body in moving for space in workspace.keep_out]
     load = workspace.load
     if load is not None and load.min_height is not None:
-        up = np.array([0.0, 0.0, 1.0])
-        floor = HalfSpace(FLOOR, load.min_height * up, up)
-        hung = [body for body in bodies if body.kind == "load"]
-        pairs += [Pair(body, floor, 0.0, "load_height") for body in hung]
+        floor = HalfSpace(FLOOR, load.min_height * UP, UP)
+        pairs += [Pair(body, floor, 0.0, "load_height") for body in bodies if body.kind == "load"]
     pairs += [Pair(b, o, workspace.clearance, "obstacle") for b in moving for o in obstacles]
     if workspace.self_collision:
         hooks = _hooks(own, chain, cell.tool.load_point)

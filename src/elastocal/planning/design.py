@@ -148,10 +148,11 @@ class Stage:
 
     def finished(self, make: Callable[[], State]) -> State:
         """What was saved, or else what `make` returns, saved."""
-        state = self.load()
-        if state is None:
-            self.save(state := make())
-        return state
+        saved = self.load()
+        if saved is not None:
+            return saved
+        self.save(made := make())
+        return made
 
     def save(self, state: State) -> None:
         """Keep `state`, whole or not at all."""

@@ -197,8 +197,7 @@ class PoseFeasibility:
     @property
     def removed_by(self) -> dict[str, int]:
         """Candidates by the first rule they break: tried = feasible + Σ removed_by."""
-        first = self.broken & (self.broken.cumsum(axis=1) == 1)
-        return self._counts(first)
+        return self._counts(self.broken & (self.broken.cumsum(axis=1) == 1))
 
     @property
     def alone(self) -> dict[str, int]:
@@ -216,12 +215,11 @@ class PoseFeasibility:
     @classmethod
     def join(cls, verdicts: Sequence[PoseFeasibility]) -> PoseFeasibility:
         """Several batches under the same rules as one."""
-        return cls(
-            verdicts[0].rules,
-            np.concatenate([v.broken for v in verdicts]),
-            np.concatenate([v.q for v in verdicts]),
-            np.concatenate([v.force for v in verdicts]),
+        broken, q, force = (
+            np.concatenate([getattr(verdict, name) for verdict in verdicts])
+            for name in ("broken", "q", "force")
         )
+        return cls(verdicts[0].rules, broken, q, force)
 
 
 # The rules that a cell states, in the order of checking: cheap ones first.
@@ -275,10 +273,8 @@ def _seen(cell: Cell) -> Iterator[Rule]:
         yield Bound("range", distance, low, high, names, "a range_m", ("m",))
     observed = tuple(name for name in names if name in sight.normals)
     if sight.max_incidence is not None and observed:
-        at, axes = (
-            [cell.tool.markers[name] for name in observed],
-            [sight.normals[n] for n in observed],
-        )
+        at = [cell.tool.markers[name] for name in observed]
+        axes = [sight.normals[name] for name in observed]
         low, high = np.zeros(len(observed)), np.full(len(observed), sight.max_incidence)
         yield Bound(
             "incidence", lambda p: incidence(p, at, axes, eye), low, high, observed,
@@ -303,10 +299,8 @@ def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
                 f"{cell.path or cell.name}: [workspace] torque_limits_Nm has {len(bound)} values, "
                 f"but robot '{chain.name}' has {chain.n_joints} joints"
             )
-        torque, labels = (
-            StaticTorque(cell, chain),
-            tuple(f"joint{i + 1}" for i in range(len(bound))),
-        )
+        torque = StaticTorque(cell, chain)
+        labels = tuple(f"joint{i + 1}" for i in range(len(bound)))
         yield Bound(
             "torque", lambda p: np.abs(torque(p)), np.zeros(len(bound)), bound, labels,
             "a torque_limits_Nm", ("N m",),
@@ -380,9 +374,7 @@ class Feasibility:
         self.kinematics = Kinematics(cell, chain)
         self.bodies: tuple[Body, ...] = cell_bodies(cell, chain)
         self.pairs: tuple[Pair, ...] = cell_pairs(cell, chain, self.bodies)
-        self.rules: tuple[Rule, ...] = rule_book(
-            cell, chain, self.kinematics, self.bodies, self.pairs
-        )
+        self.rules = rule_book(cell, chain, self.kinematics, self.bodies, self.pairs)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (self._token, self.cell, self.chain)
@@ -395,9 +387,8 @@ class Feasibility:
         """
         poses = self._poses(q, force)
         broken = np.stack([rule.broken(poses) for rule in self.rules], axis=1)
-        return PoseFeasibility(
-            tuple(rule.name for rule in self.rules), broken, poses.q, poses.force
-        )
+        names = tuple(rule.name for rule in self.rules)
+        return PoseFeasibility(names, broken, poses.q, poses.force)
 
     def feasible(self, q: Array, force: Array) -> BoolArray:
         """(N,) as check(q, force).ok, without looking at a pose again that broke a rule."""

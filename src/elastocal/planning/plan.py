@@ -102,8 +102,7 @@ def reasons(
 
 
 def _inverse(M: Array) -> Array:
-    factor = linalg.cho_factor(M)
-    return np.asarray(linalg.cho_solve(factor, np.eye(len(M))))
+    return np.asarray(linalg.cho_solve(linalg.cho_factor(M), np.eye(len(M))))
 
 
 # The plan on disk: plan.csv, which `simulate` takes and people measure by, and plan.json.
@@ -217,7 +216,9 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
     known = families(joint_kinds)
     columns: dict[str, Sequence[str]] = {"configuration": rows.configuration}
     for stem, kind, values in zip(known["q"].units, joint_kinds, rows.q.T, strict=True):
-        columns[column(stem, UNITS[kind])] = [_number(v) for v in in_unit(values, kind)]
+        columns[column(stem, UNITS[kind])] = [
+            repr(round(float(v), DIGITS) + 0.0) for v in in_unit(values, kind)
+        ]
     if rows.force is not None:
         for stem, values in zip(known["force"].units, rows.force.T, strict=True):
             columns[column(stem, "N")] = [repr(float(v) + 0.0) for v in values]
@@ -232,10 +233,6 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
 def in_unit(values: Array, kind: str) -> Array:
     """A joint's values in rad or m in the unit of the file."""
     return np.degrees(values) if kind == "revolute" else values * 1e3
-
-
-def _number(value: float) -> str:
-    return repr(round(float(value), DIGITS) + 0.0)
 
 
 def write_plan_json(path: str | Path, summary: Mapping[str, Any]) -> None:
@@ -299,10 +296,11 @@ class Chance:
     def of(cls, values: Array, value: float, criterion: Criterion) -> Chance:
         """What random plans of Φ = `values` (n,), ascending, are beside a plan of Φ = `value`."""
         phi = (float(np.median(values)), float(values[0]), float(values[-1]))
-        known = [criterion.reported(v)[0] if np.isfinite(v) else None for v in phi]
+        median, best, worst = (criterion.reported(v)[0] if np.isfinite(v) else None for v in phi)
         counts = criterion.certifiable and np.isfinite(phi[0])
         efficiency = value / phi[0] if counts else None
-        return cls(len(values), int(np.isfinite(values).sum()), *known, efficiency)
+        determined = int(np.isfinite(values).sum())
+        return cls(len(values), determined, median, best, worst, efficiency)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.symbolic import SymbolicArm, configuration_rows
 from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base, few_points, mesh_hull
 from elastocal.planning.candidates import Checker, JointSpace, feasible
+from elastocal.planning.collision import arm_frames
 from elastocal.planning.criterion import Criterion
 from elastocal.planning.feasibility import POSE_SLACK
 from elastocal.planning.information import PoseInformation
@@ -72,12 +73,8 @@ class _Frames:
 
     @classmethod
     def of(cls, cell: Cell, chain: Chain, q: ca.SX) -> _Frames:
-        T, carriers = rigid.constant(data_base(cell)), {WORLD: ca.SX.eye(4)}
-        for i, joint in enumerate(chain.joints):
-            motion = rigid.joint_motion(joint.kind, joint.axis, q[i])
-            T = T @ rigid.constant(joint.placement) @ motion
-            carriers[i] = T
-        flange = T @ rigid.constant(chain.flange_placement)
+        frames, flange = arm_frames(chain, data_base(cell), q)
+        carriers = {WORLD: ca.SX.eye(4), **dict(enumerate(frames))}
         load_point = rigid.point(flange, rigid.constant(cell.tool.load_point))
         carriers[HANGING] = rigid.transform(translation=load_point)
         return cls(carriers, flange, load_point)
@@ -400,7 +397,8 @@ class Searches:
         if load not in self._margins:
             model = self.information.model
             self._margins[load] = margins(model.cell, model.chain, self.pairs, self.forces(load))
-        blocks = whitened_at(self._built[load, group], self.information, q, load)
+        whitener = self.information.whitener(q, load)
+        blocks = replace(self._built[load, group], whitener=whitener)
         return LocalSearch(blocks, self._margins[load], *self.space.bounds(group))
 
     def forces(self, load: int) -> Array:
@@ -479,13 +477,6 @@ def symbolic_blocks(information: PoseInformation, q: Array, load: int) -> Symbol
         information.sizes,
         information.whitener(q, load),
     )
-
-
-def whitened_at(
-    blocks: SymbolicBlocks, information: PoseInformation, q: Array, load: int
-) -> SymbolicBlocks:
-    """The same expression with the noise of a reading at q (n,)."""
-    return replace(blocks, whitener=information.whitener(q, load))
 
 
 class Goal(Protocol):
