@@ -196,8 +196,9 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
         if name not in moving:
             locked.append(model.getJointId(name))
     model, geometry = pin.buildReducedModel(model, geometry, locked, pin.neutral(model))
-    base = cell.robot.base
-    T_root_base = pin.SE3.Identity() if base is None else _placement(model, base)
+    base, T_root_base = cell.robot.base, pin.SE3.Identity()
+    if base is not None:
+        T_root_base = model.frames[model.getFrameId(base, pin.FrameType.BODY)].placement
     found = []
     for item in geometry.geometryObjects:
         on_base = item.parentJoint == 0
@@ -205,12 +206,6 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
         carrier = WORLD if on_base else moving.index(model.names[item.parentJoint])
         found.append((_solid(item, T.homogeneous, path), carrier))
     return found
-
-
-def _placement(model: Any, link: str) -> Any:
-    import pinocchio as pin
-
-    return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement
 
 
 def _solid(item: Any, placement: np.ndarray, path: Path) -> Solid:
@@ -380,7 +375,7 @@ def _moved(T: Array, solid: Solid) -> Solid:
 Rule = Literal["keep_out", "load_height", "obstacle", "self_collision"]
 RULES: tuple[Rule, ...] = get_args(Rule)
 FLOOR = "min_height"  # name of the half-space under the hanging load
-TOUCH = 1e-6  # m: a body this near to the load point holds the hook
+TOUCH = 1e-6  # m: a body this near to the load point holds the rope
 
 
 @dataclass(frozen=True)
@@ -408,7 +403,7 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
     Every moving body against every obstacle (`clearance`) and every half-space (no margin), and
     the arm's bodies, carried bodies, rope and load among themselves (`self_clearance`), except
     bodies of the same carrier, neighbouring links, links that joints hold together whatever the
-    pose, the rope with the bodies that hold its hook, and `ignored_pairs`.  Raises InputError
+    pose, the rope with the bodies that hold it, and `ignored_pairs`.  Raises InputError
     where `ignored_pairs` names a body that is not there.
     """
     workspace = cell.workspace
@@ -423,11 +418,14 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
         pairs += [Pair(body, floor, 0.0, "load_height") for body in bodies if body.kind == "load"]
     pairs += [Pair(b, o, workspace.clearance, "obstacle") for b in moving for o in obstacles]
     if workspace.self_collision:
-        hooks = _hooks(own, chain, cell.tool.load_point)
+        # The rope hangs from the bodies of the last link that contain or touch the load point.
+        last = [body for body in own if body.carrier == chain.n_joints - 1]
+        point = (chain.flange_placement @ [*cell.tool.load_point, 1.0])[:3]
+        holding = {body.name for body in last if touches(body.solid, point, TOUCH)}
         pairs += [
             Pair(b, a, workspace.self_clearance, "self_collision")
             for a, b in combinations(own, 2)
-            if not _joined(a, b, workspace, chain, hooks)
+            if not _joined(a, b, workspace, chain, holding)
         ]
     return tuple(pair for pair in pairs if frozenset(pair.names) not in ignored)
 
@@ -446,14 +444,14 @@ def _ignored(cell: Cell, bodies: tuple[Body, ...]) -> set[frozenset[str]]:
     return {frozenset(pair) for pair in workspace.ignored_pairs}
 
 
-def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, hooks: set[str]) -> bool:
+def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[str]) -> bool:
     """True where the two cannot or need not keep apart."""
     if a.carrier == b.carrier:
         return True
     if a.hangs or b.hangs:
         hung, other = (a, b) if a.hangs else (b, a)
         rope = workspace.load.rope if workspace.load is not None else 0.0
-        return other.name in hooks and (hung.kind == "rope" or rope == 0)
+        return other.name in holding and (hung.kind == "rope" or rope == 0)
     if a.kind != "arm" or b.kind != "arm":
         return False
     i, j = sorted((a.carrier, b.carrier))
@@ -474,10 +472,3 @@ def _held_together(a: Body, b: Body, workspace: Workspace, chain: Chain) -> bool
     between = distal_placements(chain)[i + 1 : j]
     length = sum(float(np.linalg.norm(T[:3, 3])) for T in between)
     return length <= hull(a.solid)[1] + hull(b.solid)[1] + workspace.self_clearance
-
-
-def _hooks(own: list[Body], chain: Chain, load_point: np.ndarray) -> set[str]:
-    """Names of the bodies on the last link that contain or touch the load point."""
-    last = chain.n_joints - 1
-    hook = (chain.flange_placement @ [*load_point, 1.0])[:3]
-    return {b.name for b in own if b.carrier == last and touches(b.solid, hook, TOUCH)}

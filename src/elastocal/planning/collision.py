@@ -178,9 +178,9 @@ def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
         placement = kinematics.T_data_base @ joint.placement if i == 0 else joint.placement
         moving = unaligned[joint.kind](np.array(joint.axis))
         parent = model.addJoint(parent, moving, _se3(placement), f"joint{i + 1}")
-    hook = np.eye(4)
-    hook[:3, 3] = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
-    model.addJoint(parent, pin.JointModelSpherical(), _se3(hook), "hanging")
+    load_point = np.eye(4)
+    load_point[:3, 3] = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
+    model.addJoint(parent, pin.JointModelSpherical(), _se3(load_point), "hanging")
     for i in range(free):
         model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
     return model
@@ -350,10 +350,10 @@ class MotionBound:
         n = chain.n_joints
         self._axes = np.array([joint.axis for joint in chain.joints])
         self._revolute = [joint.kind == "revolute" for joint in chain.joints]
-        hook = (chain.flange_placement @ [*kinematics.load_point, 1.0])[None, :3]
+        load_point = (chain.flange_placement @ [*kinematics.load_point, 1.0])[None, :3]
         # The points and radii whose motion bounds that of all bodies on a joint; the load point.
         self._carried = [(i, *_reach([b for b in bodies if b.carrier == i])) for i in range(n)]
-        self._carried.append((n - 1, hook, np.zeros(1)))
+        self._carried.append((n - 1, load_point, np.zeros(1)))
         # Each pair's bound is one entry of S, or the sum of two.
         at = np.zeros((2, 2, len(pairs)), dtype=int)
         at[1, 1] = n  # S after the last joint is zero

@@ -65,7 +65,7 @@ Effort = Literal["quick", "normal", "thorough"]
 @dataclass(frozen=True)
 class DesignSearch:
     """`rounds` of polishing and of poses from the continuum added to the pool; `starts` of the
-    exchange; fresh `points` per level and `ascents` when the continuum is searched."""
+    exchange; new `points` per level and `ascents` when the continuum is searched."""
 
     rounds: int
     starts: int
@@ -324,8 +324,8 @@ class _Rounds:
         q, moved = state["q"], state["moved"]
         if not moved.any():
             return pool, chosen
-        fresh = chosen[moved]
-        grown = pool.joined(self.setup.pool(q[moved], pool.load[fresh], pool.group[fresh]))
+        were = chosen[moved]
+        grown = pool.joined(self.setup.pool(q[moved], pool.load[were], pool.group[were]))
         now = chosen.copy()
         now[moved] = np.arange(len(pool), len(grown))
         return grown, now
@@ -486,7 +486,10 @@ class _Design:
         shares = shares_of(self.cell)
         planned = [shares_of(self.cell, n) for n in options.curve]
         planned += [shares] if self.cell.design.target is None else []
-        targets = test_poses(self.cell, self.chain, self._at_work(), options.seed)
+        # At the test poses the arm works, and the tracker need not see it.
+        workspace = replace(self.cell.workspace, visibility=None, load=None)
+        at_work = Feasibility(replace(self.cell, workspace=workspace), self.chain)
+        targets = test_poses(self.cell, self.chain, at_work, options.seed)
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
@@ -508,11 +511,6 @@ class _Design:
         progress("random plans beside it")
         drawn = random_plans(setup.problem(pool, shares), options.seed)
         return self._plan(setup, found, shares, counts, targets.source, curve, done, drawn)
-
-    def _at_work(self) -> Feasibility:
-        """The rules for test poses: there the arm works, and the tracker need not see it."""
-        workspace = replace(self.cell.workspace, visibility=None, load=None)
-        return Feasibility(replace(self.cell, workspace=workspace), self.chain)
 
     def _candidates(self) -> tuple[Array, IntArray, IntArray, CandidateCounts]:
         state = self.checkpoint.stage("candidates").finished(self._drawn)

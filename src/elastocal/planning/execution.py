@@ -225,16 +225,16 @@ def shortest_tour(cost: Array, start: list[int], seed: int, iterations: int) -> 
     import pyvrp
     from pyvrp import search
 
-    whole: Any = np.round(cost * (LARGEST / max(float(cost.max()), 1e-300))).astype(np.int64)
-    np.fill_diagonal(whole, 0)
-    n = len(whole)
+    integers: Any = np.round(cost * (LARGEST / max(float(cost.max()), 1e-300))).astype(np.int64)
+    np.fill_diagonal(integers, 0)
+    n = len(integers)
     data = pyvrp.ProblemData(
         locations=[pyvrp.Location(0, 0) for _ in range(n)],
         clients=[pyvrp.Client(location=i) for i in range(1, n)],
         depots=[pyvrp.Depot(location=0)],
         vehicle_types=[pyvrp.VehicleType(num_available=1)],
-        distance_matrices=[whole],
-        duration_matrices=[0 * whole],
+        distance_matrices=[integers],
+        duration_matrices=[0 * integers],
     )
     # One vehicle: the moves that exchange between routes are left out, longer segments added.
     # Lower history than the default, which is made for thousands of nodes.

@@ -67,20 +67,20 @@ class Bound(Rule):
     key: str
     units: tuple[str, ...]
 
-    def _beyond(self, poses: Poses) -> tuple[Array, BoolArray, BoolArray]:
+    def _outside(self, poses: Poses) -> tuple[Array, BoolArray, BoolArray]:
         value = self.quantity(poses)
         return value, value < self.lower - SAME, value > self.upper + SAME
 
     def broken(self, poses: Poses) -> BoolArray:
-        _, below, above = self._beyond(poses)
+        _, below, above = self._outside(poses)
         return np.asarray((below | above).any(axis=1))
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        _, below, above = self._beyond(poses)
+        _, below, above = self._outside(poses)
         return {label: below[:, i] | above[:, i] for i, label in enumerate(self.labels)}
 
     def remedy(self, poses: Poses) -> str:
-        value, below, above = self._beyond(poses)
+        value, below, above = self._outside(poses)
         i = int((below | above).sum(axis=0).argmax())
         low = below[:, i].sum() > above[:, i].sum()
         limit = np.broadcast_to(self.lower if low else self.upper, len(self.labels))[i]
@@ -197,20 +197,8 @@ class PoseFeasibility:
     @property
     def removed_by(self) -> dict[str, int]:
         """Candidates by the first rule they break: tried = feasible + Σ removed_by."""
-        return self._counts(self.broken & (self.broken.cumsum(axis=1) == 1))
-
-    @property
-    def alone(self) -> dict[str, int]:
-        """Candidates that break each rule, whatever the others: its toll if it stood alone."""
-        return self._counts(self.broken)
-
-    @property
-    def freed(self) -> dict[str, int]:
-        """Candidates that break this rule and no other: what dropping it would free."""
-        return self._counts(self.broken & (self.broken.sum(axis=1) == 1)[:, None])
-
-    def _counts(self, mask: BoolArray) -> dict[str, int]:
-        return {rule: int(n) for rule, n in zip(self.rules, mask.sum(axis=0), strict=True)}
+        first = (self.broken & (self.broken.cumsum(axis=1) == 1)).sum(axis=0)
+        return dict(zip(self.rules, first.tolist(), strict=True))
 
     @classmethod
     def join(cls, verdicts: Sequence[PoseFeasibility]) -> PoseFeasibility:
@@ -235,7 +223,7 @@ def rule_book(
     """All rules of the cell.  Raises InputError where they do not fit the robot."""
     return (
         _joints(cell, chain),
-        *_seen(cell),
+        *_visibility(cell),
         *_load(cell, chain),
         *(
             KeepApart(rule, kinematics, own)
@@ -253,7 +241,7 @@ def _joints(cell: Cell, chain: Chain) -> Rule:
     return Bound("joint_limits", lambda p: p.q, lower, upper, labels, "a limit", units)
 
 
-def _seen(cell: Cell) -> Iterator[Rule]:
+def _visibility(cell: Cell) -> Iterator[Rule]:
     sight, eye = cell.workspace.visibility, cell.tracker.position
     if sight is None:
         return
@@ -421,10 +409,6 @@ class Feasibility:
             for pair in self.pairs
             if Collisions(self.kinematics, [pair]).hits(poses).all()
         )
-
-    def path_free(self, q_from: Array, q_to: Array, loaded: bool) -> bool:
-        """The joint interpolation q_from → q_to (n,) breaks no margin at any point of it."""
-        return bool(self.paths_free(np.atleast_2d(q_from), np.atleast_2d(q_to), loaded)[0])
 
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool | BoolArray) -> BoolArray:
         """(M,) for moves q_from → q_to (M, n); `loaded` for all or per move (M,).

@@ -109,7 +109,7 @@ def visit_costs(
     # Any tour travels less than this in all, if it needs no unreachable move.
     change = max(float(travel[finite].max()) * (n + 1), 1.0)
     states = np.append(-1, visits.load)
-    # The beginning is its own block; the unloaded states carry the same as it: nothing.
+    # The beginning is a state of its own; the unloaded states carry the same as it: nothing.
     carried = np.append(-1, np.where(loaded[visits.load], visits.load, -1))
     apart = change * (states[:, None] != states[None])
     changed = change * (carried[:, None] != carried[None])

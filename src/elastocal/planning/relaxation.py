@@ -420,15 +420,15 @@ def relax(
     first = _first_weights(pool, start)
     pieces = None if method == "conic" else pieces_of(criterion, len(problem.prior))
     master: Master = ConicMaster(criterion) if pieces is None else partial(newton, pieces)
-    whole = method == "conic" and problem.n_candidates <= DIRECT
+    at_once = method == "conic" and problem.n_candidates <= DIRECT
 
     def report(step: RelaxationStep) -> None:
         progress(f"relaxation: within {step.gap:.1e} of the bound, {step.support} candidates")
 
-    sizes = _sizes(pool, whole)
+    sizes = _sizes(pool, at_once)
     weights, tangent, history = optimise(pool, master, first, sizes, tolerance, report)
     last = history[-1]
-    weights, value = _cleaned(pool, weights, last, tolerance)
+    weights, value = _thinned(pool, weights, last, tolerance)
     return Relaxed(
         weights=weights,
         value=value,
@@ -464,9 +464,9 @@ def _first_weights(pool: CandidatePool, start: Array | None) -> Array:
     return weights
 
 
-def _sizes(pool: CandidatePool, whole: bool) -> IntArray:
+def _sizes(pool: CandidatePool, at_once: bool) -> IntArray:
     """Candidates of each level in the first master; more than its share takes at once."""
-    if whole:
+    if at_once:
         return np.full(len(pool.levels), pool.problem.n_candidates)
     p = pool.problem.prior.shape[-1]
     for_share = 2 * pool.problem.shares[pool.levels] // pool.problem.most
@@ -482,7 +482,7 @@ def _only_plan(pool: CandidatePool) -> Relaxed:
     return Relaxed(pool.fixed, tangent.value, bound, step.gap, 0, "first-order", (), tangent)
 
 
-def _cleaned(
+def _thinned(
     pool: CandidatePool, weights: Array, last: RelaxationStep, tolerance: float
 ) -> tuple[Array, float]:
     """Without the smallest weights of each level, as many as the gap allows."""
@@ -516,9 +516,9 @@ class CandidatePool:
         fits = 8 * S * N * len(self.rows) <= PACKED_BYTES
         self._packed = self._pack() if fits else None
         size = np.bincount(problem.group, minlength=len(problem.shares))
-        whole = size * problem.most == problem.shares
-        self.fixed = np.where(whole[problem.group], float(problem.most), 0.0)
-        self.levels = np.flatnonzero(~whole & (problem.shares > 0))
+        full = size * problem.most == problem.shares
+        self.fixed = np.where(full[problem.group], float(problem.most), 0.0)
+        self.levels = np.flatnonzero(~full & (problem.shares > 0))
 
     def even(self) -> Array:
         """w (N,): each group's share spread evenly."""
@@ -562,8 +562,8 @@ class CandidatePool:
         """d (N,) = Σ_s ⟨G_s, A_si⟩, as `DesignProblem.sensitivity`."""
         if self._packed is None:
             return self.problem.sensitivity(G)
-        triangles = G[:, self.rows, self.columns] * self._factor
-        return np.asarray((self._packed @ triangles[:, :, None])[..., 0].sum(axis=0))
+        packed = G[:, self.rows, self.columns] * self._factor
+        return np.asarray((self._packed @ packed[:, :, None])[..., 0].sum(axis=0))
 
     def matrices(self, chosen: IntArray) -> Array:
         """A (S, k, p, p) of the candidates `chosen` (k,)."""

@@ -362,7 +362,9 @@ def is_regular(M: Array) -> bool:
 def check_enough(problem: DesignProblem) -> None:
     """Raise InsufficientDataError where no plan of these shares can determine all parameters."""
     _, _, r, p = problem.blocks.shape
-    n, known = problem.n_poses, _known(problem)
+    n = problem.n_poses
+    # How many combinations of parameters the prior determines.
+    known = min(int(np.linalg.matrix_rank(prior, hermitian=True)) for prior in problem.prior)
     needed = -(-(p - known) // r)
     if n < needed:
         prior = f" and the prior {known}" if known else ""
@@ -376,11 +378,6 @@ def check_enough(problem: DesignProblem) -> None:
             f"all {len(usable)} candidates of the groups with a share together do not determine "
             f"the {p} parameters; allow other joint levels or more load, or switch effects off"
         )
-
-
-def _known(problem: DesignProblem) -> int:
-    """How many combinations of parameters the prior determines."""
-    return min(int(np.linalg.matrix_rank(prior, hermitian=True)) for prior in problem.prior)
 
 
 def log_det_gain(M: Array, blocks: Array) -> Array:
