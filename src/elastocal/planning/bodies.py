@@ -228,7 +228,7 @@ def _solid(item: Any, placement: np.ndarray, path: Path) -> Solid:
 
 # All bodies of a cell in one list: arm, tool, hanging load, obstacles, each with its carrier.
 #
-# A body stands at frames[:, carrier] @ solid.placement in the data's frame (`frames.py`).  The
+# A body stands at frames[:, carrier] @ solid.placement in the data's frame (`collision`).  The
 # arm is rigid here, at its nominal geometry: clearances must cover deflections of a few mm.
 
 Kind = Literal["arm", "carried", "load", "rope", "obstacle"]

@@ -4,7 +4,7 @@ On the continuum of feasible poses the tangent at (Φ, G) bounds every plan's va
 
     Φ(plan) ≥ Φ² / (⟨G, prior⟩ + Σ_l n_l max_{q∈l} d(q)),   d(q) = Σ_s tr(B_s(q) G_s B_s(q)ᵀ)
 
-as in `certificate`, without its box, since one continuous pose may repeat.  d has many local
+as in `selection`, without its box, since one continuous pose may repeat.  d has many local
 maxima and rules cut the space up, so the global one is sought, not proved: new Sobol points,
 then local ascents from the best of them and of the pool.
 """

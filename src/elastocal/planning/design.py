@@ -433,7 +433,7 @@ def _warnings(lost: int, execution: Execution) -> list[str]:
     return warnings
 
 
-# From a cell to a plan.
+# The course of a design.
 
 MOST_POSES = 100  # that a target is sought with
 

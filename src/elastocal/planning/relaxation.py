@@ -308,7 +308,7 @@ def _barrier(local: LocalPieces, task: Restricted, w: Array, sigma: float) -> Ba
 
 
 def _gap(task: Restricted, w: Array, local: LocalPieces, mu: Array, slopes: Array) -> float:
-    """log Φ(w) minus the bound (see `certificate`) of the restricted problem."""
+    """log Φ(w) minus the bound (see `tangent_bound`) of the restricted problem."""
     d = mu @ slopes / mu.sum()
     gain = largest_sum(d, task.level, task.shares, task.most) - d @ w
     below = mu.sum() / np.sum(mu / local.values)
