@@ -26,8 +26,8 @@ from peer_tools import ONE_THREAD, Row, Seconds, peer, required, seconds_of, sta
 
 from elastocal.planning import DesignProblem, DeterminantCriterion, relax, round_weights
 from elastocal.planning.exact_plan import exact_plan
-from elastocal.planning.exchange import exchange
 from elastocal.planning.polish import polish
+from elastocal.planning.selection import exchange
 
 SEED = 1
 POOL, POSES = 1000, 30  # of the UR10

@@ -17,7 +17,7 @@ from small_pools import CRITERIA, all_plans, all_values, random_problem
 
 from elastocal.planning import DesignProblem, random_plan, regular_plan, relax
 from elastocal.planning.exact_plan import exact_plan
-from elastocal.planning.exchange import exchange
+from elastocal.planning.selection import exchange
 
 EQUAL = 1e-9
 

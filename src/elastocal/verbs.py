@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from elastocal.identification.options import FaultyReadings, Method
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
+    from elastocal.planning.design import DesignOptions, Effort
     from elastocal.planning.plan import Plan
-    from elastocal.planning.search import DesignOptions, Effort
 
 # One verb should not load another: each imports the package that it calls.
 
@@ -170,7 +170,7 @@ def design_request(
 
     Raises InputError that names the keyword.
     """
-    from elastocal.planning.search import DesignOptions
+    from elastocal.planning.design import DesignOptions
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
     if isinstance(prior, str):

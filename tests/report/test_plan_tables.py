@@ -77,11 +77,11 @@ def test_what_chance_would_have_given(plan):
         other = replace(plan, chance=replace(plan.chance, **changes))
         return dict(plan_lines(other))["Chance"]
 
-    text = told(median=9.876, best=8.0, worst=None, efficiency=0.254, determined=18, drawn=20)
+    text = told(median=9.876, best=8.0, worst=None, efficiency=0.254, determined=18, n=20)
     assert "median of 20 random plans" in text and "ρ₀ = 9.876 µm (best 8, worst no value)" in text
     assert "efficiency of 0.25 against this plan" in text
     assert "2 of 20 random plans of as many feasible poses leave parameters open" in text
-    text = told(median=None, best=8.0, worst=None, efficiency=None, determined=3, drawn=20)
+    text = told(median=None, best=8.0, worst=None, efficiency=None, determined=3, n=20)
     assert text.startswith("17 of 20 random plans") and "median" not in text
 
 

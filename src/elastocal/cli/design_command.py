@@ -219,8 +219,8 @@ def design(
 
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
+    from elastocal.planning.design import Checkpoint, key_of
     from elastocal.planning.design import design as run
-    from elastocal.planning.search import Checkpoint, key_of
     from elastocal.verbs import design_request
 
     summary = output.with_suffix(".json")

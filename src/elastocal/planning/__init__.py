@@ -14,28 +14,30 @@ ROOMS = {
         "DeterminantCriterion GCriterion SpectralCriterion TraceCriterion criterion_named "
         "make_criterion register"
     ),
-    "criterion": "Criterion CriterionInputs ScenarioCriterion",
+    "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
+    "design": "Checkpoint DesignOptions DesignSearch Effort Selection Stage key_of ordered",
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
-    "exchange": (
-        "Exchanged best_addition fitted greedy_plan information_without random_plan "
-        "regular_plan values_without"
-    ),
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",
     "feasibility": "Feasibility PoseFeasibility",
-    "information": "Estimable LoadStates PoseInformation load_states measured next_number rows_of",
-    "information_matrices": "candidate_sums",
-    "interior_point": "pieces_of",
+    "information": (
+        "Estimable LoadStates PoseInformation load_states measured next_number rows_of"
+    ),
     "moves": "Blockers Unreachable",
     "plan": (
         "Certificate Chance Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
         "write_plan_json"
     ),
-    "polish": "Goal LocalSearch PlanValue Searches Sensitivity search_all symbolic_blocks",
-    "pose_margins": "excess margins signed_distance smooth_min sphere_cover",
+    "polish": (
+        "Goal LocalSearch PlanValue Searches Sensitivity excess margins search_all "
+        "signed_distance smooth_min sphere_cover symbolic_blocks"
+    ),
     "programs": "krl_program load_name number plain urscript_program",
-    "relaxation": "CandidatePool relax",
-    "search": "Checkpoint DesignOptions DesignSearch Effort Selection Stage key_of ordered",
-    "selection_problem": "DesignProblem efficiency largest_sum lower_bound tangent_bound",
+    "relaxation": "CandidatePool pieces_of relax",
+    "selection": (
+        "DesignProblem Exchanged best_addition efficiency fitted greedy_plan "
+        "information_without largest_sum lower_bound random_plan regular_plan tangent_bound "
+        "values_without"
+    ),
     "setup": "FeasiblePool Known Setup set_up shares_of",
     "test_poses": "TargetPoses check_cell prediction_rows",
 }

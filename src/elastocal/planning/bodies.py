@@ -95,15 +95,14 @@ def coal_shape(solid: Solid) -> Any:
     """
     import coal
 
-    size = [float(s) for s in solid.size]
-    if solid.shape == "box":
-        return coal.Box(*size)
-    if solid.shape == "sphere":
-        return coal.Sphere(size[0])
-    if solid.shape == "cylinder":
-        return coal.Cylinder(size[0], size[1])
-    if solid.shape == "capsule":
-        return coal.Capsule(size[0], size[1])
+    if solid.shape != "mesh":
+        kind, numbers = {
+            "box": (coal.Box, 3),
+            "sphere": (coal.Sphere, 1),
+            "cylinder": (coal.Cylinder, 2),
+            "capsule": (coal.Capsule, 2),
+        }[solid.shape]
+        return kind(*(float(s) for s in solid.size[:numbers]))
     points, triangles = mesh_hull(solid)
     corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     for point in points:
@@ -197,8 +196,9 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
         if name not in moving:
             locked.append(model.getJointId(name))
     model, geometry = pin.buildReducedModel(model, geometry, locked, pin.neutral(model))
-    base = cell.robot.base
-    T_root_base = pin.SE3.Identity() if base is None else _placement(model, base)
+    base, T_root_base = cell.robot.base, pin.SE3.Identity()
+    if base is not None:
+        T_root_base = model.frames[model.getFrameId(base, pin.FrameType.BODY)].placement
     found = []
     for item in geometry.geometryObjects:
         on_base = item.parentJoint == 0
@@ -206,12 +206,6 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
         carrier = WORLD if on_base else moving.index(model.names[item.parentJoint])
         found.append((_solid(item, T.homogeneous, path), carrier))
     return found
-
-
-def _placement(model: Any, link: str) -> Any:
-    import pinocchio as pin
-
-    return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement
 
 
 def _solid(item: Any, placement: np.ndarray, path: Path) -> Solid:
@@ -234,7 +228,7 @@ def _solid(item: Any, placement: np.ndarray, path: Path) -> Solid:
 
 # All bodies of a cell in one list: arm, tool, hanging load, obstacles, each with its carrier.
 #
-# A body stands at frames[:, carrier] @ solid.placement in the data's frame (`frames.py`).  The
+# A body stands at frames[:, carrier] @ solid.placement in the data's frame (`collision`).  The
 # arm is rigid here, at its nominal geometry: clearances must cover deflections of a few mm.
 
 Kind = Literal["arm", "carried", "load", "rope", "obstacle"]
@@ -287,14 +281,14 @@ def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
         *(() if workspace.load is None else hanging(workspace.load)),
         *(Body(solid, WORLD, "obstacle") for solid in workspace.obstacles),
     )
-    observed: set[str] = set()
+    names: set[str] = set()
     for body in bodies:
-        if body.name in observed:
+        if body.name in names:
             raise InputError(
                 f"{cell.path or cell.name}: [workspace] has two bodies named '{body.name}'; "
                 "rename one (base, link1 … and rope are taken)"
             )
-        observed.add(body.name)
+        names.add(body.name)
     return bodies
 
 
@@ -381,7 +375,7 @@ def _moved(T: Array, solid: Solid) -> Solid:
 Rule = Literal["keep_out", "load_height", "obstacle", "self_collision"]
 RULES: tuple[Rule, ...] = get_args(Rule)
 FLOOR = "min_height"  # name of the half-space under the hanging load
-TOUCH = 1e-6  # m: a body this near to the load point holds the hook
+TOUCH = 1e-6  # m: a body this near to the load point holds the rope
 
 
 @dataclass(frozen=True)
@@ -409,7 +403,7 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
     Every moving body against every obstacle (`clearance`) and every half-space (no margin), and
     the arm's bodies, carried bodies, rope and load among themselves (`self_clearance`), except
     bodies of the same carrier, neighbouring links, links that joints hold together whatever the
-    pose, the rope with the bodies that hold its hook, and `ignored_pairs`.  Raises InputError
+    pose, the rope with the bodies that hold it, and `ignored_pairs`.  Raises InputError
     where `ignored_pairs` names a body that is not there.
     """
     workspace = cell.workspace
@@ -420,17 +414,18 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
     pairs = [Pair(body, space, 0.0, "keep_out") for body in moving for space in workspace.keep_out]
     load = workspace.load
     if load is not None and load.min_height is not None:
-        up = np.array([0.0, 0.0, 1.0])
-        floor = HalfSpace(FLOOR, load.min_height * up, up)
-        hung = [body for body in bodies if body.kind == "load"]
-        pairs += [Pair(body, floor, 0.0, "load_height") for body in hung]
+        floor = HalfSpace(FLOOR, load.min_height * UP, UP)
+        pairs += [Pair(body, floor, 0.0, "load_height") for body in bodies if body.kind == "load"]
     pairs += [Pair(b, o, workspace.clearance, "obstacle") for b in moving for o in obstacles]
     if workspace.self_collision:
-        hooks = _hooks(own, chain, cell.tool.load_point)
+        # The rope hangs from the bodies of the last link that contain or touch the load point.
+        last = [body for body in own if body.carrier == chain.n_joints - 1]
+        point = (chain.flange_placement @ [*cell.tool.load_point, 1.0])[:3]
+        holding = {body.name for body in last if touches(body.solid, point, TOUCH)}
         pairs += [
             Pair(b, a, workspace.self_clearance, "self_collision")
             for a, b in combinations(own, 2)
-            if not _joined(a, b, workspace, chain, hooks)
+            if not _joined(a, b, workspace, chain, holding)
         ]
     return tuple(pair for pair in pairs if frozenset(pair.names) not in ignored)
 
@@ -449,14 +444,14 @@ def _ignored(cell: Cell, bodies: tuple[Body, ...]) -> set[frozenset[str]]:
     return {frozenset(pair) for pair in workspace.ignored_pairs}
 
 
-def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, hooks: set[str]) -> bool:
+def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[str]) -> bool:
     """True where the two cannot or need not keep apart."""
     if a.carrier == b.carrier:
         return True
     if a.hangs or b.hangs:
         hung, other = (a, b) if a.hangs else (b, a)
         rope = workspace.load.rope if workspace.load is not None else 0.0
-        return other.name in hooks and (hung.kind == "rope" or rope == 0)
+        return other.name in holding and (hung.kind == "rope" or rope == 0)
     if a.kind != "arm" or b.kind != "arm":
         return False
     i, j = sorted((a.carrier, b.carrier))
@@ -477,10 +472,3 @@ def _held_together(a: Body, b: Body, workspace: Workspace, chain: Chain) -> bool
     between = distal_placements(chain)[i + 1 : j]
     length = sum(float(np.linalg.norm(T[:3, 3])) for T in between)
     return length <= hull(a.solid)[1] + hull(b.solid)[1] + workspace.self_clearance
-
-
-def _hooks(own: list[Body], chain: Chain, load_point: np.ndarray) -> set[str]:
-    """Names of the bodies on the last link that contain or touch the load point."""
-    last = chain.n_joints - 1
-    hook = (chain.flange_placement @ [*load_point, 1.0])[:3]
-    return {b.name for b in own if b.carrier == last and touches(b.solid, hook, TOUCH)}

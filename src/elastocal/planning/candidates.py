@@ -56,18 +56,13 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     """The robot's limits, narrowed by [limits], with the levels of [design.levels].
 
     A joint without a limit turns once, from −π to π, or slides 2 m (`finite_ranges`).  Raises
-    InputError for levels of several joints, and as `joint_limits` does.
+    InputError as `joint_limits` does.
     """
     lower, upper = finite_ranges(chain, *joint_limits(cell, chain))
     wanted = cell.design.levels
     if not wanted:
         return JointSpace(lower, upper)
-    require(
-        len(wanted) == 1,
-        f"{cell.path or cell.name}: [design.levels] holds {', '.join(wanted)} at levels; only one "
-        "joint can be held: keep one, and narrow the others by [limits]",
-    )
-    name, levels = next(iter(wanted.items()))
+    ((name, levels),) = wanted.items()
     return JointSpace(lower, upper, joint_index(cell, chain, name, "[design.levels]"), levels)
 
 
@@ -109,6 +104,16 @@ class Candidates:
     feasible: int
     removed_by: dict[str, int]
 
+    @classmethod
+    def join(cls, lots: Sequence[Candidates]) -> Candidates:
+        """Several lots, tried under the same rules, as one."""
+        removed = {rule: sum(lot.removed_by[rule] for lot in lots) for rule in lots[0].removed_by}
+        q, load, group = (
+            np.concatenate([getattr(lot, name) for lot in lots]) for name in ("q", "load", "group")
+        )
+        tried, ok = sum(lot.tried for lot in lots), sum(lot.feasible for lot in lots)
+        return cls(q, load, group, tried, ok, removed)
+
 
 def draw(
     cell: Cell,
@@ -134,10 +139,10 @@ def draw(
     space = joint_space(cell, chain)
     groups = space.n_groups
     require(n >= groups, f"{n} candidates are too few for {groups} levels; ask for more")
-    drawn: list[_Lot] = []
+    drawn: list[Candidates] = []
     for group, stream in enumerate(np.random.SeedSequence(seed).spawn(groups)):
         progress(f"drawing candidates, level {group + 1} of {groups}")
-        chunks = _checked(checker, states, sobol(space, group, stream), jobs)
+        chunks = _checked(checker, states, group, sobol(space, group, stream), jobs)
         lot, verdict = _fill(chunks, n // groups + (group < n % groups))
         if not len(lot.q):
             raise InsufficientDataError(
@@ -145,9 +150,7 @@ def draw(
                 f"{checker.advice(verdict)}"
             )
         drawn.append(lot)
-    whole = _Lot.join(drawn)
-    of_group = np.repeat(np.arange(groups), [len(lot.q) for lot in drawn])
-    return Candidates(whole.q, whole.load, of_group, whole.tried, whole.feasible, whole.removed_by)
+    return Candidates.join(drawn)
 
 
 def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:
@@ -166,27 +169,10 @@ def feasible(checker: Checker, q: Array, forces: Array) -> BoolArray:
     return ok
 
 
-@dataclass(frozen=True)
-class _Lot:
-    """Feasible candidates q (k, n), load (k,) out of `tried`."""
-
-    q: Array
-    load: IntArray
-    tried: int
-    feasible: int
-    removed_by: dict[str, int]
-
-    @classmethod
-    def join(cls, lots: Sequence[_Lot]) -> _Lot:
-        removed = {rule: sum(lot.removed_by[rule] for lot in lots) for rule in lots[0].removed_by}
-        q = np.concatenate([lot.q for lot in lots])
-        load = np.concatenate([lot.load for lot in lots])
-        tried, ok = sum(lot.tried for lot in lots), sum(lot.feasible for lot in lots)
-        return cls(q, load, tried, ok, removed)
-
-
-def _check(checker: Checker, states: LoadStates, q: Array) -> tuple[_Lot, PoseFeasibility]:
-    """The feasible candidates among poses q (N, n), and the verdict on all.
+def _check(
+    checker: Checker, states: LoadStates, group: int, q: Array
+) -> tuple[Candidates, PoseFeasibility]:
+    """The feasible candidates among poses q (N, n) of a group, and the verdict on all.
 
     A pose measured in all load states must be feasible in each, and its verdict is that of the
     first state that forbids it; where the state is chosen, (pose, state) pairs are judged.
@@ -205,37 +191,31 @@ def _check(checker: Checker, states: LoadStates, q: Array) -> tuple[_Lot, PoseFe
         pose = np.flatnonzero(verdict.ok)
         load = np.full(len(pose), ALL_LOADS)
     order = np.lexsort((load, pose))
-    lot = _Lot(q[pose][order], load[order], len(verdict.ok), len(pose), verdict.removed_by)
+    of_group = np.full(len(pose), group)
+    tried, found = len(verdict.ok), len(pose)
+    lot = Candidates(q[pose][order], load[order], of_group, tried, found, verdict.removed_by)
     return lot, verdict
 
 
 def _checked(
-    checker: Checker, states: LoadStates, chunks: Iterator[Array], jobs: int
-) -> Iterator[tuple[_Lot, PoseFeasibility]]:
+    checker: Checker, states: LoadStates, group: int, chunks: Iterator[Array], jobs: int
+) -> Iterator[tuple[Candidates, PoseFeasibility]]:
     """Each chunk checked, in order, on `jobs` processes."""
     if jobs == 1:
-        for q in chunks:
-            yield _check(checker, states, q)
+        yield from (_check(checker, states, group, q) for q in chunks)
     from joblib import Parallel, delayed, effective_n_jobs
 
-    with Parallel(n_jobs=jobs) as pool:
+    with Parallel(n_jobs=jobs, batch_size=PER_TASK) as pool:
         while True:
-            wave = [list(islice(chunks, PER_TASK)) for _ in range(effective_n_jobs(jobs))]
-            for found in pool(delayed(_check_lots)(checker, states, lots) for lots in wave):
-                yield from found
-
-
-def _check_lots(
-    checker: Checker, states: LoadStates, lots: list[Array]
-) -> list[tuple[_Lot, PoseFeasibility]]:
-    return [_check(checker, states, q) for q in lots]
+            wave = islice(chunks, PER_TASK * effective_n_jobs(jobs))
+            yield from pool([delayed(_check)(checker, states, group, q) for q in wave])
 
 
 def _fill(
-    chunks: Iterator[tuple[_Lot, PoseFeasibility]], wanted: int
-) -> tuple[_Lot, PoseFeasibility]:
+    chunks: Iterator[tuple[Candidates, PoseFeasibility]], wanted: int
+) -> tuple[Candidates, PoseFeasibility]:
     """`wanted` candidates, fewer where the tries run out; the verdict on the first tries."""
-    lots: list[_Lot] = []
+    lots: list[Candidates] = []
     verdicts: list[PoseFeasibility] = []
     count = tried = 0
     while count < wanted and tried < max(TRIES * wanted if count else 0, GIVE_UP):
@@ -244,16 +224,17 @@ def _fill(
         if count == 0:
             verdicts.append(verdict)
         count, tried = count + len(lot.q), tried + CHUNK
-    whole = _Lot.join(lots)
-    return replace(whole, q=whole.q[:wanted], load=whole.load[:wanted]), PoseFeasibility.join(
-        verdicts
-    )
+    found = Candidates.join(lots)
+    found = replace(found, q=found.q[:wanted], load=found.load[:wanted], group=found.group[:wanted])
+    return found, PoseFeasibility.join(verdicts)
 
 
 def _at(chain: Chain, space: JointSpace, group: int) -> str:
     if space.held is None:
         return ""
-    value = space.levels[group]
-    revolute = chain.kinds[space.held] == "revolute"
-    told = f"{np.degrees(value):.6g}°" if revolute else f"{value:.6g} m"
-    return f" with joint{space.held + 1} at {told}"
+    return f" with joint{space.held + 1} at {told(chain, space.held, space.levels[group])}"
+
+
+def told(chain: Chain, j: int, value: float) -> str:
+    """A value in rad or m of joint j as people read it: "-25.24°"."""
+    return f"{np.degrees(value):.6g}°" if chain.kinds[j] == "revolute" else f"{value:.6g} m"

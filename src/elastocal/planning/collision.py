@@ -64,31 +64,33 @@ class Poses:
         return Poses(self.q[index], self.force[index], self.frames[index], self.flange_placement)
 
 
-class Kinematics:
-    """Frames of the rigid nominal arm:
+def arm_frames(chain: Chain, T_data_base: Array, q: ca.SX) -> tuple[list[ca.SX], ca.SX]:
+    """T_data_joint_i(q) = T_data_base X_1 J_1(q_1) … X_i J_i(q_i) of the rigid nominal arm after
+    each joint's motion, and the flange's frame."""
+    T, frames = rigid.constant(T_data_base), []
+    for i, joint in enumerate(chain.joints):
+        T = T @ rigid.constant(joint.placement) @ rigid.joint_motion(joint.kind, joint.axis, q[i])
+        frames.append(T)
+    return frames, T @ rigid.constant(chain.flange_placement)
 
-    T_data_joint_i(q) = T_data_base X_1 J_1(q_1) … X_i J_i(q_i), built by `manipulator.rigid`.
-    """
+
+class Kinematics:
+    """Frames of the rigid nominal arm in whole batches, as `arm_frames` has them."""
 
     def __init__(self, cell: Cell, chain: Chain) -> None:
         self.chain = chain
         self.T_data_base = data_base(cell)
         self.load_point = np.asarray(cell.tool.load_point, dtype=float)
         q = ca.SX.sym("q", chain.n_joints)
-        T, frames = rigid.constant(self.T_data_base), []
-        for i, joint in enumerate(chain.joints):
-            T = T @ rigid.constant(joint.placement)
-            T = T @ rigid.joint_motion(joint.kind, joint.axis, q[i])
-            frames.append(T)
-        hanging = rigid.point(T @ rigid.constant(chain.flange_placement), self.load_point)
-        self._tape = BatchFunction([q], [*frames, hanging])
+        frames, flange = arm_frames(chain, self.T_data_base, q)
+        self._compiled = BatchFunction([q], [*frames, rigid.point(flange, self.load_point)])
 
     def poses(self, q: Array, force: Array) -> Poses:
         """Poses for joint values q (N, n) and a force (3,) or (N, 3)."""
         q = np.ascontiguousarray(np.atleast_2d(q), dtype=float)
         n = self.chain.n_joints
         frames = np.zeros((len(q), n + 2, 4, 4))
-        *joints, hanging = self._tape(q)
+        *joints, hanging = self._compiled(q)
         for i, T in enumerate(joints):
             frames[:, i] = T
         frames[:, n:] = np.eye(4)
@@ -168,19 +170,17 @@ def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
     import pinocchio as pin
 
     model, parent = pin.Model(), 0
+    unaligned = {
+        "revolute": pin.JointModelRevoluteUnaligned,
+        "prismatic": pin.JointModelPrismaticUnaligned,
+    }
     for i, joint in enumerate(kinematics.chain.joints):
         placement = kinematics.T_data_base @ joint.placement if i == 0 else joint.placement
-        unaligned = (
-            pin.JointModelRevoluteUnaligned
-            if joint.kind == "revolute"
-            else pin.JointModelPrismaticUnaligned
-        )
-        parent = model.addJoint(
-            parent, unaligned(np.array(joint.axis)), _se3(placement), f"joint{i + 1}"
-        )
-    hook = np.eye(4)
-    hook[:3, 3] = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
-    model.addJoint(parent, pin.JointModelSpherical(), _se3(hook), "hanging")
+        moving = unaligned[joint.kind](np.array(joint.axis))
+        parent = model.addJoint(parent, moving, _se3(placement), f"joint{i + 1}")
+    load_point = np.eye(4)
+    load_point[:3, 3] = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
+    model.addJoint(parent, pin.JointModelSpherical(), _se3(load_point), "hanging")
     for i in range(free):
         model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
     return model
@@ -207,9 +207,8 @@ def geometry_of(kinematics: Kinematics, items: Sequence[Body | HalfSpace]) -> An
             joint, placement = 0, np.eye(4)
         else:
             shape, placement = coal_shape(item.solid), item.solid.placement
-            joint = {WORLD: 0, HANGING: kinematics.chain.n_joints + 1}.get(
-                item.carrier, item.carrier + 1
-            )
+            fixed = {WORLD: 0, HANGING: kinematics.chain.n_joints + 1}
+            joint = fixed.get(item.carrier, item.carrier + 1)
         geometry.addGeometryObject(pin.GeometryObject(item.name, joint, _se3(placement), shape))
     return geometry
 
@@ -313,22 +312,16 @@ class StaticTorque:
 
     def __init__(self, cell: Cell, chain: Chain) -> None:
         kept = tuple(e for e in cell.model.effects if e.name == GravityCompensator.name)
-        markers = {"tool": np.zeros(3)}
-        symbolic = SymbolicArm(
-            chain,
-            replace(
-                cell,
-                tool=replace(cell.tool, markers=markers),
-                model=replace(cell.model, effects=kept, observe="position"),
-            ),
-        )
+        model = replace(cell.model, effects=kept, observe="position")
+        tool = replace(cell.tool, markers={"tool": np.zeros(3)})
+        symbolic = SymbolicArm(chain, replace(cell, tool=tool, model=model))
         arm = symbolic.arm
         torque = ca.gradient(arm.potential, arm.q_commanded)
         self._nominal = np.array([p.nominal for p in symbolic.parameters])
-        self._tape = BatchFunction([arm.inputs["q"], arm.inputs["force"], symbolic.p], [torque])
+        self._compiled = BatchFunction([arm.inputs["q"], arm.inputs["force"], symbolic.p], [torque])
 
     def __call__(self, poses: Poses) -> Array:
-        return self._tape(poses.q, poses.force, self._nominal)[0][..., 0]
+        return self._compiled(poses.q, poses.force, self._nominal)[0][..., 0]
 
 
 # How far a body can move during a part of a joint interpolation, at most.
@@ -357,10 +350,10 @@ class MotionBound:
         n = chain.n_joints
         self._axes = np.array([joint.axis for joint in chain.joints])
         self._revolute = [joint.kind == "revolute" for joint in chain.joints]
-        hook = (chain.flange_placement @ [*kinematics.load_point, 1.0])[None, :3]
+        load_point = (chain.flange_placement @ [*kinematics.load_point, 1.0])[None, :3]
         # The points and radii whose motion bounds that of all bodies on a joint; the load point.
         self._carried = [(i, *_reach([b for b in bodies if b.carrier == i])) for i in range(n)]
-        self._carried.append((n - 1, hook, np.zeros(1)))
+        self._carried.append((n - 1, load_point, np.zeros(1)))
         # Each pair's bound is one entry of S, or the sum of two.
         at = np.zeros((2, 2, len(pairs)), dtype=int)
         at[1, 1] = n  # S after the last joint is zero

@@ -4,8 +4,8 @@ On the continuum of feasible poses the tangent at (Φ, G) bounds every plan's va
 
     Φ(plan) ≥ Φ² / (⟨G, prior⟩ + Σ_l n_l max_{q∈l} d(q)),   d(q) = Σ_s tr(B_s(q) G_s B_s(q)ᵀ)
 
-as in `certificate`, without its box, since one continuous pose may repeat.  d has many local
-maxima and rules cut the space up, so the global one is sought, not proved: fresh Sobol points,
+as in `selection`, without its box, since one continuous pose may repeat.  d has many local
+maxima and rules cut the space up, so the global one is sought, not proved: new Sobol points,
 then local ascents from the best of them and of the pool.
 """
 
@@ -21,10 +21,10 @@ from elastocal.errors import require
 from elastocal.planning.candidates import CHUNK, sobol
 from elastocal.planning.criterion import Gradient
 from elastocal.planning.polish import Searches, Sensitivity, distinct, search_all, trials
-from elastocal.planning.selection_problem import DesignProblem
+from elastocal.planning.selection import DesignProblem
 from elastocal.units import Array, IntArray, Progress
 
-LOT = 256  # of the best fresh points that are checked for feasibility at a time
+LOT = 256  # of the best new points that are checked for feasibility at a time
 LOTS = 16  # at most
 LEAST_GAIN = 1e-6  # relative excess over the pool's largest d that counts as one
 
@@ -35,7 +35,7 @@ class Continuum:
 
     An estimate from above: a larger d may have been missed, and then no plan is held to `bound`.
     `q` (k, n), `load` (k,), `group` (k,): feasible poses found whose d exceeds all of the pool's;
-    adding them to the pool and choosing anew closes the gap.  Effort: `searched` fresh points
+    adding them to the pool and choosing anew closes the gap.  Effort: `searched` new points
     evaluated, `checked` of them for feasibility, `ascents` local searches.
     """
 
@@ -64,9 +64,9 @@ def estimate(
 ) -> Continuum:
     """The largest d on the continuum per group, for the tangent (Φ, G) of the pool's optimum.
 
-    `q` (N, n), `load` (N,): the problem's candidates.  Per group and load state `points` fresh
+    `q` (N, n), `load` (N,): the problem's candidates.  Per group and load state `points` new
     poses (rounded up to chunks) are evaluated at once, feasibility only of the best; IPOPT climbs
-    from the `starts` best poses, fresh or of the pool, that lie apart.  Every maximum is
+    from the `starts` best poses, new or of the pool, that lie apart.  Every maximum is
     evaluated exactly and passed by the cell's own rules.  The result depends on `seed`, not on
     `jobs`, the number of processes.
 
@@ -128,7 +128,7 @@ class _Poses:
 
 @dataclass
 class _Search:
-    """Fresh points and ascents for one G; counts its effort."""
+    """New points and ascents for one G; counts its effort."""
 
     searches: Searches
     G: Array
@@ -140,9 +140,9 @@ class _Search:
     ascents: int = 0
 
     def run(self, pool: _Poses, stream: np.random.SeedSequence) -> _Poses:
-        """Feasible poses found, fresh ones and where ascents ended."""
-        fresh = self._fresh(pool, stream)
-        first = pool.with_these(fresh.q, fresh.d).ranked()
+        """Feasible poses found, new ones and where ascents ended."""
+        drawn = self._drawn(pool, stream)
+        first = pool.with_these(drawn.q, drawn.d).ranked()
         first = first.take(distinct(first.q, self.starts))
         tasks = [
             (self.searches.at(q, pool.load, pool.group), Sensitivity(self.G, d), q[None])
@@ -155,9 +155,9 @@ class _Search:
         rose = d > np.tile(first.d, len(q) // len(first.d))
         q, d = q[rose], d[rose]
         ok = self.searches.feasible(q, pool.load)
-        return fresh.with_these(q[ok], d[ok])
+        return drawn.with_these(q[ok], d[ok])
 
-    def _fresh(self, pool: _Poses, stream: np.random.SeedSequence) -> _Poses:
+    def _drawn(self, pool: _Poses, stream: np.random.SeedSequence) -> _Poses:
         """The best feasible of `points` Sobol points."""
         chunks = islice(sobol(self.searches.space, pool.group, stream), -(-self.points // CHUNK))
         q = np.concatenate(list(chunks))

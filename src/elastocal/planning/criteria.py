@@ -18,7 +18,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from inspect import isabstract
 from types import ModuleType
 from typing import Any, Self, TypeVar, get_args
 
@@ -29,16 +28,19 @@ from elastocal.planning.criterion import (
     Cone,
     Criterion,
     CriterionInputs,
+    Interest,
     Robust,
     ScenarioCriterion,
     SpectralTerm,
     Term,
     TraceTerm,
+    Variances,
     Worst,
     power_mean,
     power_mean_slope,
+    trustworthy,
+    whitened_rows,
 )
-from elastocal.planning.information_matrices import Interest, Variances, trustworthy, whitened_rows
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import Array, IntArray
 
@@ -465,20 +467,32 @@ class EigenvalueCriterion(SpectralCriterion):
 
 
 @dataclass(frozen=True)
-class FirstObservability(DeterminantCriterion):
+class ObservabilityIndex(SpectralCriterion):
+    """An index O, to be maximised, with Φ_s = 1/O²; σ as in SpectralCriterion: of the scaled,
+    whitened regressor with the nuisance columns projected out.
+
+    `reported`: O, in noise standard deviations per typical size.
+    """
+
+    unit = ""
+    better = "larger"
+
+    def figure(self, value: float) -> float:
+        return float(1 / np.sqrt(value))
+
+
+@dataclass(frozen=True)
+class FirstObservability(ObservabilityIndex, DeterminantCriterion):
     """O1 = (σ_1 ⋯ σ_k)^{1/k} / √m, to be maximised: Φ_s = 1/(m O1²) = det(V_II)^{1/k}.
 
     m = `n_poses`, the number of measurement configurations.  At a given number of poses O1 orders
-    plans as D does.  σ as in SpectralCriterion: of the scaled, whitened regressor with the
-    nuisance columns projected out.  `reported`: O1, in noise standard deviations per typical size.
+    plans as D does.
     Source: Menq & Borm 1988; Borm & Menq 1991, Int. J. Robotics Research 10(1), 51–63.
     """
 
     n_poses: int
     name = "O1"
     title = "observability index: volume of the ellipsoid of the singular values"
-    unit = ""
-    better = "larger"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -495,23 +509,22 @@ class FirstObservability(DeterminantCriterion):
         return cls(inputs.counted(), n)
 
     def figure(self, value: float) -> float:
-        return float(1 / np.sqrt(self.n_poses * value))
+        return super().figure(self.n_poses * value)
 
 
 @dataclass(frozen=True)
-class SecondObservability(SpectralCriterion):
+class SecondObservability(ObservabilityIndex):
     """O2 = σ_min / σ_max, to be maximised: Φ_s = 1/O2² = μ_k / μ_1, without unit.
 
     The squared condition number of the information of interest.  It has degree 0 in M and may
     grow when a pose is added, so it gives no lower bound here; without nuisance parameters it
-    is quasi-convex: Φ ≤ t is the linear matrix inequality z 1 ⪯ M ⪯ t z 1 in M and z.  σ as in
-    SpectralCriterion.  `reported`: O2 between 0 and 1.
+    is quasi-convex: Φ ≤ t is the linear matrix inequality z 1 ⪯ M ⪯ t z 1 in M and z.
+    `reported`: O2 between 0 and 1.
     Source: Driels & Pathre 1990, J. Robotic Systems 7(1), 27–53.
     """
 
     name = "O2"
     title = "observability index: inverse condition number"
-    better = "larger"
     without_bound = "is not convex"
 
     def phi(self, mu: Array) -> Array:
@@ -523,41 +536,29 @@ class SecondObservability(SpectralCriterion):
         slope[..., -1] -= 1 / mu[..., 0]
         return slope
 
-    def figure(self, value: float) -> float:
-        return float(1 / np.sqrt(value))
-
 
 @dataclass(frozen=True)
-class ThirdObservability(EigenvalueCriterion):
+class ThirdObservability(ObservabilityIndex, EigenvalueCriterion):
     """O3 = σ_min, to be maximised: Φ_s = 1/O3² = 1/μ_1; it orders plans as E does.
 
-    σ as in SpectralCriterion: of the scaled, whitened regressor with the nuisance columns
-    projected out.  `reported`: O3, in noise standard deviations per typical size.
     Source: Nahvi, Hollerbach & Hayward 1994, IEEE Int. Conf. Robotics and Automation, 407–412.
     """
 
     name = "O3"
     title = "observability index: smallest singular value"
-    unit = ""
-    better = "larger"
-
-    def figure(self, value: float) -> float:
-        return float(1 / np.sqrt(value))
 
 
 @dataclass(frozen=True)
-class FourthObservability(SpectralCriterion):
+class FourthObservability(ObservabilityIndex):
     """O4 = σ_min² / σ_max = O2 · O3, to be maximised: Φ_s = 1/O4² = μ_k / μ_1².
 
     The noise amplification index.  It has degree −1 in M, but may grow when a pose is added, and
-    1/Φ is not concave: no bound.  σ as in SpectralCriterion.  `reported`: O4, in noise standard
-    deviations per typical size.
+    1/Φ is not concave: no bound.
     Source: Nahvi & Hollerbach 1996, IEEE Int. Conf. Robotics and Automation, 647–654.
     """
 
     name = "O4"
     title = "observability index: noise amplification"
-    better = "larger"
     without_bound = "is not convex"
 
     def phi(self, mu: Array) -> Array:
@@ -569,23 +570,18 @@ class FourthObservability(SpectralCriterion):
         slope[..., -1] -= 1 / mu[..., 0] ** 2
         return slope
 
-    def figure(self, value: float) -> float:
-        return float(1 / np.sqrt(value))
-
 
 @dataclass(frozen=True)
-class FifthObservability(SpectralCriterion):
+class FifthObservability(ObservabilityIndex):
     """O5 = 1 / Σ_i (1/σ_i), to be maximised: Φ_s = 1/O5² = (tr V_II^{1/2})², V = M⁻¹.
 
-    k² times the matrix mean of order −1/2 between D and A, hence 1/Φ is concave.  σ as in
-    SpectralCriterion.  `reported`: O5, in noise standard deviations per typical size.
+    k² times the matrix mean of order −1/2 between D and A, hence 1/Φ is concave.
     Source: Sun & Hollerbach 2008, IEEE Int. Conf. Robotics and Automation, 831–836, where O1 is
     related to D, O3 to E and O5 to A; Pukelsheim 2006, ch. 6.
     """
 
     name = "O5"
     title = "observability index: harmonic sum of the singular values"
-    better = "larger"
     certifiable = True
 
     def phi(self, mu: Array) -> Array:
@@ -593,9 +589,6 @@ class FifthObservability(SpectralCriterion):
 
     def slope(self, mu: Array) -> Array:
         return np.asarray((mu**-0.5).sum(axis=-1)[..., None] * mu**-1.5)
-
-    def figure(self, value: float) -> float:
-        return float(1 / np.sqrt(value))
 
     def term(self, s: int) -> Term | None:
         return SquaredTraceRootTerm(np.asarray(self.interest))
@@ -682,14 +675,10 @@ def register(criterion: Registered) -> Registered:
         f"{listed(CRITERIA)}",
     )
     made = criterion.of.__func__ is not ScenarioCriterion.of.__func__  # type: ignore[attr-defined]
-    require(
-        made and not isabstract(criterion),
-        f"{known} ({quoted(name)}) is not complete: define {listed(_missing(criterion, made))}",
-    )
-    bounded = any(
-        getattr(criterion, form) is not getattr(ScenarioCriterion, form)
-        for form in ("term", "cone")
-    )
+    missing = sorted(getattr(criterion, "__abstractmethods__", ())) + ([] if made else ["of"])
+    require(not missing, f"{known} ({quoted(name)}) is not complete: define {listed(missing)}")
+    forms = ("term", "cone")
+    bounded = any(getattr(criterion, f) is not getattr(ScenarioCriterion, f) for f in forms)
     require(
         bounded or not criterion.certifiable,
         f"{known} ({quoted(name)}) is certifiable but has neither term nor cone for the "
@@ -701,10 +690,6 @@ def register(criterion: Registered) -> Registered:
 
 def _place(criterion: type[ScenarioCriterion]) -> tuple[str, str]:
     return criterion.__module__, criterion.__qualname__
-
-
-def _missing(criterion: type[ScenarioCriterion], made: bool) -> list[str]:
-    return sorted(getattr(criterion, "__abstractmethods__", ())) + ([] if made else ["of"])
 
 
 def criterion_named(name: str) -> type[ScenarioCriterion]:
@@ -723,19 +708,13 @@ def make_criterion(
     parameters: int,
     interest: IntArray,
     scenarios: int = 1,
-    A: Array | None = None,
-    weights: Array | None = None,
-    combination: Array | None = None,
-    unit: str = "",
-    n_poses: int | None = None,
-    names: tuple[str, ...] = (),
-    sizes: Array | None = None,
     robust: Robust = "none",
+    **inputs: Any,
 ) -> Criterion:
     """The criterion `name`, one of CRITERIA, for p = `parameters` scaled parameters.
 
-    All else as in CriterionInputs.  Over S = `scenarios` > 1 of the arm, `robust` says whether
-    the average or the worst counts.
+    All else, `inputs` too, as in CriterionInputs.  Over S = `scenarios` > 1 of the arm, `robust`
+    says whether the average or the worst counts.
     Raises InputError for an unknown name, and where something the criterion needs is missing, of
     another shape, or empty.
     """
@@ -751,9 +730,6 @@ def make_criterion(
         f"criterion {name} has {scenarios} scenarios of the arm to weigh: say whether the "
         'average or the worst counts (robust = "average" or "worst")',
     )
-    inputs = CriterionInputs(
-        name, parameters, np.asarray(interest, dtype=np.int64), scenarios, A, weights,
-        combination, unit, n_poses, names, sizes,
-    )  # fmt: skip
-    criterion = chosen.of(inputs)
+    indices = np.asarray(interest, dtype=np.int64)
+    criterion = chosen.of(CriterionInputs(name, parameters, indices, scenarios, **inputs))
     return Worst(criterion) if robust == "worst" else criterion

@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from elastocal.errors import InsufficientDataError, require
 from elastocal.planning.criterion import Gradient
-from elastocal.planning.exchange import (
+from elastocal.planning.relaxation import Relaxed, relax
+from elastocal.planning.selection import (
     IMPROVEMENT,
     SOFT,
     TIE,
+    DesignProblem,
+    Exchanged,
     check_enough,
     exchange,
     fitted,
@@ -24,8 +27,6 @@ from elastocal.planning.exchange import (
     random_plan,
     regular_plan,
 )
-from elastocal.planning.relaxation import Relaxed, relax
-from elastocal.planning.selection_problem import DesignProblem
 from elastocal.units import Array, IntArray, Progress
 
 # What chance would have given: the criterion of plans drawn from the same feasible poses.
@@ -34,36 +35,12 @@ DRAWN = 20
 STREAM = 10_000  # of the seed's children, beyond those that draw candidates and begin searches
 
 
-@dataclass(frozen=True)
-class RandomPlans:
-    """`values` Φ (n,) of random plans, ascending; inf for one that leaves a parameter open."""
-
-    values: Array
-
-    @property
-    def determined(self) -> int:
-        """How many of the plans determine every parameter that the criterion needs."""
-        return int(np.isfinite(self.values).sum())
-
-    @property
-    def median(self) -> float:
-        """Φ of the median plan; inf where half of them leave a parameter open."""
-        return float(np.median(self.values))
-
-    def efficiency(self, value: float) -> float | None:
-        """Φ = `value` of a plan over that of the median random plan, None where that is infinite.
-
-        Φ is homogeneous of degree −1 in the number of readings: without prior knowledge the random
-        plan needs 1/efficiency times as many to be worth as much.
-        """
-        return value / self.median if np.isfinite(self.median) else None
-
-
-def random_plans(problem: DesignProblem, seed: int, n: int = DRAWN) -> RandomPlans:
-    """Φ of `n` plans drawn uniformly from the candidates of `problem`, with its shares."""
+def random_plans(problem: DesignProblem, seed: int, n: int = DRAWN) -> Array:
+    """Φ (n,), ascending, of plans drawn uniformly from the candidates of `problem`, with its
+    shares; inf for one that leaves a parameter open."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
     M = np.stack([problem.prior + problem.sum_of(random_plan(problem, rng)) for _ in range(n)])
-    return RandomPlans(np.sort(np.asarray(problem.criterion.value(M), dtype=np.float64)))
+    return np.sort(np.asarray(problem.criterion.value(M), dtype=np.float64))
 
 
 # The best exact plan found from many starts, and the fewest poses that meet a target.
@@ -131,7 +108,7 @@ def exact_plan(
     seeds = np.random.SeedSequence(seed).spawn(starts)
     done = load_finished(checkpoint, problem, seed, starts)
 
-    def keep(k: int, finished: Finished) -> None:
+    def keep(k: int, finished: Exchanged) -> None:
         done[k] = finished
         save_finished(checkpoint, done, seed)
         best = min(f.value for f in done.values())
@@ -141,7 +118,7 @@ def exact_plan(
         tangent = _tangent(problem, relaxed_weights)
     if 0 not in done:
         begun = None if warm is None else fitted(problem, warm)
-        keep(0, _start(_PrunedPool.of(problem, tangent, relaxed_weights), 0, seeds[0], begun))
+        keep(*_start(_PrunedPool.of(problem, tangent, relaxed_weights), 0, seeds[0], begun))
     first = done[0]
     if tangent is None:
         tangent = _tangent(problem, np.bincount(first.chosen, minlength=N).astype(float))
@@ -176,7 +153,7 @@ class _PrunedPool:
         problem: DesignProblem,
         tangent: Gradient | None,
         weights: Array | None,
-        first: Finished | None = None,
+        first: Exchanged | None = None,
     ) -> _PrunedPool:
         """All candidates, or those that may be in a better plan than `first`."""
         if tangent is None:
@@ -192,8 +169,9 @@ class _PrunedPool:
 
 def _start(
     pool: _PrunedPool, k: int, seed: np.random.SeedSequence, begun: IntArray | None = None
-) -> Finished:
-    """Start k, all of it: from `begun` or a plan of its kind, near candidates first, then all."""
+) -> tuple[int, Exchanged]:
+    """k and where start k ended: from `begun` or a plan of its kind, near candidates first, then
+    all."""
     rng = np.random.default_rng(seed)
     problem = pool.problem
     chosen = _begin(pool, k, rng) if begun is None else begun
@@ -201,7 +179,7 @@ def _start(
     kept = np.union1d(pool.near, chosen)
     found = iterated_search(restrict(problem, kept), np.searchsorted(kept, chosen), rng)
     final = exchange(problem, kept[found.chosen])
-    return Finished(pool.kept[final.chosen], final.value, found.passes + final.passes)
+    return k, Exchanged(pool.kept[final.chosen], final.value, found.passes + final.passes)
 
 
 def _begin(pool: _PrunedPool, k: int, rng: np.random.Generator) -> IntArray:
@@ -228,23 +206,18 @@ def _regular(pool: _PrunedPool, chosen: IntArray, rng: np.random.Generator) -> I
 
 def _run(
     pool: _PrunedPool, which: list[int], seeds: list[np.random.SeedSequence], jobs: int
-) -> Iterator[tuple[int, Finished]]:
+) -> Iterator[tuple[int, Exchanged]]:
     """The starts `which`, as each is finished."""
     if jobs == 1 or len(which) < 2:
-        for k in which:
-            yield k, _start(pool, k, seeds[k])
+        yield from (_start(pool, k, seeds[k]) for k in which)
         return
     from joblib import Parallel, delayed
 
-    tasks = (delayed(_numbered)(pool, k, seeds[k]) for k in which)
+    tasks = (delayed(_start)(pool, k, seeds[k]) for k in which)
     yield from Parallel(jobs, return_as="generator_unordered")(tasks)
 
 
-def _numbered(pool: _PrunedPool, k: int, seed: np.random.SeedSequence) -> tuple[int, Finished]:
-    return k, _start(pool, k, seed)
-
-
-def _best(problem: DesignProblem, done: list[Finished]) -> ExactPlan:
+def _best(problem: DesignProblem, done: list[Exchanged]) -> ExactPlan:
     """The best of all starts; of equal ones the first in the order of their candidates."""
     values = np.array([f.value for f in done])
     tied = [f.chosen.tolist() for f in done if f.value <= values.min() * (1 + TIE)]
@@ -363,40 +336,24 @@ class ArrayStore(Protocol):
         """Keep `state` instead of what was saved before."""
 
 
-@dataclass(frozen=True)
-class Finished:
-    """Where a start ended: its plan (n_poses,), sorted, Φ, and the passes it took."""
-
-    chosen: IntArray
-    value: float
-    passes: int
-
-
-def save_finished(checkpoint: ArrayStore | None, done: Mapping[int, Finished], seed: int) -> None:
+def save_finished(checkpoint: ArrayStore | None, done: Mapping[int, Exchanged], seed: int) -> None:
     """Keep all starts `done` so far, by their numbers."""
-    if checkpoint is None:
-        return
-    checkpoint.save(
-        {
-            "seed": np.array(seed),
-            "start": np.array(list(done)),
-            "chosen": np.array([f.chosen for f in done.values()]),
-            "value": np.array([f.value for f in done.values()]),
-            "passes": np.array([f.passes for f in done.values()]),
-        }
-    )
+    if checkpoint is not None:
+        fields = ("chosen", "value", "passes")
+        ends = {name: np.array([getattr(f, name) for f in done.values()]) for name in fields}
+        checkpoint.save({"seed": np.array(seed), "start": np.array(list(done)), **ends})
 
 
 def load_finished(
     checkpoint: ArrayStore | None, problem: DesignProblem, seed: int, starts: int
-) -> dict[int, Finished]:
+) -> dict[int, Exchanged]:
     """The starts that need not be made again; none where they are of another problem or seed."""
     state = None if checkpoint is None else checkpoint.load()
     if state is None or int(state["seed"]) != seed or not _belongs(state, problem):
         return {}
     numbered = zip(state["start"], state["chosen"], state["value"], state["passes"], strict=True)
     return {
-        int(k): Finished(chosen, float(value), int(passes))
+        int(k): Exchanged(chosen, float(value), int(passes))
         for k, chosen, value, passes in numbered
         if k < starts
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -78,9 +79,7 @@ class Execution:
     @property
     def one_sided(self) -> tuple[int, ...]:
         """Poses that were to be approached from both sides but can be from one only."""
-        sides: dict[tuple[int, int], int] = {}
-        for stop in self.stops:
-            sides[stop.pose, stop.load] = sides.get((stop.pose, stop.load), 0) + 1
+        sides = Counter((stop.pose, stop.load) for stop in self.stops)
         few = {pose for (pose, _), n in sides.items() if self.motion.both_directions and n < 2}
         return tuple(sorted(few))
 
@@ -100,17 +99,6 @@ class Execution:
 # From a tour over visits to the stops of an execution.
 
 
-def stops_of(moves: Moves, tour: list[int], costs: Costs) -> tuple[Stop, ...]:
-    """The stops of a tour whose moves have all been checked."""
-    return tuple(stop for u, v in pairwise([0, *tour]) for stop in _stops(moves, u, v, costs))
-
-
-def way_home(moves: Moves, last: int, costs: Costs) -> tuple[Array, float]:
-    """Via points (k, n) from the node `last` to home, and the time; nothing without a home."""
-    _, way = moves.way(last, 0, costs)
-    return moves.points[way[1:-1]], _time(moves, way)
-
-
 def _stops(moves: Moves, u: int, v: int, costs: Costs) -> list[Stop]:
     """The reading of node v after node u, or two where it is approached from both sides."""
     _, way = moves.way(u, v, costs)
@@ -126,30 +114,15 @@ def _stops(moves: Moves, u: int, v: int, costs: Costs) -> list[Stop]:
     # The load is exchanged before the last stretch, which is the approach.
     passed = way[1:] if len(way) > 1 else way
     change = None if before == after else 0 if after < 0 else len(passed)
-    other = int(visits.entry[node, 1 - side])
-    signs = moves.signs[pose]
-    first = Stop(
-        pose=pose,
-        load=load,
-        q=q,
-        via=moves.points[passed],
-        travel=_time(moves, [*way, leave]),
-        change_after=change,
-        approach=signs[side],
-        side=side,
-    )
-    if not np.isfinite(visits.inside[node, 1 - side]):
+    signs, opposite = moves.signs[pose], 1 - side
+    time = _time(moves, [*way, leave])
+    first = Stop(pose, load, q, moves.points[passed], time, change, signs[side], side)
+    if not np.isfinite(visits.inside[node, opposite]):
         return [first]
-    second = Stop(
-        pose=pose,
-        load=load,
-        q=q,
-        via=moves.points[[other]],
-        travel=_time(moves, [leave, other, leave]),
-        approach=signs[1 - side],
-        side=1 - side,
-    )
-    return [first, second]
+    other = int(visits.entry[node, opposite])
+    time = _time(moves, [leave, other, leave])
+    via = moves.points[[other]]
+    return [first, Stop(pose, load, q, via, time, None, signs[opposite], opposite)]
 
 
 def _time(moves: Moves, way: list[int]) -> float:
@@ -252,16 +225,16 @@ def shortest_tour(cost: Array, start: list[int], seed: int, iterations: int) -> 
     import pyvrp
     from pyvrp import search
 
-    whole: Any = np.round(cost * (LARGEST / max(float(cost.max()), 1e-300))).astype(np.int64)
-    np.fill_diagonal(whole, 0)
-    n = len(whole)
+    integers: Any = np.round(cost * (LARGEST / max(float(cost.max()), 1e-300))).astype(np.int64)
+    np.fill_diagonal(integers, 0)
+    n = len(integers)
     data = pyvrp.ProblemData(
         locations=[pyvrp.Location(0, 0) for _ in range(n)],
         clients=[pyvrp.Client(location=i) for i in range(1, n)],
         depots=[pyvrp.Depot(location=0)],
         vehicle_types=[pyvrp.VehicleType(num_available=1)],
-        distance_matrices=[whole],
-        duration_matrices=[0 * whole],
+        distance_matrices=[integers],
+        duration_matrices=[0 * integers],
     )
     # One vehicle: the moves that exchange between routes are left out, longer segments added.
     # Lower history than the default, which is made for thousands of nodes.
@@ -345,15 +318,16 @@ def schedule(
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
     refuse_impossible(moves, tour, costs, blockers)
-    stops = stops_of(moves, tour, costs)
-    home_via, home_travel = way_home(moves, tour[-1], costs)
+    stops = [stop for u, v in pairwise([0, *tour]) for stop in _stops(moves, u, v, costs)]
+    _, home = moves.way(tour[-1], 0, costs)  # empty without a home
+    home_travel = _time(moves, home)
     travel = sum(stop.travel for stop in stops) + home_travel
     # The bound leaves open in which order the load states come: their number alone is fixed.
     open_cost = costs.cost - costs.changed
     bound = tour_bound(open_cost, tour_cost(open_cost, tour)) - tour_cost(costs.apart, tour)
     return Execution(
-        stops=stops,
-        home_via=home_via,
+        stops=tuple(stops),
+        home_via=moves.points[home[1:-1]],
         home_travel=home_travel,
         take_off=bool(moves.loaded[stops[-1].load]),
         motion=motion,

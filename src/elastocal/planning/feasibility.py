@@ -67,20 +67,20 @@ class Bound(Rule):
     key: str
     units: tuple[str, ...]
 
-    def _beyond(self, poses: Poses) -> tuple[Array, BoolArray, BoolArray]:
+    def _outside(self, poses: Poses) -> tuple[Array, BoolArray, BoolArray]:
         value = self.quantity(poses)
         return value, value < self.lower - SAME, value > self.upper + SAME
 
     def broken(self, poses: Poses) -> BoolArray:
-        _, below, above = self._beyond(poses)
+        _, below, above = self._outside(poses)
         return np.asarray((below | above).any(axis=1))
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        _, below, above = self._beyond(poses)
+        _, below, above = self._outside(poses)
         return {label: below[:, i] | above[:, i] for i, label in enumerate(self.labels)}
 
     def remedy(self, poses: Poses) -> str:
-        value, below, above = self._beyond(poses)
+        value, below, above = self._outside(poses)
         i = int((below | above).sum(axis=0).argmax())
         low = below[:, i].sum() > above[:, i].sum()
         limit = np.broadcast_to(self.lower if low else self.upper, len(self.labels))[i]
@@ -197,31 +197,17 @@ class PoseFeasibility:
     @property
     def removed_by(self) -> dict[str, int]:
         """Candidates by the first rule they break: tried = feasible + Σ removed_by."""
-        first = self.broken & (self.broken.cumsum(axis=1) == 1)
-        return self._counts(first)
-
-    @property
-    def alone(self) -> dict[str, int]:
-        """Candidates that break each rule, whatever the others: its toll if it stood alone."""
-        return self._counts(self.broken)
-
-    @property
-    def freed(self) -> dict[str, int]:
-        """Candidates that break this rule and no other: what dropping it would free."""
-        return self._counts(self.broken & (self.broken.sum(axis=1) == 1)[:, None])
-
-    def _counts(self, mask: BoolArray) -> dict[str, int]:
-        return {rule: int(n) for rule, n in zip(self.rules, mask.sum(axis=0), strict=True)}
+        first = (self.broken & (self.broken.cumsum(axis=1) == 1)).sum(axis=0)
+        return dict(zip(self.rules, first.tolist(), strict=True))
 
     @classmethod
     def join(cls, verdicts: Sequence[PoseFeasibility]) -> PoseFeasibility:
         """Several batches under the same rules as one."""
-        return cls(
-            verdicts[0].rules,
-            np.concatenate([v.broken for v in verdicts]),
-            np.concatenate([v.q for v in verdicts]),
-            np.concatenate([v.force for v in verdicts]),
+        broken, q, force = (
+            np.concatenate([getattr(verdict, name) for verdict in verdicts])
+            for name in ("broken", "q", "force")
         )
+        return cls(verdicts[0].rules, broken, q, force)
 
 
 # The rules that a cell states, in the order of checking: cheap ones first.
@@ -237,7 +223,7 @@ def rule_book(
     """All rules of the cell.  Raises InputError where they do not fit the robot."""
     return (
         _joints(cell, chain),
-        *_seen(cell),
+        *_visibility(cell),
         *_load(cell, chain),
         *(
             KeepApart(rule, kinematics, own)
@@ -255,7 +241,7 @@ def _joints(cell: Cell, chain: Chain) -> Rule:
     return Bound("joint_limits", lambda p: p.q, lower, upper, labels, "a limit", units)
 
 
-def _seen(cell: Cell) -> Iterator[Rule]:
+def _visibility(cell: Cell) -> Iterator[Rule]:
     sight, eye = cell.workspace.visibility, cell.tracker.position
     if sight is None:
         return
@@ -275,10 +261,8 @@ def _seen(cell: Cell) -> Iterator[Rule]:
         yield Bound("range", distance, low, high, names, "a range_m", ("m",))
     observed = tuple(name for name in names if name in sight.normals)
     if sight.max_incidence is not None and observed:
-        at, axes = (
-            [cell.tool.markers[name] for name in observed],
-            [sight.normals[n] for n in observed],
-        )
+        at = [cell.tool.markers[name] for name in observed]
+        axes = [sight.normals[name] for name in observed]
         low, high = np.zeros(len(observed)), np.full(len(observed), sight.max_incidence)
         yield Bound(
             "incidence", lambda p: incidence(p, at, axes, eye), low, high, observed,
@@ -303,10 +287,8 @@ def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
                 f"{cell.path or cell.name}: [workspace] torque_limits_Nm has {len(bound)} values, "
                 f"but robot '{chain.name}' has {chain.n_joints} joints"
             )
-        torque, labels = (
-            StaticTorque(cell, chain),
-            tuple(f"joint{i + 1}" for i in range(len(bound))),
-        )
+        torque = StaticTorque(cell, chain)
+        labels = tuple(f"joint{i + 1}" for i in range(len(bound)))
         yield Bound(
             "torque", lambda p: np.abs(torque(p)), np.zeros(len(bound)), bound, labels,
             "a torque_limits_Nm", ("N m",),
@@ -380,9 +362,7 @@ class Feasibility:
         self.kinematics = Kinematics(cell, chain)
         self.bodies: tuple[Body, ...] = cell_bodies(cell, chain)
         self.pairs: tuple[Pair, ...] = cell_pairs(cell, chain, self.bodies)
-        self.rules: tuple[Rule, ...] = rule_book(
-            cell, chain, self.kinematics, self.bodies, self.pairs
-        )
+        self.rules = rule_book(cell, chain, self.kinematics, self.bodies, self.pairs)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (self._token, self.cell, self.chain)
@@ -395,9 +375,8 @@ class Feasibility:
         """
         poses = self._poses(q, force)
         broken = np.stack([rule.broken(poses) for rule in self.rules], axis=1)
-        return PoseFeasibility(
-            tuple(rule.name for rule in self.rules), broken, poses.q, poses.force
-        )
+        names = tuple(rule.name for rule in self.rules)
+        return PoseFeasibility(names, broken, poses.q, poses.force)
 
     def feasible(self, q: Array, force: Array) -> BoolArray:
         """(N,) as check(q, force).ok, without looking at a pose again that broke a rule."""
@@ -430,10 +409,6 @@ class Feasibility:
             for pair in self.pairs
             if Collisions(self.kinematics, [pair]).hits(poses).all()
         )
-
-    def path_free(self, q_from: Array, q_to: Array, loaded: bool) -> bool:
-        """The joint interpolation q_from → q_to (n,) breaks no margin at any point of it."""
-        return bool(self.paths_free(np.atleast_2d(q_from), np.atleast_2d(q_to), loaded)[0])
 
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool | BoolArray) -> BoolArray:
         """(M,) for moves q_from → q_to (M, n); `loaded` for all or per move (M,).

@@ -238,7 +238,6 @@ class PoseInformation:
 
 SURE = 1e3  # standard deviations that a typical deviation counts for where a prior is stated
 SAMPLE = 2000  # poses that show what is visible: more would not change a rank
-# Effects that say where things stand rather than what the arm is; D, A, E and O pass them over.
 
 
 @dataclass(frozen=True)
@@ -295,16 +294,16 @@ def estimable(
         B = np.vstack([B, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T])
     if stated is not None:
         B = np.vstack([B, SURE * np.eye(len(free))[stated[free]]])
+    sizes = information.sizes
     structure, reduction = (
-        _reduced(model, B, free, information.sizes, threshold)
-        for threshold in (0.0, WORTH_A_COLUMN)
+        _reduced(model, B, free, sizes, threshold) for threshold in (0.0, WORTH_A_COLUMN)
     )
     if not len(reduction.kept):
         raise InsufficientDataError(
             f"{model.cell.path or model.cell.name}: no feasible pose shows any parameter of the "
             "model; state the load that will hang ([design] loads_N), or choose other effects"
         )
-    return Estimable(reduction, information.sizes, structure)
+    return Estimable(reduction, sizes, structure)
 
 
 def _reduced(model: Model, B: Array, free: IntArray, sizes: Array, threshold: float) -> Reduction:
@@ -376,10 +375,8 @@ def _sample(model: Model, q: Array, load: IntArray) -> IntArray:
     held = [joint_index(cell, model.chain, name, "[design.levels]") for name in cell.design.levels]
     kinds, kind = np.unique(np.column_stack([q[:, held], load]), axis=0, return_inverse=True)
     each = -(-SAMPLE // len(kinds))
-    found = []
-    for k in range(len(kinds)):
-        members = np.flatnonzero(kind.ravel() == k)
-        found.append(members[:: -(-len(members) // each)])
+    members = [np.flatnonzero(kind.ravel() == k) for k in range(len(kinds))]
+    found = [own[:: -(-len(own) // each)] for own in members]
     return np.sort(np.concatenate(found))
 
 

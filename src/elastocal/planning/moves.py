@@ -39,11 +39,6 @@ def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> In
     return np.stack([np.where(below, 1, -1), np.where(above, -1, 1)], axis=1)
 
 
-def approach_points(q: Array, signs: IntArray, overshoot: float) -> Array:
-    """Joint vectors (N, 2, n) at which the last motions of `approach_signs` start."""
-    return np.asarray(q[:, None] - signs * overshoot)
-
-
 # What has to be visited: poses under load states, from which points they are entered and left.
 
 
@@ -62,9 +57,6 @@ class Visits:
     entry: IntArray
     inside: Array
 
-    def __len__(self) -> int:
-        return len(self.pose)
-
 
 @dataclass(frozen=True)
 class Costs:
@@ -81,16 +73,6 @@ class Costs:
     side: IntArray
 
 
-def loaded_between(visits: Visits, loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(V + 1, V + 1): is the load on the arm during the move?  Only if it is before and after.
-
-    So loads are hung and taken off where the arm stands for a loaded reading, and moves to and
-    from the beginning, node 0, are without.
-    """
-    carries = np.concatenate([[False], loaded[visits.load]])
-    return np.asarray(carries[:, None] & carries[None, :])
-
-
 def visit_costs(
     visits: Visits,
     loaded: NDArray[np.bool_],
@@ -104,8 +86,11 @@ def visit_costs(
     and ends without load, at point `home` or, where that is None, anywhere.  What cannot be
     reached costs more than everything else together.
     """
-    n = len(visits)
-    with_load = loaded_between(visits, loaded)
+    n = len(visits.pose)
+    # The load is on the arm during a move only if it is before and after: it is hung and taken
+    # off where the arm stands for a loaded reading.
+    carries = np.concatenate([[False], loaded[visits.load]])
+    with_load = carries[:, None] & carries[None, :]
     travel = np.zeros((n + 1, n + 1))
     side = np.zeros((n + 1, n), dtype=np.int64)
     for layer, between in enumerate(times):
@@ -124,7 +109,7 @@ def visit_costs(
     # Any tour travels less than this in all, if it needs no unreachable move.
     change = max(float(travel[finite].max()) * (n + 1), 1.0)
     states = np.append(-1, visits.load)
-    # The beginning is its own block; the unloaded states carry the same as it: nothing.
+    # The beginning is a state of its own; the unloaded states carry the same as it: nothing.
     carried = np.append(-1, np.where(loaded[visits.load], visits.load, -1))
     apart = change * (states[:, None] != states[None])
     changed = change * (carried[:, None] != carried[None])
@@ -302,7 +287,7 @@ class Moves:
             if limits is None:
                 raise InputError("approaches from both sides need the joint limits")
             signs = approach_signs(q, *limits, motion.overshoot)
-            between = approach_points(q, signs, motion.overshoot).reshape(-1, n)
+            between = (q[:, None] - signs * motion.overshoot).reshape(-1, n)
             entry = len(start) + n_poses + 2 * pose[:, None] + np.arange(2)
         points = np.vstack([start, q, between, np.zeros((0, n)) if via is None else via])
         times = travel_times(points, motion.speed)
@@ -310,7 +295,11 @@ class Moves:
         loaded = (forces != 0).any(axis=1)
         inside = times[leave[:, None], entry]
         if signs is not None:
-            inside = _approach_times(inside, _free_sides(maps, loaded[state], leave, entry))
+            # From the first entry on: the approach, then to the other side and back, where that
+            # is free; inf where this side is not.
+            free = _free_sides(maps, loaded[state], leave, entry)
+            back = np.where(free, 2 * inside, 0.0)[:, ::-1]
+            inside = np.where(free, inside + back, np.inf)
         visits = Visits(pose, state, leave, entry, inside)
         return cls(points, times, maps, visits, loaded, home, signs)
 
@@ -368,13 +357,6 @@ def _free_sides(
     for v, side in np.ndindex(*entry.shape):
         free[v, side] = maps[int(loaded[v])].check([(int(entry[v, side]), int(leave[v]))])
     return free
-
-
-def _approach_times(reach: Array, free: NDArray[np.bool_]) -> Array:
-    """Time (V, 2) from the first entry on: the approach, then to the other side and back, where
-    that is free; inf where this side is not."""
-    back = np.where(free, 2 * reach, 0.0)[:, ::-1]
-    return np.asarray(np.where(free, reach + back, np.inf))
 
 
 def _check_motion(motion: Motion, n: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
 from elastocal.planning.criterion import Criterion
-from elastocal.planning.exact_plan import RandomPlans
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text
@@ -103,8 +102,7 @@ def reasons(
 
 
 def _inverse(M: Array) -> Array:
-    factor = linalg.cho_factor(M)
-    return np.asarray(linalg.cho_solve(factor, np.eye(len(M))))
+    return np.asarray(linalg.cho_solve(linalg.cho_factor(M), np.eye(len(M))))
 
 
 # The plan on disk: plan.csv, which `simulate` takes and people measure by, and plan.json.
@@ -218,7 +216,9 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
     known = families(joint_kinds)
     columns: dict[str, Sequence[str]] = {"configuration": rows.configuration}
     for stem, kind, values in zip(known["q"].units, joint_kinds, rows.q.T, strict=True):
-        columns[column(stem, UNITS[kind])] = [_number(v) for v in in_unit(values, kind)]
+        columns[column(stem, UNITS[kind])] = [
+            repr(round(float(v), DIGITS) + 0.0) for v in in_unit(values, kind)
+        ]
     if rows.force is not None:
         for stem, values in zip(known["force"].units, rows.force.T, strict=True):
             columns[column(stem, "N")] = [repr(float(v) + 0.0) for v in values]
@@ -233,10 +233,6 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
 def in_unit(values: Array, kind: str) -> Array:
     """A joint's values in rad or m in the unit of the file."""
     return np.degrees(values) if kind == "revolute" else values * 1e3
-
-
-def _number(value: float) -> str:
-    return repr(round(float(value), DIGITS) + 0.0)
 
 
 def write_plan_json(path: str | Path, summary: Mapping[str, Any]) -> None:
@@ -281,14 +277,15 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Chance:
-    """The same number of random feasible poses: criteria of `drawn` such plans in the plan's unit.
+    """The same number of random feasible poses: criteria of `n` such plans in the plan's unit.
 
     `determined` of them determine every parameter; `median`, `best` and `worst` are None where
     that plan does not.  `efficiency` is the plan's Φ over the median's, None where the criterion
-    has no bound: such a Φ does not count poses.
+    has no bound: such a Φ does not count poses.  Φ is homogeneous of degree −1 in the number of
+    readings: without prior knowledge random plans need 1/efficiency times as many readings.
     """
 
-    drawn: int
+    n: int
     determined: int
     median: float | None
     best: float | None
@@ -296,18 +293,14 @@ class Chance:
     efficiency: float | None
 
     @classmethod
-    def of(cls, found: RandomPlans, value: float, criterion: Criterion) -> Chance:
-        """What `found` is beside a plan of Φ = `value`."""
-
-        def known(phi: float) -> float | None:
-            return criterion.reported(phi)[0] if np.isfinite(phi) else None
-
-        values = found.values
-        return cls(
-            len(values), found.determined, known(found.median), known(float(values[0])),
-            known(float(values[-1])),
-            found.efficiency(value) if criterion.certifiable else None,
-        )  # fmt: skip
+    def of(cls, values: Array, value: float, criterion: Criterion) -> Chance:
+        """What random plans of Φ = `values` (n,), ascending, are beside a plan of Φ = `value`."""
+        phi = (float(np.median(values)), float(values[0]), float(values[-1]))
+        median, best, worst = (criterion.reported(v)[0] if np.isfinite(v) else None for v in phi)
+        counts = criterion.certifiable and np.isfinite(phi[0])
+        efficiency = value / phi[0] if counts else None
+        determined = int(np.isfinite(values).sum())
+        return cls(len(values), determined, median, best, worst, efficiency)
 
 
 @dataclass(frozen=True)
@@ -432,11 +425,7 @@ class Plan(Result):
             "value": self.reported,
             "unit": self.unit,
             "n_poses": len(self.q),
-            "candidates": {
-                "tried": self.candidates.tried,
-                "feasible": self.candidates.feasible,
-                "removed_by": self.candidates.removed_by,
-            },
+            "candidates": asdict(self.candidates),
             "certificate": {
                 "efficiency_pool": c.efficiency_pool,
                 "bound_pool": self.bound_reported,
@@ -447,14 +436,7 @@ class Plan(Result):
                 "searched": c.searched,
                 "ascents": c.ascents,
             },
-            "random_plans": None if self.chance is None else {
-                "n": self.chance.drawn,
-                "determined": self.chance.determined,
-                "median": self.chance.median,
-                "best": self.chance.best,
-                "worst": self.chance.worst,
-                "efficiency": self.chance.efficiency,
-            },
+            "random_plans": None if self.chance is None else asdict(self.chance),
             "predicted": [
                 {
                     "name": p.name,

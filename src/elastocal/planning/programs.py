@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -32,32 +32,16 @@ def number(value: float, digits: int) -> str:
 # An execution as a list of what a robot program does: move, have the load changed, measure.
 
 AXES = 6
+TAKE_OFF = "take the load off"
 
 
-@dataclass(frozen=True)
-class Move:
-    """A joint move to `q` (n,) rad; `note` says what is there."""
-
-    q: Array
-    note: str
-
-
-@dataclass(frozen=True)
-class ChangeLoad:
-    """A stop until someone has done what `order` says."""
-
-    order: str
-
-
-@dataclass(frozen=True)
-class Measure:
-    """A stop of `dwell` s while the tracker measures `note`."""
-
-    dwell: float
-    note: str
-
-
-Step = Move | ChangeLoad | Measure
+# A move to joints (n,) rad with a note on what is there; a stop until someone has done what an
+# order says; a stop of so many s while the tracker measures what the note says.
+Step = (
+    tuple[Literal["move"], Array, str]
+    | tuple[Literal["load"], str]
+    | tuple[Literal["measure"], float, str]
+)
 
 
 def steps_of(
@@ -71,25 +55,23 @@ def steps_of(
     loaded = [False] if forces is None else [bool(np.any(force)) for force in forces]
     home = execution.motion.home
     if home is not None:
-        yield Move(home, "home")
+        yield "move", home, "home"
     for stop in execution.stops:
         name = f"configuration {configurations[stop.pose]}"
-        done = 0
-        for q in [*stop.via, stop.q]:
-            if stop.change_after == done:
-                yield _change(loaded[stop.load], loads[stop.load])
-            yield Move(q, name if q is stop.q else "via point, not measured")
-            done += 1
-        if stop.change_after == done:
-            yield _change(loaded[stop.load], loads[stop.load])
+        steps: list[Step] = [("move", q, "via point, not measured") for q in stop.via]
+        steps.append(("move", stop.q, name))
+        if stop.change_after is not None:
+            hang = f"hang the {loads[stop.load]}" if loaded[stop.load] else TAKE_OFF
+            steps.insert(stop.change_after, ("load", hang))
+        yield from steps
         side = "" if stop.approach is None else f", approached from {('below', 'above')[stop.side]}"
-        yield Measure(execution.motion.dwell, f"{name}, {loads[stop.load]}{side}")
+        yield "measure", execution.motion.dwell, f"{name}, {loads[stop.load]}{side}"
     if execution.take_off:
-        yield _change(False, "no load")
+        yield "load", TAKE_OFF
     if home is not None:
         for q in execution.home_via:
-            yield Move(q, "via point, not measured")
-        yield Move(home, "home")
+            yield "move", q, "via point, not measured"
+        yield "move", home, "home"
 
 
 def load_name(force: Array) -> str:
@@ -108,10 +90,6 @@ def check_six_axes(chain: Chain, language: str) -> None:
             f"robot '{chain.name}': a {language} program moves arms of {AXES} revolute joints, but "
             f"{what}; external axes are not written: take the joint values from the plan's table"
         )
-
-
-def _change(hang: bool, name: str) -> ChangeLoad:
-    return ChangeLoad(f"hang the {name}" if hang else "take the load off")
 
 
 # KUKA robot language: a .src file of PTP moves in axis angles.
@@ -159,12 +137,12 @@ def krl_program(
     ]
     for step in steps_of(execution, configurations, forces):
         match step:
-            case Move(q, note):
+            case "move", q, note:
                 angles = ", ".join(f"A{i + 1} {number(v, 6)}" for i, v in enumerate(np.degrees(q)))
                 lines += [f"; {plain(note)}", f"PTP {{{angles}}}"]
-            case ChangeLoad(order):
+            case "load", order:
                 lines += [f"; {plain(order)}, then start again", "HALT"]
-            case Measure(dwell, note):
+            case "measure", dwell, note:
                 lines += [f"; measure {plain(note)}", f"WAIT SEC {number(dwell, 3)}"]
     return "\n".join([*lines, "END"]) + "\n"
 
@@ -211,12 +189,12 @@ def urscript_program(
     motion = f"a={number(acceleration, 4)}, v={number(speed, 4)}"
     for step in steps_of(execution, configurations, forces):
         match step:
-            case Move(q, note):
+            case "move", q, note:
                 joints = ", ".join(number(v, 9) for v in q)
                 lines += [f"  # {plain(note)}", f"  movej([{joints}], {motion})"]
-            case ChangeLoad(order):
+            case "load", order:
                 text = plain(order)
                 lines.append(f'  popup("{text}, then continue", title="Load", blocking=True)')
-            case Measure(dwell, note):
+            case "measure", dwell, note:
                 lines += [f'  textmsg("measure {plain(note)}")', f"  sleep({number(dwell, 3)})"]
     return "\n".join([*lines, "end", "", f"{name}()"]) + "\n"

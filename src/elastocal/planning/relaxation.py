@@ -11,17 +11,327 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Literal, Protocol, get_args
+from functools import cached_property, partial
+from typing import Any, Literal, get_args
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from elastocal.errors import InsufficientDataError, require
-from elastocal.planning.criterion import Cone, Criterion, Gradient, ScenarioCriterion, Worst
-from elastocal.planning.information_matrices import BATCH_NUMBERS
-from elastocal.planning.interior_point import NewtonMaster, Restricted, pieces_of
-from elastocal.planning.selection_problem import DesignProblem, tangent_bound
-from elastocal.units import Array, IntArray
+from elastocal.planning.criterion import (
+    BATCH_NUMBERS,
+    Cone,
+    Criterion,
+    Gradient,
+    ScenarioCriterion,
+    Term,
+    Worst,
+)
+from elastocal.planning.selection import DesignProblem, largest_sum, tangent_bound
+from elastocal.units import Array, IntArray, Progress
+
+# Newton's method for a few hundred candidates: a primal–dual interior point with exact Hessian.
+#
+#     minimise max_j f_j(w),  f_j = log Φ_j(M(w)),   subject to  E w = n,  0 ≤ w ≤ u.
+#
+# f_j is convex since 1/Φ_j is concave; E (L, k) sums the weights of each level.  For σ → 0 the
+# barrier function
+#
+#     F_σ(w) = min_τ [τ − σ Σ_j log(τ − f_j)] − σ Σ_i log w_i − σ Σ_i log(u − w_i)
+#
+# is minimised by Newton steps in which the barrier's own curvatures σ/s_j², σ/w_i², σ/(u − w_i)²
+# are replaced by μ_j/s_j, z_i/w_i, y_i/(u − w_i) with multipliers that follow their own Newton
+# steps; s_j = τ − f_j.  F_σ decreases in every step, so that no start can fail, and the multipliers
+# give the fast last steps and the bound.  Boyd & Vandenberghe, Convex Optimization (2004), ch. 11;
+# Wächter & Biegler, Math. Program. 106 (2006) 25, for keeping the multipliers near σ/w.
+
+MOST_STEPS = 100
+TO_BOUNDARY = 0.99
+# Reduction of σ, once the decrement λ² of Newton's step is below CENTRED · σ · (constraints).
+REDUCTION = 0.1
+CENTRED = 0.3
+# and no multiplier further than this |log| from σ/slack.
+SPREAD = 2.0
+ARMIJO = 1e-4
+# A gap that should be below the accuracy is, for σ below this part of it, hidden by rounding.
+FINEST = 1e-2
+# Multipliers stay within this factor of σ/slack.
+NEAR = 1e4
+# Relative to the mean diagonal of the Hessian: keeps it definite to rounding.
+RIDGE = 1e-14
+
+
+@dataclass(frozen=True)
+class Restricted:
+    """Candidates A (S, k, p, p) in levels (k,) 0 … L−1 with shares (L,), each at most `most`.
+
+    `base` (S, p, p): information that does not depend on their weights.
+    """
+
+    A: Array
+    base: Array
+    level: IntArray
+    shares: IntArray
+    most: int
+
+    def information(self, w: Array) -> Array:
+        return self.base + np.tensordot(self.A, w, (1, 0))
+
+    def relative(self, w: Array) -> Array:
+        """w_i as a part of the largest weight of its level."""
+        largest = np.zeros(len(self.shares))
+        np.maximum.at(largest, self.level, w)
+        return np.asarray(w / largest[self.level])
+
+    def inside(self, w: Array, depth: float) -> Array:
+        """w ≥ 0 scaled to the shares and moved off its bounds, `depth` of the way to even ones."""
+        size = np.bincount(self.level)
+        total = np.bincount(self.level, w)
+        scale = self.shares / np.where(total > 0.0, total, np.inf)
+        clipped = np.minimum(w * scale[self.level], self.most)
+        filled = np.bincount(self.level, clipped)
+        missing = np.maximum(self.shares - filled, 0.0)
+        part = missing / np.maximum(self.most * size - filled, np.finfo(float).tiny)
+        full = clipped + part[self.level] * (self.most - clipped)
+        return np.asarray((1.0 - depth) * full + depth * (self.shares / size)[self.level])
+
+
+@dataclass(frozen=True)
+class SmoothPieces:
+    """Φ(M) = max_j Φ_j, Φ_j = Σ_t mix_jt φ_t(M_s(t)⁻¹).
+
+    `terms`: one Term per scenario s; the columns of `mix` (J, T) ≥ 0 are their functions in order.
+    One row is a smooth criterion (a mean over scenarios), the identity the worst case.
+    """
+
+    terms: tuple[Term, ...]
+    mix: Array
+
+    def at(self, M: Array) -> LocalPieces | None:
+        """Φ_j and derivatives at M (S, p, p); None where M is not positive definite."""
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(M))
+        except np.linalg.LinAlgError:
+            return None
+        V = root.transpose(0, 2, 1) @ root
+        slopes = [term.slope(V_s) for term, V_s in zip(self.terms, V, strict=True)]
+        values = self.mix @ np.concatenate([value for value, _ in slopes])
+        if not np.all(np.isfinite(values)):
+            return None
+        return LocalPieces(self, V, values, [C for _, C in slopes])
+
+
+@dataclass(frozen=True)
+class LocalPieces:
+    """The pieces at one M: V (S, p, p), `values` Φ_j (J,), C = ∂φ/∂V of each scenario's terms."""
+
+    pieces: SmoothPieces
+    V: Array
+    values: Array
+    C: list[Array]
+
+    def shares(self, mu: Array) -> list[Array]:
+        """Σ_j μ_j mix_jt/Φ_j (T_s,) per scenario: how much each term counts in Σ μ_j log Φ_j."""
+        counts = np.cumsum([term.count for term in self.pieces.terms])[:-1]
+        return list(np.split((mu / self.values) @ self.pieces.mix, counts))
+
+    def slopes(self, A: Array) -> Array:
+        """−∂ log Φ_j/∂w_i (J, k) for A (S, k, p, p)."""
+        of_terms = []
+        for V, C, A_s in zip(self.V, self.C, A, strict=True):
+            G = V @ C @ V
+            of_terms.append(G.reshape(len(G), -1) @ A_s.reshape(len(A_s), -1).T)
+        return np.asarray(self.pieces.mix @ np.concatenate(of_terms)) / self.values[:, None]
+
+    def tangent(self, mu: Array) -> Gradient:
+        """Φ_μ = Σ c_j Φ_j ≤ Φ with c_j ∝ μ_j/Φ_j, Σ c_j = 1, and its G.
+
+        1/Φ_μ is concave as 1/Φ is, so the tangent bounds Φ too; at the optimum, where μ are the
+        multipliers, it is tight, while a single piece would not be.
+        """
+        scale = 1.0 / np.sum(mu / self.values)
+        shares = self.shares(mu)
+        C = np.stack([np.tensordot(c, C, 1) for c, C in zip(shares, self.C, strict=True)])
+        return Gradient(float(scale * mu.sum()), scale * (self.V @ C @ self.V))
+
+    def hessian(self, A: Array, mu: Array, slopes: Array) -> Array:
+        """Σ_j μ_j ∂² log Φ_j/∂w_i∂w_j (k, k); `slopes` (J, k) as from `slopes`."""
+        k = A.shape[1]
+        H = -(slopes.T * mu) @ slopes
+        for term, share, V, C, A_s in zip(
+            self.pieces.terms, self.shares(mu), self.V, self.C, A, strict=True
+        ):
+            AV = A_s @ V
+            G = V @ np.tensordot(share, C, 1) @ V
+            # tr(A_i V A_j G): A_i V beside the transpose of A_j G.
+            H += 2.0 * AV.reshape(k, -1) @ (A_s @ G).transpose(0, 2, 1).reshape(k, -1).T
+            curvature = term.curvature(V, V @ AV)
+            if curvature is not None:
+                H += share[0] * curvature
+        return 0.5 * (H + H.T)
+
+
+def pieces_of(criterion: Criterion, scenarios: int) -> SmoothPieces | None:
+    """The criterion as a maximum of smooth pieces, from its terms; None where it is none.
+
+    These are E and its O3, whose pieces would be all directions, and the mean over several
+    scenarios of a maximum.
+    """
+    worst = isinstance(criterion, Worst) or scenarios == 1
+    if isinstance(criterion, Worst) and criterion.order != np.inf:
+        return None
+    base = criterion.base if isinstance(criterion, Worst) else criterion
+    assert isinstance(base, ScenarioCriterion)
+    terms = []
+    for s in range(scenarios):
+        term = base.term(s)
+        if term is None or not (worst or term.count == 1):
+            return None
+        terms.append(term)
+    count = sum(term.count for term in terms)
+    return SmoothPieces(tuple(terms), np.eye(count) if worst else np.full((1, count), 1.0 / count))
+
+
+@dataclass(frozen=True)
+class BarrierPoint:
+    """w (k,) inside its bounds, the pieces there, their slacks s (J,) and F_σ as `merit`."""
+
+    w: Array
+    local: LocalPieces
+    s: Array
+    merit: float
+
+
+def _central(task: Restricted, point: BarrierPoint, sigma: float) -> Array:
+    """Multipliers (J + 2k,) on the central path: of the pieces, of w ≥ 0 and of w ≤ u."""
+    return sigma / np.concatenate([point.s, point.w, task.most - point.w])
+
+
+def _solve(
+    pieces: SmoothPieces, task: Restricted, start: Array, accuracy: float
+) -> tuple[Array, Array]:
+    """Weights w (k,) whose log Φ is within `accuracy` of the least, and multipliers μ (J,).
+
+    `start` (k,) strictly inside its bounds with the right sums per level.
+    """
+    local = pieces.at(task.information(start))
+    assert local is not None  # every support sees what the pool sees
+    J, count = len(local.values), 2 * len(start) + len(local.values)
+    mu = np.full(J, 1.0 / J)
+    gap = _gap(task, start, local, mu, local.slopes(task.A))
+    if gap <= accuracy:
+        return start, mu
+    sigma = gap / count
+    point = _barrier(local, task, start, sigma)
+    at = _central(task, point, sigma)
+    best = (gap, start, mu)
+    for _ in range(MOST_STEPS):
+        slopes = point.local.slopes(task.A)
+        gap = _gap(task, point.w, point.local, at[:J], slopes)
+        if gap < best[0]:
+            best = (gap, point.w, at[:J])
+        if gap <= accuracy or sigma * count < FINEST * accuracy:
+            break
+        change, direction, decrement = _newton(task, point, at, slopes, sigma)
+        # Where rounding hides any decrease of F the multipliers still have to settle.
+        point = _search(pieces, task, point, direction, decrement, sigma) or point
+        # All stay positive, and within NEAR of the central values.
+        central = _central(task, point, sigma)
+        at = np.clip(at + _step_to_boundary(at, change) * change, central / NEAR, central * NEAR)
+        spread = float(np.abs(np.log(at / central)).max())
+        if decrement <= CENTRED * count * sigma and spread <= SPREAD:
+            sigma *= REDUCTION
+            point = _barrier(point.local, task, point.w, sigma)
+    return best[1], best[2] / best[2].sum()
+
+
+def _newton(
+    task: Restricted, point: BarrierPoint, at: Array, slopes: Array, sigma: float
+) -> tuple[Array, Array, float]:
+    """Steps of the multipliers `at` (J + 2k,) and of w (k,), and the decrement −∇F·Δw."""
+    w, room, s = point.w, task.most - point.w, point.s
+    mu, z, y = np.split(at, np.cumsum([len(s), len(w)]))
+    K = point.local.hessian(task.A, mu, slopes)
+    stiff = mu / s
+    centred = slopes - stiff @ slopes / stiff.sum()
+    K += (centred.T * stiff) @ centred
+    K[np.diag_indices_from(K)] += z / w + y / room + RIDGE * np.trace(K) / len(K)
+    gradient = -(sigma / s) @ slopes - sigma / w + sigma / room
+
+    factor = cho_factor(K, lower=True, overwrite_a=True, check_finite=False)
+    E = (task.level == np.arange(len(task.shares))[:, None]).astype(float)
+    solved = cho_solve(factor, np.column_stack([gradient, E.T]), check_finite=False)
+    lam = np.linalg.solve(E @ solved[:, 1:], E @ solved[:, 0])
+    dw = solved[:, 1:] @ lam - solved[:, 0]
+    change = [
+        sigma / s - mu - stiff * (centred @ dw),
+        sigma / w - z * (1.0 + dw / w),
+        sigma / room - y * (1.0 - dw / room),
+    ]
+    return np.concatenate(change), dw, float(-gradient @ dw)
+
+
+def _search(
+    pieces: SmoothPieces,
+    task: Restricted,
+    point: BarrierPoint,
+    dw: Array,
+    decrement: float,
+    sigma: float,
+) -> BarrierPoint | None:
+    """The longest of halved steps that decreases F_σ enough; None where rounding allows none."""
+    length = min(_step_to_boundary(point.w, dw), _step_to_boundary(task.most - point.w, -dw))
+    while length > 1e-10:
+        w = point.w + length * dw
+        local = pieces.at(task.information(w))
+        if local is not None:
+            moved = _barrier(local, task, w, sigma)
+            if moved.merit <= point.merit - ARMIJO * length * decrement:
+                return moved
+        length *= 0.5
+    return None
+
+
+def _barrier(local: LocalPieces, task: Restricted, w: Array, sigma: float) -> BarrierPoint:
+    """F_σ at w; τ solves Σ_j σ/(τ − f_j) = 1 by Newton's method from the left."""
+    f = np.log(local.values)
+    below = f.max() - f
+    excess = sigma
+    for _ in range(50):
+        s = below + excess
+        missing = np.sum(sigma / s) - 1.0
+        if missing <= 1e-14:
+            break
+        excess += missing / np.sum(sigma / s**2)
+    logs = np.log(s).sum() + np.log(w).sum() + np.log(task.most - w).sum()
+    return BarrierPoint(w, local, s, float(f.max() + excess - sigma * logs))
+
+
+def _gap(task: Restricted, w: Array, local: LocalPieces, mu: Array, slopes: Array) -> float:
+    """log Φ(w) minus the bound (see `tangent_bound`) of the restricted problem."""
+    d = mu @ slopes / mu.sum()
+    gain = largest_sum(d, task.level, task.shares, task.most) - d @ w
+    below = mu.sum() / np.sum(mu / local.values)
+    return float(np.log(local.values.max() / below) + np.log1p(gain))
+
+
+def _step_to_boundary(value: Array, step: Array) -> float:
+    """The longest step in (0, 1] that leaves 1 % of every positive value."""
+    shrink = np.min(step / value)
+    return 1.0 if shrink >= -TO_BOUNDARY else float(-TO_BOUNDARY / shrink)
+
+
+def newton(
+    pieces: SmoothPieces, task: Restricted, start: Array, accuracy: float
+) -> tuple[Array, Gradient]:
+    """The master problem by this interior point."""
+    w, mu = _solve(pieces, task, start, accuracy)
+    local = pieces.at(task.information(w))
+    assert local is not None  # `_solve` returns only points where it is
+    return w, local.tangent(mu)
+
+
+# The candidates of the pool, and the rounds in which they are priced against a master.
 
 Method = Literal["auto", "first-order", "conic"]
 
@@ -79,7 +389,7 @@ def relax(
     method: Method = "auto",
     tolerance: float = 1e-6,
     start: Array | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = lambda message: None,
 ) -> Relaxed:
     """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ most with Σ_{i∈l} w_i = shares[l].
 
@@ -109,18 +419,16 @@ def relax(
         return _only_plan(pool)
     first = _first_weights(pool, start)
     pieces = None if method == "conic" else pieces_of(criterion, len(problem.prior))
-    master: Master = ConicMaster(criterion) if pieces is None else NewtonMaster(pieces)
-    whole = method == "conic" and problem.n_candidates <= DIRECT
+    master: Master = ConicMaster(criterion) if pieces is None else partial(newton, pieces)
+    at_once = method == "conic" and problem.n_candidates <= DIRECT
 
     def report(step: RelaxationStep) -> None:
-        if progress is not None:
-            progress(f"relaxation: within {step.gap:.1e} of the bound, {step.support} candidates")
+        progress(f"relaxation: within {step.gap:.1e} of the bound, {step.support} candidates")
 
-    weights, tangent, history = optimise(
-        pool, master, first, _sizes(pool, whole), tolerance, report
-    )
+    sizes = _sizes(pool, at_once)
+    weights, tangent, history = optimise(pool, master, first, sizes, tolerance, report)
     last = history[-1]
-    weights, value = _cleaned(pool, weights, last, tolerance)
+    weights, value = _thinned(pool, weights, last, tolerance)
     return Relaxed(
         weights=weights,
         value=value,
@@ -156,9 +464,9 @@ def _first_weights(pool: CandidatePool, start: Array | None) -> Array:
     return weights
 
 
-def _sizes(pool: CandidatePool, whole: bool) -> IntArray:
+def _sizes(pool: CandidatePool, at_once: bool) -> IntArray:
     """Candidates of each level in the first master; more than its share takes at once."""
-    if whole:
+    if at_once:
         return np.full(len(pool.levels), pool.problem.n_candidates)
     p = pool.problem.prior.shape[-1]
     for_share = 2 * pool.problem.shares[pool.levels] // pool.problem.most
@@ -174,7 +482,7 @@ def _only_plan(pool: CandidatePool) -> Relaxed:
     return Relaxed(pool.fixed, tangent.value, bound, step.gap, 0, "first-order", (), tangent)
 
 
-def _cleaned(
+def _thinned(
     pool: CandidatePool, weights: Array, last: RelaxationStep, tolerance: float
 ) -> tuple[Array, float]:
     """Without the smallest weights of each level, as many as the gap allows."""
@@ -208,9 +516,9 @@ class CandidatePool:
         fits = 8 * S * N * len(self.rows) <= PACKED_BYTES
         self._packed = self._pack() if fits else None
         size = np.bincount(problem.group, minlength=len(problem.shares))
-        whole = size * problem.most == problem.shares
-        self.fixed = np.where(whole[problem.group], float(problem.most), 0.0)
-        self.levels = np.flatnonzero(~whole & (problem.shares > 0))
+        full = size * problem.most == problem.shares
+        self.fixed = np.where(full[problem.group], float(problem.most), 0.0)
+        self.levels = np.flatnonzero(~full & (problem.shares > 0))
 
     def even(self) -> Array:
         """w (N,): each group's share spread evenly."""
@@ -254,8 +562,8 @@ class CandidatePool:
         """d (N,) = Σ_s ⟨G_s, A_si⟩, as `DesignProblem.sensitivity`."""
         if self._packed is None:
             return self.problem.sensitivity(G)
-        triangles = G[:, self.rows, self.columns] * self._factor
-        return np.asarray((self._packed @ triangles[:, :, None])[..., 0].sum(axis=0))
+        packed = G[:, self.rows, self.columns] * self._factor
+        return np.asarray((self._packed @ packed[:, :, None])[..., 0].sum(axis=0))
 
     def matrices(self, chosen: IntArray) -> Array:
         """A (S, k, p, p) of the candidates `chosen` (k,)."""
@@ -324,14 +632,9 @@ class RelaxationStep:
         return max(1.0 - self.bound / self.value, 0.0)
 
 
-class Master(Protocol):
-    """Solves the problem on a few candidates."""
-
-    def __call__(self, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Gradient]:
-        """w (k,) with a relative gap of `accuracy`, and a tangent that shows it.
-
-        `start` (k,) is strictly inside the bounds.
-        """
+# Solves the problem on a few candidates: from a start (k,) strictly inside the bounds to w (k,)
+# with a relative gap of the accuracy asked for, and a tangent that shows it.
+Master = Callable[[Restricted, Array, float], tuple[Array, Gradient]]
 
 
 def optimise(
@@ -340,7 +643,7 @@ def optimise(
     start: Array,
     sizes: IntArray,
     tolerance: float,
-    progress: Callable[[RelaxationStep], None] | None,
+    progress: Callable[[RelaxationStep], None],
 ) -> tuple[Array, Gradient, tuple[RelaxationStep, ...]]:
     """Weights (N,) with 1 − bound/Φ ≤ tolerance, the tangent of the bound, and all rounds.
 
@@ -366,8 +669,7 @@ def optimise(
         if not history or certified > bound:
             bound, steepest = certified, tangent
         history.append(RelaxationStep(value, bound, len(support)))
-        if progress is not None:
-            progress(history[-1])
+        progress(history[-1])
         gap = history[-1].gap
         margin, least = pool.margins(support, d)
         outside = np.where(d > (1.0 + 0.1 * tolerance) * margin, d, -np.inf)
@@ -436,10 +738,8 @@ class ConicMaster:
             float(v / values.max()) * cone.value for v, cone in zip(values, cones, strict=True)
         ]
         total = cp.Variable()
-        if self._worst:
-            limit = [value <= total for value in relative]
-        else:
-            limit = [sum(relative) / len(relative) <= total]
+        mean = sum(relative) / len(relative)
+        limit = [value <= total for value in (relative if self._worst else [mean])]
         self._solve(cp.Problem(cp.Minimize(total), [*constraints, *limit]))
         if self._worst:
             share = np.maximum([float(c.dual_value) for c in limit], 0.0)

@@ -25,7 +25,7 @@ from elastocal.planning.information import (
     typical_sizes,
     why,
 )
-from elastocal.planning.selection_problem import DesignProblem
+from elastocal.planning.selection import DesignProblem
 from elastocal.planning.test_poses import (
     TargetPoses,
     on_kept,
@@ -195,7 +195,11 @@ def set_up(
     kept = found.columns
     information = replace(information, columns=kept, sizes=sizes[kept])
     interest = interest_of(model, found)
-    A, warnings = None, _unseen(model, found, free)
+    # The unit of [design] combination: that of its parameters, "" where they differ.
+    units = {p.unit for p in model.parameters if p.name in spec.combination}
+    # A sentence per free parameter that no feasible pose shows at all.
+    unseen = [int(i) for i in found.structure.invisible if i in free]
+    A, warnings = None, tuple(why(model, found, i) for i in unseen)
     if "test_poses" in criterion_named(spec.criterion).needs:
         rows = np.stack([prediction_rows(information, targets, x) for x in scenarios])
         A = on_kept(model, rows, found)
@@ -208,7 +212,7 @@ def set_up(
         A=A,
         weights=targets.weight,
         combination=_combination(model, found),
-        unit=_unit(model),
+        unit=units.pop() if len(units) == 1 else "",
         n_poses=n_poses,
         names=information.names,
         sizes=information.sizes,
@@ -271,17 +275,6 @@ def _combination(model: Model, found: Estimable) -> Array | None:
             f"{model.names[lost[1]]}; {why(model, found, lost[1])}"
         )
     return np.asarray((a * found.sizes)[found.columns])
-
-
-def _unit(model: Model) -> str:
-    """The unit of `[design] combination`: that of its parameters, "" where they differ."""
-    units = {p.unit for p in model.parameters if p.name in model.cell.design.combination}
-    return units.pop() if len(units) == 1 else ""
-
-
-def _unseen(model: Model, found: Estimable, free: IntArray) -> tuple[str, ...]:
-    """A sentence per free parameter that no feasible pose shows at all."""
-    return tuple(why(model, found, int(i)) for i in found.structure.invisible if i in free)
 
 
 def _held(model: Model, found: Estimable, bias: float) -> tuple[str, ...]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence, Sized
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,8 @@ from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.manipulator import Model
+from elastocal.planning.bodies import data_base
+from elastocal.planning.candidates import Checker, told
 from elastocal.planning.information import Estimable, PoseInformation, why
 from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
 from elastocal.text import listed, quoted
@@ -67,17 +68,11 @@ def beyond_limits(cell: Cell, chain: Chain, q: Array) -> str | None:
     if not len(beyond):
         return None
     j = int(beyond[0])
-    low, high = _told(chain, j, lower[j]), _told(chain, j, upper[j])
+    low, high = told(chain, j, lower[j]), told(chain, j, upper[j])
     return (
-        f"joint{j + 1} ({chain.joints[j].name}) at {_told(chain, j, q[j])} is beyond its limits, "
+        f"joint{j + 1} ({chain.joints[j].name}) at {told(chain, j, q[j])} is beyond its limits, "
         f"{low} to {high}"
     )
-
-
-def _told(chain: Chain, j: int, value: float) -> str:
-    if chain.kinds[j] == "revolute":
-        return f"{np.degrees(value):.6g}°"
-    return f"{value:.6g} m"
 
 
 def _check_count(cell: Cell, chain: Chain, key: str, found: Sized, one: bool = False) -> None:
@@ -124,13 +119,13 @@ def _check_levels(cell: Cell, chain: Chain) -> None:
             require(
                 lower[i] - LIMIT_SLACK <= value <= upper[i] + LIMIT_SLACK,
                 f"{cell.path or cell.name}: [design.levels] has {joint} at "
-                f"{_told(chain, i, value)}, beyond its limits, {_told(chain, i, lower[i])} to "
-                f"{_told(chain, i, upper[i])}; correct the level or the limits",
+                f"{told(chain, i, value)}, beyond its limits, {told(chain, i, lower[i])} to "
+                f"{told(chain, i, upper[i])}; correct the level or the limits",
             )
             require(
                 split is None or min(abs(value - s) for s in split) <= LEVEL_TOLERANCE,
                 f"{cell.path or cell.name}: [design.levels] has {joint} at "
-                f"{_told(chain, i, value)}, which is none of its levels in "
+                f"{told(chain, i, value)}, which is none of its levels in "
                 "[model.compliance_levels]; give both the same levels",
             )
 
@@ -239,12 +234,6 @@ FEW, MANY = 16, 256  # postures per place; many where the work cell allows none 
 WRONG_UNIT = 1e5  # mm
 
 
-class Rules(Protocol):
-    """What a work cell allows: `check` gives a verdict with `ok` (N,)."""
-
-    def check(self, q: Array, force: Array) -> Any: ...
-
-
 def working_loads(cell: Cell) -> Array:
     """The forces (L, 3) N of the design's loads that are not zero, or none but zero."""
     loads = cell.design.loads
@@ -274,18 +263,13 @@ class Places:
 
 def reach(cell: Cell, chain: Chain, places: Places, seed: int, postures: int = FEW) -> Postures:
     """Postures at the places: inverse kinematics with the cell's limits, base and home."""
-    nominal, T = cell.model.nominal, np.eye(4)
-    if nominal.base_rotation is not None:
-        T[:3, :3] = nominal.base_rotation
-    if nominal.base_position is not None:
-        T[:3, 3] = nominal.base_position
     return inverse_kinematics(
         chain,
         places.position,
         joint_limits(cell, chain),
         rotation=places.rotation,
         point=places.point,
-        T_data_base=T,
+        T_data_base=data_base(cell),
         near=cell.design.motion.home,
         postures=postures,
         seed=seed,
@@ -293,7 +277,7 @@ def reach(cell: Cell, chain: Chain, places: Places, seed: int, postures: int = F
 
 
 def preferred(
-    cell: Cell, chain: Chain, places: Places, found: Postures, rules: Rules | None, seed: int
+    cell: Cell, chain: Chain, places: Places, found: Postures, rules: Checker | None, seed: int
 ) -> tuple[Array, str]:
     """Per place the first posture that the rules allow, and what to tell.
 
@@ -307,15 +291,15 @@ def preferred(
     if len(stuck):
         more = reach(cell, chain, places.take(stuck), seed, MANY)
         stuck = _take_allowed(cell, places.take(stuck), more, rules, q, stuck)
-    told = f" ({len(stuck)} of them in no posture that the work cell allows)"
-    return q, told if len(stuck) else ""
+    lost = f" ({len(stuck)} of them in no posture that the work cell allows)"
+    return q, lost if len(stuck) else ""
 
 
 def _take_allowed(
     cell: Cell,
     places: Places,
     found: Postures,
-    rules: Rules,
+    rules: Checker,
     q: Array,
     rows: NDArray[np.int64],
 ) -> NDArray[np.int64]:
@@ -335,9 +319,9 @@ def how_near(found: Postures, t: int) -> str:
     """How near the arm gets to target t."""
     distance, turn = found.miss[t, 0] * 1e3, np.degrees(found.turn[t, 0])
     # A place missed by this much is given in another unit than its column says.
-    told = f"{distance:.4g} mm" if distance < WRONG_UNIT else f"{distance:.0f} mm, wrong unit?"
+    near = f"{distance:.4g} mm" if distance < WRONG_UNIT else f"{distance:.0f} mm, wrong unit?"
     also = f" and {turn:.3g}° from its rotation" if turn > 0.01 else ""
-    return f"the arm gets no nearer than {told}{also}"
+    return f"the arm gets no nearer than {near}{also}"
 
 
 def remedy(cell: Cell) -> str:
@@ -372,18 +356,19 @@ class TargetPoses:
 
 @dataclass(frozen=True)
 class _Group:
-    """Poses of one source: q (N, n), force (N, 3) or None for the cell's loads, weight (N,)."""
+    """Poses of one source: q (N, n), force (N, 3) or None for the cell's loads, weight (N,);
+    `source` in words."""
 
     q: Array
     force: Array | None
     weight: Array
     point: Array
-    told: str
+    source: str
     stated: bool
 
 
 def test_poses(
-    cell: Cell, chain: Chain, feasibility: Rules | None = None, seed: int = 0
+    cell: Cell, chain: Chain, feasibility: Checker | None = None, seed: int = 0
 ) -> TargetPoses:
     """The test poses of the cell: [[design.test_pose]], [design.test_path], [design.test_box].
 
@@ -396,7 +381,10 @@ def test_poses(
     and InsufficientDataError where the cell allows none of the drawn poses.
     """
     spec, groups = cell.design, []
-    point = _default_point(cell)
+    # The load point where the cell states one, else the mean over the markers.
+    point = cell.tool.load_point
+    if not point.any() and cell.tool.markers:
+        point = np.asarray(np.mean(list(cell.tool.markers.values()), axis=0))
     for k, pose in enumerate(spec.test_poses):
         key = place("design", "test_pose", k, "q_deg" if pose.degrees else "q_si")
         check_posture(cell, chain, key, pose.q, pose.degrees)
@@ -405,24 +393,18 @@ def test_poses(
         groups.append(
             _Group(pose.q[None], force, np.array([pose.weight]), own, "", pose.point is not None)
         )
-    told = [f"{len(groups)} of [[design.test_pose]]"] if groups else []
+    sources = [f"{len(groups)} of [[design.test_pose]]"] if groups else []
     if spec.test_path is not None:
         groups.append(_along_path(cell, chain, spec.test_path, point, feasibility, seed))
     if spec.test_box is not None:
         groups.append(_in_box(cell, chain, spec.test_box, point, feasibility, seed))
     if not groups:
         groups.append(_drawn(cell, chain, point, feasibility, seed))
-    return _together(groups, working_loads(cell), [*told, *(g.told for g in groups if g.told)])
+    sources += [g.source for g in groups if g.source]
+    return _together(groups, working_loads(cell), "test poses: " + ", ".join(sources))
 
 
-def _default_point(cell: Cell) -> Array:
-    """The load point where the cell states one, else the mean over the markers."""
-    if cell.tool.load_point.any() or not cell.tool.markers:
-        return cell.tool.load_point
-    return np.asarray(np.mean(list(cell.tool.markers.values()), axis=0))
-
-
-def _together(groups: Sequence[_Group], loads: Array, told: Sequence[str]) -> TargetPoses:
+def _together(groups: Sequence[_Group], loads: Array, source: str) -> TargetPoses:
     q, force, weight, point, stated = [], [], [], [], []
     for group in groups:
         each = loads if group.force is None else np.zeros((1, 3))
@@ -431,21 +413,14 @@ def _together(groups: Sequence[_Group], loads: Array, told: Sequence[str]) -> Ta
         weight.append(np.repeat(group.weight / len(each), len(each)))
         point.append(np.broadcast_to(group.point, (len(q[-1]), 3)))
         stated.append(np.full(len(q[-1]), group.stated))
-    all_weights = np.concatenate(weight)
-    # First by the largest, so that no sum overflows.
-    all_weights = all_weights / all_weights.max()
-    return TargetPoses(
-        np.vstack(q),
-        np.vstack(force),
-        all_weights / all_weights.sum(),
-        np.vstack(point),
-        np.concatenate(stated),
-        "test poses: " + ", ".join(told),
-    )
+    w = np.concatenate(weight)
+    w = w / w.max()  # so that no sum overflows
+    joints, forces, points = np.vstack(q), np.vstack(force), np.vstack(point)
+    return TargetPoses(joints, forces, w / w.sum(), points, np.concatenate(stated), source)
 
 
 def _along_path(
-    cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Rules | None, seed: int
+    cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Checker | None, seed: int
 ) -> _Group:
     path = read_path(spec.file, chain.kinds)
     stated = spec.point is not None
@@ -455,9 +430,8 @@ def _along_path(
         force = np.broadcast_to(spec.force, (len(path.weight), 3))
     if path.q is not None:
         _check_path_limits(cell, chain, path, path.q)
-        return _Group(
-            path.q, force, path.weight, point, f"{len(path.q)} of {spec.file.name}", stated
-        )
+        source = f"{len(path.q)} of {spec.file.name}"
+        return _Group(path.q, force, path.weight, point, source, stated)
     assert path.position is not None  # read_path: joints or positions
     rotation = None if path.rotation is None else Rotation.from_rotvec(path.rotation).as_matrix()
     places = Places(path.position, rotation, point, force)
@@ -469,8 +443,8 @@ def _along_path(
             f"out of reach, {how_near(found, t)} ({len(found.out_of_reach)} of "
             f"{len(path.weight)} places); {remedy(cell)}"
         )
-    q, told = preferred(cell, chain, places, found, rules, seed)
-    return _Group(q, force, path.weight, point, f"{len(q)} of {spec.file.name}{told}", stated)
+    q, lost = preferred(cell, chain, places, found, rules, seed)
+    return _Group(q, force, path.weight, point, f"{len(q)} of {spec.file.name}{lost}", stated)
 
 
 def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> None:
@@ -486,7 +460,7 @@ def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> N
 
 
 def _in_box(
-    cell: Cell, chain: Chain, box: TargetBox, point: Array, rules: Rules | None, seed: int
+    cell: Cell, chain: Chain, box: TargetBox, point: Array, rules: Checker | None, seed: int
 ) -> _Group:
     stated = box.point is not None
     point = point if box.point is None else box.point
@@ -504,11 +478,11 @@ def _in_box(
             f"{box.count} places); make the box smaller, "
             f"{'leave out rpy_deg, ' if box.rotation is not None else ''}{remedy(cell)}"
         )
-    q, told = preferred(cell, chain, places, found, rules, seed)
-    return _Group(q, force, np.ones(len(q)), point, f"{len(q)} in [design.test_box]{told}", stated)
+    q, lost = preferred(cell, chain, places, found, rules, seed)
+    return _Group(q, force, np.ones(len(q)), point, f"{len(q)} in [design.test_box]{lost}", stated)
 
 
-def _drawn(cell: Cell, chain: Chain, point: Array, rules: Rules | None, seed: int) -> _Group:
+def _drawn(cell: Cell, chain: Chain, point: Array, rules: Checker | None, seed: int) -> _Group:
     low, high = finite_ranges(chain, *joint_limits(cell, chain))
     count = DEFAULT_COUNT if rules is None else DRAWN
     q = low + (high - low) * _sobol(chain.n_joints, count, seed)
@@ -527,8 +501,8 @@ def _drawn(cell: Cell, chain: Chain, point: Array, rules: Rules | None, seed: in
                 f"none of {count} postures drawn over the joint limits; state "
                 "[[design.test_pose]], or relax the rules of [workspace]"
             )
-    told = f"{len(q)} drawn over the joint limits (the cell states none)"
-    return _Group(q, None, np.ones(len(q)), point, told, False)
+    source = f"{len(q)} drawn over the joint limits (the cell states none)"
+    return _Group(q, None, np.ones(len(q)), point, source, False)
 
 
 def _sobol(dimension: int, count: int, seed: int) -> Array:
@@ -596,21 +570,19 @@ def _table(
 def _with_points(model: Model, points: dict[str, Array]) -> Model:
     """The same arm with the test points as markers whose place on the flange is known."""
     cell = model.cell
+    # Effects act where they do on the model as it is, without the test points.
     effects = tuple(
-        EffectChoice(choice.name, place)
+        EffectChoice(choice.name, where)
         for choice in cell.model.effects
-        for place in _places(choice, model)
+        for where in (
+            CATALOGUE[choice.name].places(model.chain, cell)
+            if choice.where is None
+            else (choice.where,)
+        )
     )
     spec = replace(cell.model, effects=effects, observe="position")
     tool = replace(cell.tool, markers=cell.tool.markers | points)
     return Model.assembled(model.chain, replace(cell, model=spec, tool=tool))
-
-
-def _places(choice: EffectChoice, model: Model) -> tuple[str, ...]:
-    """Where the effect acts on the model as it is, without the test points."""
-    if choice.where is not None:
-        return (choice.where,)
-    return CATALOGUE[choice.name].places(model.chain, model.cell)
 
 
 def on_kept(model: Model, A: Array, found: Estimable) -> Array:

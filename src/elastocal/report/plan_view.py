@@ -214,8 +214,8 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
     c = plan.chance
     if c is None:
         return []
-    whole = f"{c.drawn} random plans of as many feasible poses"
-    open_ = c.drawn - c.determined
+    whole = f"{c.n} random plans of as many feasible poses"
+    open_ = c.n - c.determined
     lost = f"{open_} of {whole} leave parameters open that this plan determines"
     if c.median is None or c.best is None:
         return [("Chance", f"{lost}.")]

@@ -24,9 +24,8 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.model import Chain, joint_limits, read_urdf
 from elastocal.planning import DesignOptions, DesignSearch, Effort, Feasibility, Plan, Setup, set_up
 from elastocal.planning import design as design_module
-from elastocal.planning.design import design
+from elastocal.planning.design import EFFORTS, design
 from elastocal.planning.information import ALL_LOADS
-from elastocal.planning.search import EFFORTS
 
 BOTH = np.array([[0.0, 0, 0], DOWN])
 LIGHT = np.array([[0.0, 0, 0], [0.0, 0, -60.0]])

@@ -34,17 +34,17 @@ def test_each_is_a_plan_of_these_shares_drawn_without_preference(name: str) -> N
     of = problem(name=name)
     every = np.sort(every_value(of))
     found = random_plans(of, seed=1, n=400)
-    gap = np.abs(found.values[:, None] - every[None]).min(axis=1)
-    assert (gap <= 1e-9 * found.values).all()
-    assert (np.diff(found.values) >= 0).all()
+    gap = np.abs(found[:, None] - every[None]).min(axis=1)
+    assert (gap <= 1e-9 * found).all()
+    assert (np.diff(found) >= 0).all()
     # The share of draws below the true median is binomial: 400 draws, 5 standard deviations.
-    below = int((found.values <= np.median(every)).sum())
+    below = int((found <= np.median(every)).sum())
     assert abs(below - 200) < 50
 
 
 def test_a_seed_gives_the_same_plans_again() -> None:
     one, same, other = (random_plans(problem(), seed=s) for s in (3, 3, 4))
-    assert (one.values == same.values).all() and (one.values != other.values).any()
+    assert (one == same).all() and (one != other).any()
 
 
 def test_plans_that_leave_a_parameter_open_are_counted_and_have_no_value() -> None:
@@ -52,7 +52,7 @@ def test_plans_that_leave_a_parameter_open_are_counted_and_have_no_value() -> No
     chance = Chance.of(random_plans(of, seed=0), 1.0, of.criterion)
     assert chance == Chance(20, 0, None, None, None, None)
     known = problem(shares=(1, 0), prior=1.0)
-    assert random_plans(known, seed=0).determined == 20
+    assert np.isfinite(random_plans(known, seed=0)).all()
 
 
 def test_a_plan_says_what_chance_gives_and_beats_it(tmp_path) -> None:

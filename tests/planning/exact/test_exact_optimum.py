@@ -8,7 +8,7 @@ from small_pools import CRITERIA, all_plans, all_values, random_problem
 
 from elastocal.planning import DesignProblem, make_criterion, relax
 from elastocal.planning.exact_plan import exact_plan
-from elastocal.planning.exchange import exchange
+from elastocal.planning.selection import exchange
 
 
 def is_optimal(problem: DesignProblem, seed: int, **options) -> bool:

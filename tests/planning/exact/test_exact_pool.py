@@ -58,7 +58,7 @@ def test_something_is_ruled_out():
 def test_the_best_addition_is_that_of_trying_all(name, prior, monkeypatch):
     """With one candidate evaluated at first, so that the bound decides when to stop; with much
     known before Φ is nearly linear and the bound is close."""
-    monkeypatch.setattr("elastocal.planning.exchange.FIRST", 1)
+    monkeypatch.setattr("elastocal.planning.selection.FIRST", 1)
     for seed in range(20):
         problem = random_problem(name, seed)
         problem = replace(problem, prior=prior * np.eye(problem.blocks.shape[-1])[None])

@@ -51,7 +51,7 @@ def test_the_curve_falls_even_where_the_search_for_the_larger_plan_finds_nothing
         rng = np.random.default_rng(pool.problem.n_poses)
         chosen = module.random_plan(pool.problem, rng) if begun is None else begun
         M = pool.problem.prior + pool.problem.sum_of(chosen)
-        return module.Finished(pool.kept[chosen], float(pool.problem.criterion.value(M)), 0)
+        return k, module.Exchanged(pool.kept[chosen], float(pool.problem.criterion.value(M)), 0)
 
     def unmoved(problem, chosen):
         M = problem.prior + problem.sum_of(chosen)

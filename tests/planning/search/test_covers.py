@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell.workspace_rules import Solid
 from elastocal.planning import coal_shape, excess, signed_distance, smooth_min, sphere_cover
-from elastocal.planning.pose_margins import MOST_SPHERES, ROUNDING
+from elastocal.planning.polish import MOST_SPHERES, ROUNDING
 from elastocal.units import Array
 
 PLACED = np.eye(4)

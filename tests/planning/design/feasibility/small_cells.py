@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,22 @@ from elastocal.cell.arm_description import Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Solid, Workspace
 from elastocal.model import Chain, Joint, read_urdf
-from elastocal.planning import Feasibility
+from elastocal.planning import Feasibility, PoseFeasibility
 
-CHECK = Path(__file__).resolve().parents[3] / "experiment_design" / "feasibility_check"
+CHECK = Path(__file__).resolve().parents[4] / "experiment_design" / "feasibility_check"
 DOWN = np.array([0.0, 0.0, -2600.0])
 NOTHING = np.zeros(3)
 KR270_CHAIN = read_urdf(KR270)
+
+
+def breaking(verdict: PoseFeasibility) -> dict[str, int]:
+    """Candidates that break each rule, whatever the others."""
+    return dict(zip(verdict.rules, verdict.broken.sum(axis=0).tolist(), strict=True))
+
+
+def freed_by(verdict: PoseFeasibility) -> dict[str, int]:
+    """Candidates that break this rule and no other: what dropping it would free."""
+    return breaking(replace(verdict, broken=verdict.broken & (verdict.broken.sum(1) == 1)[:, None]))
 
 
 def at(x: float, y: float, z: float) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planning.feasibility.small_cells import (
+from planning.design.feasibility.small_cells import (
     DOWN,
     KR270_CHAIN,
     NOTHING,
@@ -19,8 +19,8 @@ from planning.feasibility.small_cells import (
     gantry_rules,
     sphere,
 )
-from planning.feasibility.test_frames_of_poses import random_chain
-from planning.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
+from planning.design.feasibility.test_frames_of_poses import random_chain
+from planning.design.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
 
 from elastocal.cell.arm_description import Tool
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
@@ -138,7 +138,7 @@ def test_both_directions_are_the_same_move():
     q = q[rules.feasible(q, NOTHING)]
     there, back = (rules.paths_free(a, b, False) for a, b in ((q[:-1], q[1:]), (q[1:], q[:-1])))
     assert (there == back).all()
-    single = [rules.path_free(a, b, False) for a, b in pairwise(q[:10])]
+    single = [rules.paths_free(a, b, False) for a, b in pairwise(q[:10])]
     assert single == there[:9].tolist()
 
 
@@ -149,9 +149,9 @@ def test_nothing_is_too_thin_to_be_met(x, thickness):
     sheet = box("sheet", (thickness, 2, 2), (x, 0, 0))
     rules = gantry_rules(replace(BALL, obstacles=(sheet,), clearance=0.0))
     start, end = gantry_at((-2.9, 0, 0), (2.9, 0, 0))
-    assert not rules.path_free(start, end, False)
+    assert not rules.paths_free(start, end, False)
     above = gantry_at((-2.9, 0, 1.2), (2.9, 0, 1.2))
-    assert rules.path_free(*above, False)
+    assert rules.paths_free(*above, False)
 
 
 @settings(deadline=None, max_examples=30)
@@ -171,7 +171,7 @@ def test_a_move_past_an_obstacle_is_free_up_to_the_resolution():
     ways = [(0.15 - 1e-6, False), (0.15 + 3 * RESOLUTION, True)]
     for height, expected in ways:
         q = gantry_at((-2, 0.3, height), (2, -0.2, height))
-        assert rules.path_free(*q, False) == expected
+        assert rules.paths_free(*q, False) == expected
 
 
 def test_every_feasible_pose_can_be_left():
@@ -180,7 +180,7 @@ def test_every_feasible_pose_can_be_left():
     touching = gantry_at((0, 0, 0.15 + POSE_SLACK + 1e-8))
     assert rules.feasible(touching, NOTHING).all()
     for aside in gantry_at((0.2, 0, 0.3), (0.3, 0, 0.15 + POSE_SLACK), (0, 0, 0.15 + POSE_SLACK)):
-        assert rules.path_free(touching[0], aside, False)
+        assert rules.paths_free(touching[0], aside, False)
 
 
 def test_the_load_is_in_the_way_only_where_it_hangs():
@@ -194,8 +194,8 @@ def test_the_load_is_in_the_way_only_where_it_hangs():
     assert mixed.tolist() == [False, True]
     # Down to 0.9 m under the data's origin and no lower: the load ends 1 m under the load point.
     down = gantry_at((-1, 0, 0.5), (-1, 0, 0.1 + 1e-4), (-1, 0, 0.1 - 1e-4))
-    assert rules.path_free(down[0], down[1], True)
-    assert not rules.path_free(down[0], down[2], True)
+    assert rules.paths_free(down[0], down[1], True)
+    assert not rules.paths_free(down[0], down[2], True)
 
 
 def test_the_rope_keeps_its_angle_on_the_way():
@@ -207,6 +207,6 @@ def test_the_rope_keeps_its_angle_on_the_way():
     start[4], end[4] = np.radians([60, 120])
     round_about = end.copy()
     round_about[3] = 4 * np.pi
-    assert rules.path_free(start, end, True)
-    assert not rules.path_free(start, round_about, True)
-    assert rules.path_free(start, round_about, False)
+    assert rules.paths_free(start, end, True)
+    assert not rules.paths_free(start, round_about, True)
+    assert rules.paths_free(start, round_about, False)

@@ -4,9 +4,17 @@ import re
 from dataclasses import replace
 
 import numpy as np
-from planning.feasibility.small_cells import DOWN, KR270_CHAIN, NOTHING, box, cell, sphere
-from planning.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
-from planning.feasibility.test_single_rules import full_cell
+from planning.design.feasibility.small_cells import (
+    DOWN,
+    KR270_CHAIN,
+    NOTHING,
+    box,
+    cell,
+    freed_by,
+    sphere,
+)
+from planning.design.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
+from planning.design.feasibility.test_single_rules import full_cell
 
 from elastocal.cell.arm_description import Tool, Tracker
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, Visibility, Workspace
@@ -23,7 +31,7 @@ def test_dropping_the_advised_rule_frees_as_many_as_it_says():
     q = kr270_poses(3000)
     rules, verdict, text = advised(full_cell(), q, DOWN)
     name, count = re.search(r"relax '(\w+)', which alone stops (\d+)", text).groups()
-    assert int(count) == max(verdict.freed.values()) == verdict.freed[name]
+    assert int(count) == max(freed_by(verdict).values()) == freed_by(verdict)[name]
     rules.rules = tuple(rule for rule in rules.rules if rule.name != name)
     assert rules.check(q, DOWN).ok.sum() - verdict.ok.sum() == int(count)
     assert f"{verdict.ok.sum()} of 3000" in text
@@ -63,7 +71,7 @@ def test_the_limit_proposed_frees_half_of_those_that_are_stopped():
     proposed = float(re.search(r"range_m of ([\d.]+) m instead of 1 m", text).group(1))
     wider = replace(given.workspace, visibility=replace(near, range=(0.0, proposed)))
     freed = Feasibility(replace(given, workspace=wider), KR270_CHAIN).check(q, NOTHING).ok.sum()
-    assert abs((freed - verdict.ok.sum()) / verdict.freed["range"] - 0.5) < 0.02
+    assert abs((freed - verdict.ok.sum()) / freed_by(verdict)["range"] - 0.5) < 0.02
 
 
 def test_two_rules_that_both_stop_everything_are_named_together():
@@ -73,7 +81,7 @@ def test_two_rules_that_both_stop_everything_are_named_together():
         obstacles=(sphere("cave", 9.0, (0, 0, 0)),),
     )
     _, verdict, text = advised(cell(both), kr270_poses(50))
-    assert verdict.freed == {"joint_limits": 0, "keep_out": 0, "obstacle": 0}
+    assert freed_by(verdict) == {"joint_limits": 0, "keep_out": 0, "obstacle": 0}
     assert "relax 'keep_out' and 'obstacle', which stop 50 of them" in text
     assert "tool and people (50)" in text and "tool and cave (50)" in text
 

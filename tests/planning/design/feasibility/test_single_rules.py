@@ -6,19 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from planning.feasibility.small_cells import (
+from planning.design.feasibility.small_cells import (
     DOWN,
     KR270_CHAIN,
     NOTHING,
     box,
+    breaking,
     broken,
     cell,
+    freed_by,
     gantry_at,
     gantry_rules,
     sphere,
 )
-from planning.feasibility.test_frames_of_poses import random_chain
-from planning.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
+from planning.design.feasibility.test_frames_of_poses import random_chain
+from planning.design.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
 
 from elastocal.cell.arm_description import EffectChoice, Tool, Tracker
 from elastocal.cell.workspace_rules import (
@@ -217,12 +219,12 @@ def test_the_order_of_rules_changes_who_removes_but_not_what_remains():
     rules = Feasibility(full_cell(), KR270_CHAIN)
     q = kr270_poses(4000)
     verdict = rules.check(q, DOWN)
-    assert verdict.ok.any() and all(verdict.alone.values())
+    assert verdict.ok.any() and all(breaking(verdict).values())
     shuffled = Feasibility(full_cell(), KR270_CHAIN)
     for order in np.random.default_rng(0).permuted([range(len(rules.rules))] * 5, axis=1):
         shuffled.rules = tuple(rules.rules[k] for k in order)
         other = shuffled.check(q, DOWN)
-        assert (other.ok == verdict.ok).all() and other.alone == verdict.alone
+        assert (other.ok == verdict.ok).all() and breaking(other) == breaking(verdict)
         assert (shuffled.feasible(q, DOWN) == verdict.ok).all()
 
 
@@ -235,7 +237,7 @@ def test_counts_add_up():
     joined = PoseFeasibility.join(parts)
     assert (joined.ok == verdict.ok).all() and joined.removed_by == verdict.removed_by
     for rule in verdict.rules:
-        assert verdict.freed[rule] <= verdict.removed_by[rule] <= verdict.alone[rule]
+        assert freed_by(verdict)[rule] <= verdict.removed_by[rule] <= breaking(verdict)[rule]
     # Rows are judged each by its own force.
     assert (rules.check(q[::2], DOWN).ok == verdict.ok[::2]).all()
     assert (rules.check(q[1::2], NOTHING).ok == verdict.ok[1::2]).all()

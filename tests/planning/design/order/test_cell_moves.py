@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planning.design.feasibility.small_cells import breaking
 from support.cells import kr270_cell, kr270_chain, random_poses
 
 from elastocal.cell.plan_wishes import Motion
@@ -52,7 +53,7 @@ def test_every_move_keeps_clear_with_and_without_the_load(feasibility):
         for done, goal in enumerate([*stop.via, stop.q]):
             force = LOADS[stop.load] if stop.change_after == done else force
             verdict = feasibility.check(here + step * (goal - here), force)
-            assert not any(verdict.alone.get(rule, 0) for rule in collision)
+            assert not any(breaking(verdict).get(rule, 0) for rule in collision)
             here = goal
         force = LOADS[stop.load]
 
@@ -68,7 +69,7 @@ def test_the_bodies_in_the_way_are_named(feasibility):
 
 def test_a_home_behind_the_pillar_is_told_with_the_pillar(feasibility):
     inside = np.radians([-39.0, -20, 20, 0, 0, 0])
-    assert not feasibility.path_free(inside, inside, False)
+    assert not feasibility.paths_free(inside, inside, False)
     q = random_poses(feasibility.chain, 60, seed=3)
     q = q[feasibility.feasible(q, LOADS[0])][:3]
     with pytest.raises(InsufficientDataError, match=r"home .*in the way: .*pillar"):
