@@ -70,7 +70,7 @@ def test_a_block_says_where_and_at_which_stage_it_acts() -> None:
     }
     for g in blocks():
         assert g.stage in stages[g.where.partition(":")[0].rstrip("0123456789")]
-        assert (g.drive is None) != (g.columns is None)
+        assert (g.direction is None) != (g.columns is None)
 
 
 def test_a_block_scores_as_the_columns_it_stands_for() -> None:
@@ -83,7 +83,7 @@ def test_a_block_scores_as_the_columns_it_stands_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("driver", "where"),
+    ("covariate", "where"),
     [("joint2 angle", "joint5"), ("time", "link3"), ("load × joint3 angle", "joint4")],
 )
 def test_a_planted_dependence_is_told_from_every_other(covariate: str, where: str) -> None:

@@ -12,13 +12,14 @@ from elastocal.diagnosis import (
     DiagnosisData,
     Item,
     ModelSet,
-    away,
     diagnosis_data_of,
     fit_baseline,
     fit_extended,
     fit_set,
+    from_centre,
     is_far,
     possible,
+    prior_deviations,
     relinearised,
 )
 
@@ -50,12 +51,11 @@ def test_the_residual_at_the_exact_fit_is_that_of_the_exact_fit() -> None:
     moved = np.array([x[f"{h.where}.{p.key}"] - p.nominal for p in h.parameters])
     moved[1:3] = 0.0  # the anchor may be anywhere about the joint: it has no size from the example
     explained = fresh.packed(h, np.zeros(0)) @ (moved / fresh.sizes[SPRING])
-    width = fresh.fitted.width
-    beta = np.zeros(len(width))
-    n = len(away(fresh.base))
+    beta = np.zeros(fresh.data.X.shape[2])
+    n = len(from_centre(fresh.base))
     shown = np.abs(exact.model.regressor(exact.observed.table, exact.x).B[:, :n]).max(axis=0) > 0
     assert shown.sum() <= len(beta)
-    beta[: shown.sum()] = (away(fresh.base)[shown]) / width[: shown.sum()]
+    beta[: shown.sum()] = (from_centre(fresh.base) / prior_deviations(fresh.base))[shown]
     left = fresh.data.r - fresh.data.X @ beta - explained
     expected = fresh.blocks.pack(exact.residual.reshape(-1, 3, 1))[:, :, 0]
     np.testing.assert_allclose(left, expected, atol=1e-9)

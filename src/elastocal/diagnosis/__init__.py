@@ -18,7 +18,7 @@ ROOMS = {
         "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"
     ),
     "effect_search": "ForwardSelection SelectedEffects Slot base_score is_far relinearised",
-    "evidence": "EntrySums Grams Prior Scan direct evidence_of scales_of scan",
+    "evidence": "EntrySums Grams Prior Scan direct evidence_of scan",
     "extended_cell": "write_extended_cell",
     "extra_poses": "expected expected_of_random fewest measuring_order plan_extra",
     "hypotheses": (

@@ -14,7 +14,7 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import Grams, scales_of
+from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.model.effects.play import Backlash
@@ -45,7 +45,7 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
         return dataset.changed(other_play=doubt(here, there))
     rows = dataset.columns.rows.copy()
     for h in play:
-        rows[:, :, dataset.columns.places[h.name, h.where]] = under_other.columns.of(h)
+        rows[:, :, dataset.columns.places[h.key]] = under_other.columns.of(h)
     return dataset.changed(
         base=other, columns=replace(dataset.columns, base=other, rows=rows),
         other_play=doubt(there, here),
@@ -63,7 +63,7 @@ def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
     """Play in the joint where it is likeliest, the noise fitted beside it."""
     play = [h for h in dataset.hypotheses if h.name == EFFECT]
     grams = Grams(dataset, dataset.data, project(dataset.data, noise))
-    evidence = [float(grams.of_hypothesis(h).evidence(scales_of(h)).max()) for h in play]
+    evidence = [float(grams.of_hypothesis(h).evidence(h.scales).max()) for h in play]
     likeliest = play[int(np.argmax(evidence))]
     return fit_set(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
 

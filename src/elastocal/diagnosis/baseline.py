@@ -162,6 +162,15 @@ class Baseline:
     planned: int = 0
 
     @property
+    def covariance(self) -> Array:
+        """The noise (N, size, size) that is stated; else only its shape, the residual's variances
+        along the axes."""
+        if self.stated is not None:
+            return self.stated
+        each = self.residual.reshape(-1, self.observed.size)
+        return np.tile(np.diag(np.maximum(each.var(axis=0), 1e-18)), (len(each), 1, 1))
+
+    @property
     def n_measured(self) -> int:
         """Observations that were measured; they come first."""
         return len(self.observed.lead) - self.planned

@@ -199,7 +199,7 @@ def _findings(
                 fall.reduction,
                 fall.ci90,
                 fall.ci95,
-                parameters[what.name, what.where],
+                parameters[what.key],
                 settings_of(chosen.items[k]),
             )
         )

@@ -45,15 +45,15 @@ class ExtraPlan:
     approach direction, time, monuments).
     """
 
+    separable: bool
+    inseparable: tuple[tuple[str, ...], ...]
+    n_poses: int
     rivals: tuple[str, ...]
     pairs: tuple[RivalPair, ...]
     plan: Measurements | None
-    n_poses: int
     probability_before: float
     probability_after: float
     probability_random: float
-    separable: bool
-    inseparable: tuple[tuple[str, ...], ...]
     advice: tuple[str, ...]
 
 
@@ -421,12 +421,12 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
             "noise_floor_um": d.gap.noise_floor * MICRO,
         },
         "budget": [_step(step) for step in d.budget],
-        "effects": [_finding(finding) for finding in d.effects],
-        "candidates": [_candidate(candidate) for candidate in d.candidates],
-        "indistinguishable": [[_place(e) for e in rivals] for rivals in d.indistinguishable],
+        "effects": [_found(effect) for effect in d.effects],
+        "candidates": [vars(candidate) for candidate in d.candidates],
+        "indistinguishable": [[vars(e) for e in rivals] for rivals in d.indistinguishable],
         "location": None if d.location is None else _location(d.location),
         "structure": [vars(test) for test in d.structure],
-        "curves": [_curve(curve) for curve in d.curves],
+        "curves": [vars(curve) for curve in d.curves],
         "noise": _noise(d.noise, model.chain.kinds),
         "untested": [vars(u) for u in d.untested],
         "extra_plan": None if d.extra is None else _extra(d.extra),
@@ -441,62 +441,20 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
 
 
 def _step(step: BudgetStep) -> dict[str, Any]:
-    return {
-        "step": step.step,
-        "heldout_rms_um": step.heldout_rms * MICRO,
-        "ci95": [end * MICRO for end in step.ci95],
-    }
+    ends = [end * MICRO for end in step.ci95]
+    return {"step": step.step, "heldout_rms_um": step.heldout_rms * MICRO, "ci95": ends}
 
 
-def _place(e: EffectAt | FoundEffect | Candidate) -> dict[str, Any]:
-    return {"effect": e.effect, "where": e.where}
+def _found(f: FoundEffect) -> dict[str, Any]:
+    def ends(p: FittedParameter) -> list[float]:
+        return [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]
 
-
-def _finding(f: FoundEffect) -> dict[str, Any]:
-    return _place(f) | {
-        "probability": f.probability,
-        "gap_reduction": f.gap_reduction,
-        "gap_reduction_ci90": f.gap_reduction_ci90,
-        "gap_reduction_ci95": f.gap_reduction_ci95,
-        "parameters": [
-            {
-                "name": p.name,
-                "value": p.value,
-                "unit": p.unit,
-                "std": p.std,
-                "ci95": [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std],
-            }
-            for p in f.parameters
-        ],
-        "settings": f.settings,
-    }
-
-
-def _candidate(c: Candidate) -> dict[str, Any]:
-    return _place(c) | {
-        "stage": c.stage,
-        "probability": c.probability,
-        "score": c.score,
-        "detectable": c.detectable,
-        "settings": c.settings,
-    }
+    return vars(f) | {"parameters": [vars(p) | {"ci95": ends(p)} for p in f.parameters]}
 
 
 def _location(location: Location) -> dict[str, Any]:
-    return {
-        "stage": location.stage,
-        "where": location.where,
-        "probability": location.probability,
-        "evidence": {
-            "stages": location.stages,
-            "places": location.places,
-            "drivers": location.drivers,
-        },
-    }
-
-
-def _curve(c: Curve) -> dict[str, Any]:
-    return vars(c) | {name: list(getattr(c, name)) for name in ("x", "y", "sd")}
+    out = dict(vars(location))
+    return out | {"evidence": {key: out.pop(key) for key in ("stages", "places", "drivers")}}
 
 
 def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
@@ -505,12 +463,8 @@ def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
         "stated_factor": noise.stated_factor,
         "reading_sigma_um": noise.reading_sigma * MICRO,
         "repeatability": [
-            {
-                "where": f"joint{i + 1}",
-                "value": value,
-                "unit": "rad" if kind == "revolute" else "m",
-            }
-            for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
+            {"where": f"joint{i}", "value": value, "unit": "rad" if kind == "revolute" else "m"}
+            for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True), 1)
         ],
         "shared": noise.shared,
         "pure_error_um": None if noise.pure_error is None else noise.pure_error * MICRO,
@@ -520,23 +474,11 @@ def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
 
 def _faulty(reading: FaultyReading) -> dict[str, Any]:
     return {
-        "line": reading.line,
-        "configuration": reading.configuration,
-        "marker": reading.marker,
-        "error_um": reading.error * MICRO,
-        "sigmas": reading.sigmas,
+        "error_um" if key == "error" else key: value * MICRO if key == "error" else value
+        for key, value in vars(reading).items()
     }
 
 
 def _extra(extra: ExtraPlan) -> dict[str, Any]:
-    return {
-        "separable": extra.separable,
-        "inseparable": [list(group) for group in extra.inseparable],
-        "n_poses": extra.n_poses,
-        "rivals": list(extra.rivals),
-        "pairs": [vars(pair) for pair in extra.pairs],
-        "probability_before": extra.probability_before,
-        "probability_after": extra.probability_after,
-        "probability_random": extra.probability_random,
-        "advice": list(extra.advice),
-    }
+    content = {key: value for key, value in vars(extra).items() if key != "plan"}
+    return content | {"pairs": [vars(pair) for pair in extra.pairs]}

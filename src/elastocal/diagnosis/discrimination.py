@@ -192,11 +192,7 @@ def campaign_of(
     """
     table = base.observed.table
     observed = observe(joined(table, pool.table), base.model.observe)
-    n, size = len(base.observed.lead), observed.size
-    stated = base.stated
-    if stated is None:
-        spread = base.residual.reshape(n, size).var(axis=0)
-        stated = np.tile(np.diag(np.maximum(spread, 1e-18)), (n, 1, 1))
+    n, size, stated = len(base.observed.lead), observed.size, base.covariance
     marker = table.marker[base.observed.lead]
     usual = np.zeros((len(table.marker_names), size, size))
     usual[:] = stated.mean(axis=0)

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Prior, Scan, exceedance, scan
-from elastocal.diagnosis.hypotheses import Hypothesis, is_driven
+from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_extended, fit_set, refine, signal_of
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
 from elastocal.diagnosis.unknown import Generic
@@ -119,7 +119,7 @@ def _direct(chosen: ModelSet) -> list[int]:
     return [
         k
         for k, item in enumerate(chosen.items)
-        if isinstance(item.what, Hypothesis) and not is_driven(item.what)
+        if isinstance(item.what, Hypothesis) and not item.what.driven
     ]
 
 

@@ -32,18 +32,18 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     The statistic is the largest evidence among the driver's blocks; its distribution without
     structure comes from flipping the signs of whole configurations.
     """
-    if not observed.driver_flips:
+    if not observed.covariate_flips:
         return ()
-    largest = np.max(list(observed.driver_flips.values()), axis=0)
+    largest = np.max(list(observed.covariate_flips.values()), axis=0)
     tests = [
         StructureTest(
             driver,
-            exceedance(observed.driver_flips[driver], odds),
+            exceedance(observed.covariate_flips[driver], odds),
             exceedance(largest, odds),
         )
-        for driver, odds in observed.driver_odds.items()
+        for driver, odds in observed.covariate_odds.items()
     ]
-    order = sorted(tests, key=lambda t: (t.p_family, t.p_value, -observed.driver_odds[t.driver]))
+    order = sorted(tests, key=lambda t: (t.p_family, t.p_value, -observed.covariate_odds[t.driver]))
     return tuple(order)
 
 
@@ -89,11 +89,11 @@ def curves_of(dataset: DiagnosisData, chosen: ModelSet) -> tuple[Curve, ...]:
         block = item.what
         if isinstance(block, Hypothesis) or block.source is None or block.source.values is None:
             continue
-        assert block.drive is not None and block.entry is not None
+        assert block.direction is not None and block.entry is not None
         there = dataset.present
         x = block.source.values[there]
-        motion = block.drive[there] @ at.beta[span]  # (visits, d)
-        half = block.drive[there] @ at.beta_deviation.T[span]
+        motion = block.direction[there] @ at.beta[span]  # (visits, d)
+        half = block.direction[there] @ at.beta_deviation.T[span]
         deviation = np.linalg.norm(half, axis=2)
         _, order = np.unique(x, return_index=True)
         d = motion.shape[1]
@@ -156,11 +156,11 @@ def budget(
 
 
 def _left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | None:
-    time, cell = dataset.base.observed.table.time, dataset.base.model.cell
+    time, cell = dataset.table.time, dataset.base.model.cell
     known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
     if time is None or not any("time" in what.effect.needed(cell) for what in known):
         return None
-    return blocks_of_time(dataset.blocks, time[dataset.base.observed.lead])
+    return blocks_of_time(dataset.blocks, time[dataset.lead])
 
 
 def _step(
@@ -179,7 +179,7 @@ def _step(
 
 def _fitted_steps(dataset: DiagnosisData) -> list[tuple[str, NoisyData]]:
     """The model's own effects, stage by stage, those of the later step held at nominal."""
-    stage = np.array([stage_of(effect) for effect in dataset.fitted.effect])
+    stage = np.array([stage_of(effect) for effect in dataset.fitted])
     steps = []
     for k, name in ((1, "geometry"), (2, "compliance")):
         if not (stage == k).any():

@@ -188,6 +188,11 @@ class Projection:
     marginal: float
     factor: Array
 
+    @property
+    def P(self) -> Array:
+        """P (C, m, m) of each configuration by itself."""
+        return self.inverse - self.H @ self.H.transpose(0, 2, 1)
+
     @cached_property
     def spread(self) -> tuple[Array, Array]:
         """V⁻¹e and Hᵀe, (C, m) and (C, p), of residuals e that scatter as the noise does.
@@ -195,8 +200,7 @@ class Projection:
         The fit's own residuals are too small, its leverage less than V: u_c has the covariance
         P_cc, so e_c = V_c^½ P_cc^−½ u_c has V_c (Bell and McCaffrey 2002).
         """
-        P = self.inverse - self.H @ self.H.transpose(0, 2, 1)
-        e = _power(self.inverse, -0.5) @ (_power(P, -0.5) @ self.u[..., None])
+        e = _power(self.inverse, -0.5) @ (_power(self.P, -0.5) @ self.u[..., None])
         return (self.inverse @ e)[..., 0], (self.H.transpose(0, 2, 1) @ e)[..., 0]
 
     @property

@@ -19,7 +19,6 @@ from elastocal.diagnosis.model_set import (
     Item,
     distances,
     fit_set,
-    item_key,
     packed_columns,
     settings_to_try,
     with_items,
@@ -106,7 +105,7 @@ class Suspects:
 
     def __init__(self, model: Model, table: Measurements, diagnosis: Diagnosis) -> None:
         self.diagnosis = diagnosis
-        known = {(h.name, h.where): h for h in possible(model, table)[0]}
+        known = {h.key: h for h in possible(model, table)[0]}
         self._items: dict[tuple[str, str], Item] = {}
         self._probability: dict[tuple[str, str], float] = {}
         for c in diagnosis.candidates:
@@ -162,7 +161,7 @@ class Suspects:
     def _rivals(self) -> list[tuple[str, str]]:
         """The known rivals, and what is at work beside them."""
         items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
-        keys = [item_key(item) for item in items] + self._found
+        keys = [item.key for item in items] + self._found
         return keys + self._likeliest() if self.unknown else keys
 
     @property
@@ -260,7 +259,7 @@ def with_neighbours(
         for rival in s.rivals:
             found = distances(dataset, fit_set(dataset, (rival, *s.beside), noise), 0)[1]
             near |= {key: min(near[key], d) for key, d in found.items()}
-        taken = {item_key(item) for item in (*s.rivals, *s.beside)}
+        taken = {item.key for item in (*s.rivals, *s.beside)}
         free = [
             key
             for key, (_, p) in known.items()
@@ -270,7 +269,7 @@ def with_neighbours(
         rivals = [*s.rivals, *(known[key][0] for key in free)]
         # Those named have their probability given that there is something, as these need, too.
         something = max(1 - diagnosis.probability_nothing, 1e-9)
-        named = [known[item_key(item)][1] for item in s.rivals]
+        named = [known[item.key][1] for item in s.rivals]
         p = [*named, *(known[key][1] / something for key in free)]
         out.append(RivalSet.of(rivals, p, s.beside))
     return tuple(out)

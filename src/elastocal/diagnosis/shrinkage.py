@@ -13,10 +13,10 @@ from scipy import linalg
 from elastocal.diagnosis.backlash_model import EFFECT, under_other_law
 from elastocal.diagnosis.baseline import Baseline, Blocks, visits
 from elastocal.diagnosis.diagnosis import FittedParameter
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, away, widths
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, from_centre, prior_deviations
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, is_driven
+from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
@@ -54,8 +54,7 @@ def left_out_residual(at: Projection, together: IntArray | None = None) -> Array
         P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
     """
     if together is None:
-        P = at.inverse - at.H @ at.H.transpose(0, 2, 1)
-        return np.asarray(np.linalg.solve(P, at.u[..., None])[..., 0])
+        return np.asarray(np.linalg.solve(at.P, at.u[..., None])[..., 0])
     Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
     out = Vu[..., 0]
     for g in np.unique(together):
@@ -339,13 +338,12 @@ class Linear:
         """`prior` holds standard deviations of parameters by name, where they are not wide; `at`
         spares evaluating the model at the fit."""
         observed = base.observed
-        known = prior or {}
-        names = base.model.names
-        width = np.array([known.get(n, w) for n, w in zip(names, widths(base), strict=True)])
+        wide = dict(zip(base.model.names, prior_deviations(base), strict=True))
+        width = np.array([(prior or {}).get(name, wide[name]) for name in wide])
         at = at or base.model.regressor(observed.table, base.x, observations=observed)
         B = at.B * width
-        residual = at.residual + B @ (away(base) / width)
-        centre = base.x - away(base)
+        residual = at.residual + B @ (from_centre(base) / width)
+        centre = base.x - from_centre(base)
         if further is not None:
             k = further.shape[1]
             B, width = np.hstack([B, further]), np.append(width, np.ones(k))
@@ -390,10 +388,10 @@ def other_settings(dataset: DiagnosisData, chosen: ModelSet, k: int) -> list[tup
     """
     item = chosen.items[k]
     what = item.what
-    if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
+    if not isinstance(what, Hypothesis) or not what.driven or not what.settings:
         return [(item, 1.0)]
     data = beside(dataset, chosen, k)
-    grid = dataset.grids[what.name, what.where]
+    grid = dataset.grids[what.key]
     grams = Grams(dataset, data, project(data, chosen.noise))
     own = float(grams.of_hypothesis(what, item.settings[None]).evidence(item.scales)[0])
     each = grams.of_hypothesis(what).evidence(item.scales)
@@ -415,7 +413,7 @@ def between_visits(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Change:
     off by the whole change.  Nothing for effects that do not change once.
     """
     what = chosen.items[k].what
-    time = dataset.base.observed.table.time
+    time = dataset.table.time
     kinds = [s.kind for s in what.settings] if isinstance(what, Hypothesis) else []
     if "change_time" not in kinds or time is None:
         return Change()
@@ -584,7 +582,7 @@ class Confirmation:
         out = {}
         for item, scale in zip(true.items, true.scales, strict=True):
             if isinstance(item.what, Hypothesis):
-                size = self.dataset.sizes[item.what.name, item.what.where] * max(scale, 1.0)
+                size = self.dataset.sizes[item.what.key] * max(scale, 1.0)
                 for p, s in zip(item.what.parameters, size, strict=True):
                     out[f"{item.what.where}.{p.key}"] = float(s)
         return out
@@ -600,7 +598,7 @@ class Confirmation:
         for s, setting in enumerate(what.settings):
             if setting.kind == "change_time":
                 continue
-            grid = self.dataset.grids[what.name, what.where]
+            grid = self.dataset.grids[what.key]
             step = float(grid.step[grid.nearest(item.settings), s])
             # At a bound, where the search may well end, the quotient is one-sided.
             near = item.settings[s] + NUDGE * step * np.array([1.0, -1.0])

@@ -11,7 +11,7 @@ from elastocal.diagnosis.diagnosis import Candidate, EffectAt, Untested, Verdict
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, OutlierScreening
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, distances, item_key
+from elastocal.diagnosis.model_set import Item, distances
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
@@ -44,7 +44,7 @@ class Answer:
 
 def _named(item: Item) -> tuple[str, str]:
     """(effect, place); a block without a name is an unknown effect at its place."""
-    return item_key(item) if item.known else (UNKNOWN_EFFECT, item.what.where)
+    return item.key if item.known else (UNKNOWN_EFFECT, item.what.where)
 
 
 def judge(found: SelectedEffects) -> Answer:
@@ -85,7 +85,7 @@ def _of_item(
         for i, other in enumerate(slot.items)
         if isinstance(other.what, Hypothesis)
         and id(other.what) not in taken
-        and near[item_key(other)] < ALIKE
+        and near[other.key] < ALIKE
     ]
     # More than so many are no answer; the others stand among the candidates.
     alike = sorted(alike, key=lambda i: -each[i])[: LARGEST_SET - 1]
@@ -128,8 +128,7 @@ def candidates(
     """Every hypothesis with its probability: in the slot where it is likeliest."""
     best: dict[tuple[str, str], Candidate] = {}
     distance = {
-        (h.name, h.where): s.distance
-        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+        h.key: s.distance for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
     }
     for k, slot in enumerate(found.slots):
         rivals = answer.rivals[k] if k < len(answer.rivals) else ()
@@ -141,7 +140,7 @@ def candidates(
                 continue
             settings = {s.key: float(v) for s, v in zip(what.settings, item.settings, strict=True)}
             probability = named.get(id(what), float(p))
-            key = what.name, what.where
+            key = what.key
             row = Candidate(
                 what.name, what.where, what.stage, probability, float(score),
                 distance[key], settings,
@@ -188,7 +187,7 @@ def warnings(
         )
     kept = np.flatnonzero(screened.suspects)
     if len(kept) > SUSPECT_SHARE * len(screened.suspects):
-        lines = dataset.base.observed.table.row[dataset.base.observed.lead[kept]]
+        lines = dataset.table.row[dataset.lead[kept]]
         out.append(
             f"{len(kept)} of {len(screened.suspects)} readings (lines {lines.min()} to "
             f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
@@ -196,7 +195,7 @@ def warnings(
         )
     if text := _undecided_play(found):
         out.append(text)
-    if dataset.base.observed.table.time is None:
+    if dataset.table.time is None:
         out.append("without times neither drifts nor jumps can be seen: record time_s")
     return tuple(out)
 

@@ -26,9 +26,9 @@ from elastocal.diagnosis import (
     imitations,
     joined,
     possible,
+    prior_deviations,
     rows_of,
     visit_pool_of,
-    widths,
 )
 from elastocal.diagnosis.discrimination import DRAWS
 from elastocal.diagnosis.rivals import SETTINGS
@@ -100,7 +100,7 @@ def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Ar
     x = np.array([fitted.get(p.name, 0.0) for p in whole.parameters])
     B = whole.regressor(table, x).B
     of = {key: [i for i, p in enumerate(whole.parameters) if p.effect == key[0]] for key in RIVALS}
-    X = B[:, [whole.names.index(name) for name in model.names]] * widths(base)
+    X = B[:, [whole.names.index(name) for name in model.names]] * prior_deviations(base)
     # Five times the widest of the size prior, as large as the verdict lets a rival be.
     widest = np.array([15 * whole.parameters[i].typical for i in of[RIVALS[b]]])
     Z = np.hstack([X, B[:, of[RIVALS[b]]] * widest])
