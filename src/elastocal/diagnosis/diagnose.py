@@ -18,12 +18,20 @@ from elastocal.diagnosis.diagnosis_data import (
 )
 from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
-from elastocal.diagnosis.gap import budget, curves_of, location, structure_tests
 from elastocal.diagnosis.hypotheses import Hypothesis, model_keys, possible, with_recorded_drivers
 from elastocal.diagnosis.model_set import settings_of
-from elastocal.diagnosis.shrinkage import Confirmation, between_visits, refit, shrinkage
+from elastocal.diagnosis.shrinkage import Confirmation, between_visits, budget, refit, shrinkage
 from elastocal.diagnosis.unknown import generic_blocks
-from elastocal.diagnosis.verdict import Answer, candidates, judge, too_small, warnings
+from elastocal.diagnosis.verdict import (
+    Answer,
+    candidates,
+    curves_of,
+    judge,
+    location,
+    structure_tests,
+    too_small,
+    warnings,
+)
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,7 +12,7 @@ from scipy import linalg
 
 from elastocal.diagnosis.backlash_model import EFFECT, under_other_law
 from elastocal.diagnosis.baseline import Baseline, Blocks, visits
-from elastocal.diagnosis.diagnosis import FittedParameter
+from elastocal.diagnosis.diagnosis import FittedParameter, Gap
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, from_centre, prior_deviations
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Grams
@@ -25,6 +25,7 @@ from elastocal.diagnosis.model_set import (
     fit_extended,
     fit_set,
     signal_of,
+    with_items,
 )
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
@@ -34,8 +35,9 @@ from elastocal.diagnosis.noise_floor import (
     noise_draws,
     project,
 )
-from elastocal.identification.error_budget import resampled_rms
+from elastocal.identification.error_budget import BudgetStep, resampled_rms, stage_of
 from elastocal.measurements import Measurements
+from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, IntArray
@@ -102,6 +104,69 @@ def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
     part = variance.reshape(C, M, blocks.size)[:, :, : min(blocks.size, 3)]
     used = ~data.left_out.reshape(C, M, blocks.size)[:, :, 0]
     return float(np.sqrt(part.sum() / used.sum()))
+
+
+# The gap, step by step: from the nominal arm through the fitted effects to the noise floor.
+
+
+def budget(
+    dataset: DiagnosisData, found: SelectedEffects, rng: np.random.Generator
+) -> tuple[Gap, tuple[BudgetStep, ...]]:
+    """Held-out 3-D errors of each step, and the gap they add up to.
+
+    `dataset` is about the fit without further effects.  Where an effect goes with time, what is
+    left out are tenths of the time: between neighbours a drift needs no model.
+    """
+    nothing, chosen = found.nothing, found.chosen
+    together = _left_out_together(dataset, chosen)
+    # The nominal arm, base and markers placed, as the baseline left it.
+    placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
+    steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
+    steps += [_step(name, data, nothing, together, rng) for name, data in _fitted_steps(dataset)]
+    known = [k for k, item in enumerate(chosen.items) if item.known]
+    for n, last in enumerate(known, 1):
+        items, scales = (tuple(of[k] for k in known[:n]) for of in (chosen.items, chosen.scales))
+        data = with_items(found.dataset, items, scales)
+        name = ":".join(chosen.items[last].key)
+        steps.append(_step(name, data, chosen, together, rng))
+    # Where the noise model does not fit, the readings still say what scatter they leave.
+    left = rms_with_interval(chosen.data, left_out_residual(chosen.at, together), rng)[0]
+    floor = min(noise_rms(chosen.data, chosen.noise), left)
+    calibrated = steps[len(steps) - len(known) - 1].heldout_rms
+    nominal = steps[0].heldout_rms
+    gap = Gap(nominal, calibrated, steps[-1].heldout_rms, floor)
+    unknown = [item.what.where for item in chosen.items if not item.known]
+    if unknown:
+        # What a smooth curve without a name takes away: no explanation, but how much is at stake.
+        steps.append(_step("unknown:" + "+".join(unknown), chosen.data, chosen, together, rng))
+    return gap, (*steps, BudgetStep("noise_floor", floor, (floor, floor)))
+
+
+def _left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | None:
+    time, cell = dataset.table.time, dataset.base.model.cell
+    known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
+    if time is None or not any("time" in what.effect.needed(cell) for what in known):
+        return None
+    return blocks_of_time(dataset.blocks, time[dataset.lead])
+
+
+def _step(
+    name: str, data: NoisyData, fitted: ModelSet, together: IntArray | None,
+    rng: np.random.Generator,
+) -> BudgetStep:  # fmt: skip
+    # Weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
+    # effect is that effect, and weights by it would spare it.
+    residual = left_out_residual(project(data, fitted.noise.of_instrument()), together)
+    return BudgetStep(name, *rms_with_interval(data, residual, rng))
+
+
+def _fitted_steps(dataset: DiagnosisData) -> Iterator[tuple[str, NoisyData]]:
+    """The model's own effects, stage by stage, those of the later step held at nominal."""
+    stage, data = np.array([stage_of(effect) for effect in dataset.fitted]), dataset.data
+    for k, name in ((1, "geometry"), (2, "compliance")):
+        if (stage == k).any():
+            free = stage <= k
+            yield name, replace(data, X=data.X[:, :, free], precision=data.precision[free])
 
 
 # How far the gap shrinks on poses that had no part in choosing or fitting the effect.

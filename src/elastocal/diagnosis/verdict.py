@@ -1,17 +1,27 @@
-"""From scores to an answer, with everything that was tried, best first."""
+"""What scores mean: the answer, where the gap lies, everything that was tried, best first."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
 
 from elastocal.diagnosis.backlash_model import EFFECT
-from elastocal.diagnosis.diagnosis import Candidate, EffectAt, Untested, Verdict
+from elastocal.diagnosis.diagnosis import (
+    Candidate,
+    Curve,
+    EffectAt,
+    Location,
+    StructureTest,
+    Untested,
+    Verdict,
+)
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, OutlierScreening
 from elastocal.diagnosis.effect_search import SelectedEffects
+from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, distances
+from elastocal.diagnosis.model_set import Item, ModelSet, distances
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
@@ -111,6 +121,81 @@ def _of_item(
             chosen.append(int(i))
     chosen = [own, *sorted(chosen[1:], key=lambda i: -p[i])]
     return float(p[own]), tuple((slot.items[i], float(p[i])) for i in chosen)
+
+
+# Where the gap lies: stage, place, and what the residual depends on, whatever the effect.
+
+
+def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
+    """One test per covariate, most telling first; none names an effect.
+
+    The statistic is the largest evidence among the covariate's blocks; its distribution without
+    structure comes from flipping the signs of whole configurations.
+    """
+    if not observed.covariate_flips:
+        return ()
+    largest = np.max(list(observed.covariate_flips.values()), axis=0)
+    odds, flips = observed.covariate_odds, observed.covariate_flips
+    tests = [
+        StructureTest(c, exceedance(flips[c], odds[c]), exceedance(largest, odds[c])) for c in odds
+    ]
+    return tuple(sorted(tests, key=lambda t: (t.p_family, t.p_value, -odds[t.driver])))
+
+
+def location(found: SelectedEffects, tests: tuple[StructureTest, ...]) -> Location | None:
+    """Probabilities of stage and place, from all that could stand in the place of the unknown
+    effect, or of the first one found."""
+    items = found.chosen.items
+    if not items:
+        return None
+    own = next((k for k, item in enumerate(items) if not item.known), 0)
+    slot = found.slots[own]
+    each, _ = slot.probabilities()
+    stages: dict[str, float] = defaultdict(float)
+    places: dict[str, float] = defaultdict(float)
+    for item, p in zip(slot.items, each / max(float(each.sum()), 1e-300), strict=True):
+        stages[item.what.stage] += float(p)
+        places[item.what.where] += float(p)
+    what = items[own].what
+    shown = {t.driver: t.p_value for t in tests}
+    return Location(
+        what.stage, what.where, places.get(what.where, 0.0), _sorted(stages), _sorted(places), shown
+    )
+
+
+def _sorted(shares: dict[str, float]) -> dict[str, float]:
+    return {k: v for k, v in sorted(shares.items(), key=lambda kv: -kv[1]) if v > 1e-6}
+
+
+# The shape of a dependence that has no name: the motion as a function of what drives it.
+
+MOST_CURVES = 3
+TRANSLATIONS = ((" x", "m"), (" y", "m"), (" z", "m"))
+TURNS = ((" rx", "rad"), (" ry", "rad"), (" rz", "rad"))
+COMPONENTS = {1: (("", "rad"),), 3: TRANSLATIONS, 6: TRANSLATIONS + TURNS}  # name and unit
+
+
+def curves_of(dataset: DiagnosisData, chosen: ModelSet) -> tuple[Curve, ...]:
+    """Curves of the unknown blocks that depend on one number, the largest components first."""
+    at = chosen.at
+    out: list[Curve] = []
+    for item, span in zip(chosen.items, chosen.spans, strict=True):
+        block = item.what
+        if isinstance(block, Hypothesis) or block.source is None or block.source.values is None:
+            continue
+        assert block.direction is not None
+        x, direction = block.source.values[dataset.present], block.direction[dataset.present]
+        motion = direction @ at.beta[span]  # (visits, d)
+        deviation = np.linalg.norm(direction @ at.beta_deviation.T[span], axis=2)
+        _, order = np.unique(x, return_index=True)
+        largest = np.argsort(-(motion.std(axis=0) / deviation.mean(axis=0)))
+        for k in largest[:MOST_CURVES]:
+            name, unit = COMPONENTS[motion.shape[1]][k]
+            y = motion[order, k]
+            xyd = (tuple(v.tolist()) for v in (x[order], y - y.mean(), deviation[order, k]))
+            entry = f"{block.where}{name}"
+            out.append(Curve(block.covariate, block.source.unit, entry, unit, *xyd))
+    return tuple(out)
 
 
 # Everything that was tried, best first; what could not be tested; what to beware of.
