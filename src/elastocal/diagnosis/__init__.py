@@ -11,8 +11,8 @@ ROOMS = {
         "FoundEffect Gap Location NoiseFloor RivalPair StructureTest Untested publish"
     ),
     "diagnosis_data": (
-        "DiagnosisData OutlierScreening away describe_faulty diagnosis_data_of reading_errors "
-        "screen_outliers widths"
+        "DiagnosisData OutlierScreening describe_faulty diagnosis_data_of from_centre "
+        "prior_deviations reading_errors screen_outliers"
     ),
     "discrimination": (
         "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"

@@ -15,6 +15,7 @@ from scipy.stats import norm
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.hypotheses import with_keys
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.model.effects.play import Backlash
@@ -54,9 +55,7 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
 
 def under_other_law(model: Model) -> Model:
     """The model with play under the law that it does not have."""
-    spec = model.cell.model
-    spec = replace(spec, play_side=LAWS[spec.play_side])  # type: ignore[arg-type]
-    return Model.assembled(model.chain, replace(model.cell, model=spec))
+    return with_keys(model, play_side=LAWS[model.cell.model.play_side])
 
 
 def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:

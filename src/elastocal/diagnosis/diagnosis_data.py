@@ -108,13 +108,15 @@ class DiagnosisData:
     @cached_property
     def sizes(self) -> dict[tuple[str, str], Array]:
         """Typical size of every hypothesis' parameters, by effect and place."""
-        return {h.key: self._sizes(h) for h in self.hypotheses}
+        return {
+            h.key: np.array([p.typical or 0.0 for p in h.parameters]) if h.driven
+            else self.sizes_in(h, self.columns.of(h))
+            for h in self.hypotheses
+        }  # fmt: skip
 
-    def _sizes(self, h: Hypothesis) -> Array:
-        if h.driven:
-            return np.array([p.typical or 0.0 for p in h.parameters])
-        measured = self.columns.observed(self.columns.of(h))[: self.base.n_measured]
-        return typical_sizes(h, measured)
+    def sizes_in(self, h: Hypothesis, rows: Array) -> Array:
+        """Its typical sizes by columns (n_rows, size, k), what is only planned not counted."""
+        return typical_sizes(h, self.columns.observed(rows)[: self.base.n_measured])
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
