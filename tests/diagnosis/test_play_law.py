@@ -23,7 +23,7 @@ from elastocal.diagnosis import (
     fit_baseline,
     fit_set,
     possible,
-    under_other_law,
+    under_other_backlash_model,
     warnings,
     with_likelier_backlash_model,
     with_recorded_drivers,
@@ -77,14 +77,14 @@ def test_play_in_the_cell_keeps_its_law() -> None:
 def set_of(law: str, told: DiagnosisData) -> ModelSet:
     model = told.base.model
     if model.cell.model.play_side != law:
-        model = under_other_law(model)
+        model = under_other_backlash_model(model)
     under = diagnosis_data_of(replace(told.base, model=model), list(told.hypotheses))
     (play,) = [h for h in under.hypotheses if (h.name, h.where) == PLAY.key]
     return fit_set(under, (Item(play, np.zeros(0), 0.0),), told.noise)
 
 
 def test_a_few_readings_in_the_dead_zone_leave_less_doubt_of_the_law() -> None:
-    assert with_likelier_backlash_model(dataset("load_and_approach")).other_play < 0.25
+    assert with_likelier_backlash_model(dataset("load_and_approach")).other_backlash < 0.25
 
 
 def test_laws_that_say_the_same_are_as_likely() -> None:
@@ -104,7 +104,7 @@ def test_one_configuration_alone_does_not_settle_the_law() -> None:
 
 @pytest.mark.parametrize(("doubt_of_it", "told"), [(0.05, False), (0.5, True)])
 def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool) -> None:
-    one = replace(with_likelier_backlash_model(dataset("load")), other_play=doubt_of_it)
+    one = replace(with_likelier_backlash_model(dataset("load")), other_backlash=doubt_of_it)
     (play,) = [h for h in one.hypotheses if (h.name, h.where) == PLAY.key]
     plain = fit_set(one, ())
     nothing: Scan = None  # type: ignore[assignment]
@@ -117,7 +117,7 @@ def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool)
 
 def test_play_by_either_law_may_be_true_at_fresh_poses() -> None:
     """As probable as each law is; nothing else is drawn under another law."""
-    told = replace(with_likelier_backlash_model(dataset("load")), other_play=0.3)
+    told = replace(with_likelier_backlash_model(dataset("load")), other_backlash=0.3)
     (play,) = [h for h in told.hypotheses if (h.name, h.where) == PLAY.key]
     item = Item(play, np.zeros(0), 0.0)
     plain, chosen = fit_set(told, ()), fit_set(told, (item,))

@@ -3,7 +3,7 @@
 from elastocal import loaded_on_demand
 
 ROOMS = {
-    "backlash_model": "doubt under_other_law with_likelier_backlash_model",
+    "backlash_model": "doubt under_other_backlash_model with_likelier_backlash_model",
     "baseline": "Baseline Blocks VisitPlaces fit_baseline made_once thinned",
     "diagnose": "DiagnosisOptions",
     "diagnosis": (
@@ -33,7 +33,7 @@ ROOMS = {
         "NoiseValues NoisyData Weighted covariance fit_noise likelihood log_prior noise_draws "
         "posterior project"
     ),
-    "rivals": "RivalSet Suspects imitations with_neighbours",
+    "rivals": "RivalSet Suspects alternatives with_neighbours",
     "shrinkage": (
         "Change Confirmation PosteriorDraw blocks_of_time left_out_residual new_pose_table "
         "noise_rms rms_with_interval squared_lengths"

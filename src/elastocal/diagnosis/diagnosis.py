@@ -64,8 +64,8 @@ Interval = tuple[float, float]
 
 # A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
 # Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
-SEEN, FAINTEST = 5.0, 3.0
-STRUCTURE = 0.05  # family-wise p-value from which on a driver is told
+VISIBLE, FAINTEST = 5.0, 3.0
+STRUCTURE = 0.05  # family-wise p-value up to which the dependence on a covariate is told
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class FoundEffect:
     """An effect held to be real (or, where the verdict is ambiguous, the likeliest of a set).
 
     `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
-    the 3-D error of noise-free fresh poses falls when the effect joins the model, with 90 and 95 %
+    the 3-D error of noise-free new poses falls when the effect joins the model, with 90 and 95 %
     intervals.  `settings` are its searched constants (orders, times) by their keys.
     """
 
@@ -125,12 +125,12 @@ class Candidate:
     @property
     def seen_from(self) -> float:
         """The size, in typical sizes, from which it would have been seen."""
-        return SEEN / self.detectable if self.detectable > 0 else math.inf
+        return VISIBLE / self.detectable if self.detectable > 0 else math.inf
 
     @property
     def visible(self) -> bool:
         """Whether it would have shown at its typical size."""
-        return self.detectable >= SEEN
+        return self.detectable >= VISIBLE
 
     @property
     def hidden(self) -> bool:
@@ -160,11 +160,11 @@ class Gap:
 
 @dataclass(frozen=True)
 class StructureTest:
-    """Does the residual depend on `driver` at all?  Names no effect.
+    """Does the residual depend on the covariate `driver` at all?  Names no effect.
 
-    `driver` is "joint2 angle", "joint3 torque", "time", "load", "approach of joint1", ….
-    `p_value` by sign flips of whole configurations, for the largest statistic of the driver's
-    tests; `p_family` the same against the largest over all drivers.
+    It is "joint2 angle", "joint3 torque", "time", "load", "approach of joint1", ….  `p_value` by
+    sign flips of whole configurations, for the largest statistic of the covariate's tests;
+    `p_family` the same against the largest over all covariates.
     """
 
     driver: str
@@ -174,7 +174,8 @@ class StructureTest:
 
 @dataclass(frozen=True)
 class Curve:
-    """The shape of an unknown dependence: motion of `entry` as a smooth function of `driver`.
+    """The shape of an unknown dependence: motion of `entry` as a smooth function of a covariate,
+    `driver`.
 
     `x` in `x_unit` over the measured range, `y` and its standard deviation `sd` in `y_unit`.
     One curve per component of the entry that moves.
@@ -302,7 +303,7 @@ class Diagnosis(Result):
 
     @property
     def dependences(self) -> tuple[StructureTest, ...]:
-        """Drivers that the residual depends on, the most conspicuous first."""
+        """Covariates that the residual depends on, the most conspicuous first."""
         found = [t for t in self.structure if t.p_family <= STRUCTURE]
         return tuple(sorted(found, key=lambda t: t.p_family))
 
@@ -315,7 +316,7 @@ class Diagnosis(Result):
         readings and loads per configuration only make smaller effects visible.
         """
         independent = 3 * self.n_configurations
-        return SEEN * self.gap.noise_floor / math.sqrt(independent) if independent else math.nan
+        return VISIBLE * self.gap.noise_floor / math.sqrt(independent) if independent else math.nan
 
     @property
     def findings(self) -> tuple[Finding, ...]:

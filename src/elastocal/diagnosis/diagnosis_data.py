@@ -49,7 +49,7 @@ class DiagnosisData:
     `data` holds the residual at the prior's centre, linearised at the fit, the fitted columns
     (scaled to their prior deviations) and noise shapes; `fitted` names the effect of each of these
     columns, `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a
-    load.  `other_play` is the probability that play follows the backlash model that the base's
+    load.  `other_backlash` is the probability that play follows the backlash model that the base's
     model does not have.
     """
 
@@ -59,7 +59,7 @@ class DiagnosisData:
     data: NoisyData
     fitted: tuple[str, ...]
     load_point: Array | None = None
-    other_play: float = 0.0
+    other_backlash: float = 0.0
     _packed: dict[EntryKey | tuple[str, str], Array] = field(init=False, default_factory=dict)
     _kept: dict[tuple[str, str, bytes], Array] = field(init=False, default_factory=dict)
 
@@ -271,7 +271,7 @@ def _load_hypotheses(base: Baseline) -> list[Hypothesis]:
 
 ROUNDS = 20
 LEVEL = 0.01  # chance that any of all good readings is taken for faulty
-MOST = 0.1  # share of readings beyond which "faulty" is no accident of measuring
+MOST = 0.1  # share of readings from which on "faulty" is no accident of measuring
 RUN = 3  # so many neighbours in a row, of one marker, are no accident either
 ACCIDENT = 1e-3  # chance below which suspects stand together by more than accident
 

@@ -22,12 +22,12 @@ from elastocal.diagnosis.noise_floor import NoiseValues, covariance
 from elastocal.diagnosis.rivals import (
     RivalSet,
     Suspects,
+    alternatives,
     columns_of_starts,
-    imitations,
     left_out,
     noise_found,
 )
-from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
+from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -208,7 +208,7 @@ class WhitenedRows:
     `gram` (w, w) = Wᵀ V⁻¹ W of the data so far, with the nuisance's prior precision; `pool`
     (N, m, w) = V^−½ W of each candidate; `response` (w,) = Wᵀ V⁻¹ r.  Columns W: the `nuisance`
     first ones are those of the fitted parameters and of the effects beside the rivals.  Counted
-    from there come each rival's own, at `groups`, and at `imitations` those with which it may
+    from there come each rival's own, at `groups`, and at `alternatives` those with which it may
     imitate others instead: at other settings or about other starts, each by itself.
     """
 
@@ -217,13 +217,13 @@ class WhitenedRows:
     response: Array
     nuisance: int
     groups: tuple[slice, ...]
-    imitations: tuple[tuple[slice, ...], ...]
+    alternatives: tuple[tuple[slice, ...], ...]
 
 
 def rows_of(campaign: Campaign, rivals: RivalSet) -> WhitenedRows:
     """Whiten the columns of the rivals by V = covariance of each configuration."""
     dataset, data = campaign.dataset, campaign.dataset.data
-    searched = imitations(campaign.so_far, campaign.noise, rivals)
+    searched = alternatives(campaign.so_far, campaign.noise, rivals)
     # What is beside counts by the widest size of its prior.
     beside = [
         data.masked(packed_columns(dataset, item)) * float(item.scales.max())
@@ -343,7 +343,7 @@ class Discrimination:
             of_a, g = self.rows.groups[a], self.draws[a]
             size = PLAUSIBLE * self.rivals.rivals[b].scales.max()
             nearest = np.full((len(S), len(g)), np.inf)
-            for of_b in self.rows.imitations[b]:
+            for of_b in self.rows.alternatives[b]:
                 tie = np.eye(of_b.stop - of_b.start) / size**2
                 taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
                 D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
@@ -370,14 +370,18 @@ class Discrimination:
         By the union bound over its rival classes, each as dangerous as its strongest
         member; not below what naming the likeliest so far gives, which nobody has to give up.
         While a pair is as near as the verdict calls alike, no odds name one of the two with more
-        than ALIKE_PROBABILITY.
+        than TOO_NEAR_PROBABILITY.
         """
         p = self.rivals.probability
         odds = np.log(np.bincount(self.classes, p)[self.classes])
         L = (odds[:, None] - odds[None, :])[..., None]
         delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
         beaten = norm.cdf(-(L + delta**2 / 2) / delta)
-        beaten = np.where(squared < ALIKE**2, np.maximum(beaten, 1 - ALIKE_PROBABILITY), beaten)
+        beaten = np.where(
+            squared < TOO_NEAR**2,
+            np.maximum(beaten, 1 - TOO_NEAR_PROBABILITY),
+            beaten,
+        )
         lost = np.zeros(beaten.shape[:-2] + beaten.shape[-1:])
         for k in np.unique(self.classes):
             strongest = beaten[..., self.classes == k, :].max(axis=-2)

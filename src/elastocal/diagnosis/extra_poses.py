@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import count, islice
 
@@ -162,44 +162,10 @@ def inseparable_advice(group: Sequence[str], distance: float, tried: int) -> str
     return f"no pose separates {names}: measured in all {tried} poses that were tried {near}"
 
 
-def other_means(pairs: Sequence[tuple[str, str]]) -> list[str]:
+def other_means(pairs: Iterable[tuple[str, str]]) -> list[str]:
     """What else tells the rivals of inseparable pairs apart."""
     effects = [name.partition(":")[0] for pair in pairs for name in pair]
     return list(dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy)))
-
-
-def too_few_advice(n: int, probability: float, reachable: float) -> str:
-    """That the plan stays below what was aimed at."""
-    return (
-        f"{n} poses reach a probability of {probability:.2f} only; many more would reach "
-        f"{reachable:.2f}: allow more poses ({option('poses')}), or repeat each of them"
-    )
-
-
-def none_of_them(missed: float, nothing: float) -> str:
-    """That the right answer may not be among the rivals."""
-    return (
-        f"with probability {missed:.2f} none of these rivals is at work (noise alone: "
-        f"{nothing:.2f}), which the probabilities count with: measure more poses of any kind first"
-    )
-
-
-def pull_advice(n: int, newton: float, without: float, with_pull: float) -> str:
-    """That pulling sideways would help, and how much."""
-    return (
-        f"pull horizontally: {n} poses that are also measured under {newton:.3g} N along x and "
-        f"along y, e.g. by a rope over a pulley, raise the probability from {without:.2f} to "
-        f"{with_pull:.2f}"
-    )
-
-
-def pull_separates(pairs: Sequence[tuple[str, str]], newton: float) -> str:
-    """That pulling sideways tells apart what the load alone does not."""
-    apart = ", ".join(f"{first} and {second}" for first, second in pairs)
-    return (
-        f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a pulley, "
-        f"would separate {apart}: measure poses under it, too"
-    )
 
 
 def recording_advice(sets: Sequence[RivalSet]) -> list[str]:
@@ -279,10 +245,14 @@ def _chosen(
     for group in groups:
         near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
         notes.append(inseparable_advice(group, near, len(pool)))
-    notes += other_means(list(hopeless))
+    notes += other_means(hopeless)
     covered = suspects.covered
     if covered < MOSTLY:
-        notes.append(none_of_them(1 - covered, suspects.diagnosis.probability_nothing))
+        notes.append(
+            f"with probability {1 - covered:.2f} none of these rivals is at work (noise alone: "
+            f"{suspects.diagnosis.probability_nothing:.2f}), which the probabilities count with: "
+            "measure more poses of any kind first"
+        )
     # More poses may make up for a small doubt whether the right one is among the rivals.
     enough = ENOUGH / covered if covered * MOST_CERTAIN >= ENOUGH else ENOUGH
     # Where what can be told apart is told apart already, only what cannot be is left.
@@ -294,7 +264,11 @@ def _chosen(
         progress("extra poses: what a horizontal pull would add")
         if after < enough:
             reachable = covered * expected(tasks, range(len(pool)))
-            notes.append(too_few_advice(len(chosen), covered * after, reachable))
+            notes.append(
+                f"{len(chosen)} poses reach a probability of {covered * after:.2f} only; many more "
+                f"would reach {reachable:.2f}: allow more poses ({option('poses')}), or repeat "
+                "each of them"
+            )
         pulled = _pulled(base, pool, suspects, seed)
         n, newton = len(chosen), _newton(pool)
         notes += _pull_notes(tasks, hopeless, pulled, n, after, newton, covered)
@@ -357,12 +331,21 @@ def _pull_notes(
 ) -> list[str]:  # fmt: skip
     """Advice to pull sideways, where that helps."""
     still = judged(pulled)[1] if pulled else hopeless
-    helped = [pair for pair in hopeless if pair not in still]
-    notes = [pull_separates(helped, newton)] if helped else []
+    apart = ", ".join(" and ".join(pair) for pair in hopeless if pair not in still)
+    notes = []
+    if apart:
+        notes.append(
+            f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a "
+            f"pulley, would separate {apart}: measure poses under it, too"
+        )
     if pulled and n:
         same = [p.in_classes(c.classes) for p, c in zip(pulled, tasks, strict=True)]
         chosen = fewest(same, n)
         reached = expected(same, chosen)
         if reached > after + GAIN:
-            notes.append(pull_advice(len(chosen), newton, covered * after, covered * reached))
+            notes.append(
+                f"pull horizontally: {len(chosen)} poses that are also measured under "
+                f"{newton:.3g} N along x and along y, e.g. by a rope over a pulley, raise the "
+                f"probability from {covered * after:.2f} to {covered * reached:.2f}"
+            )
     return notes

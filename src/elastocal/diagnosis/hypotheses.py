@@ -339,32 +339,32 @@ ROWS = 3000  # of the equations, as many as tell one start from another
 
 
 def with_tangents(
-    whole: Model, hypotheses: list[Hypothesis], base: Baseline, x: Array, B: Array
+    full: Model, hypotheses: list[Hypothesis], base: Baseline, x: Array, B: Array
 ) -> Array:
     """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none."""
     for h in hypotheses:
-        own = own_columns(whole, h)
+        own = own_columns(full, h)
         shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
         if shown.all() or shown.sum() != 1:
             continue
         B = B.copy()
-        B[:, :, own] = min(tangents(whole, h, base, x, B), key=lambda tangent: tangent[0])[1]
+        B[:, :, own] = min(tangents(full, h, base, x, B), key=lambda tangent: tangent[0])[1]
     return B
 
 
 def tangents(
-    whole: Model, h: Hypothesis, base: Baseline, x: Array, B: Array
+    full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array
 ) -> Iterator[tuple[float, Array]]:
     """For each start that the effect proposes what is left of the residual's sum of squares, and
     the effect's columns (n_rows, size, k) about it, at the amplitude that the residual asks for.
 
-    x (K,) and B (n_rows, size, K) are those of `whole`.  The effect's first parameter is the
+    x (K,) and B (n_rows, size, K) are those of `full`.  The effect's first parameter is the
     amplitude that the others have no columns without.
     """
     table, model = base.observed.table, base.model
-    observed = observe(table, whole.observe)
-    names = {name: k for k, name in enumerate(whole.names)}
-    fitted, own = [names[name] for name in model.names], own_columns(whole, h)
+    observed = observe(table, full.observe)
+    names = {name: k for k, name in enumerate(full.names)}
+    fitted, own = [names[name] for name in model.names], own_columns(full, h)
     X = base.observed.apply(B[:, :, fitted]).reshape(len(base.residual), -1) * base.sizes
     # What is only planned has no residual yet that a spring could answer for.
     last = base.n_measured * base.observed.size - 1
@@ -373,21 +373,21 @@ def tangents(
         at = x.copy()
         for key, value in start.items():
             at[names[f"{h.where}.{key}"]] = value
-        column = whole.regressor(table, at, np.array(own[:1]), observed).B
+        column = full.regressor(table, at, np.array(own[:1]), observed).B
         c = base.observed.apply(column.reshape(len(table), observed.size, 1)).ravel()
         size = max(float(np.abs(c).max()), 1e-300)
         A = np.column_stack([X, c / size])[rows]
         solution, *_ = np.linalg.lstsq(A, base.residual[rows], rcond=1e-9)
         at[own[0]] += solution[-1] / size
-        columns = whole.regressor(table, at, np.array(own), observed).B
+        columns = full.regressor(table, at, np.array(own), observed).B
         columns = columns.reshape(len(table), observed.size, -1)
         columns[:, :, 0] = column.reshape(len(table), observed.size)
         yield float(((base.residual[rows] - A @ solution) ** 2).sum()), columns
 
 
-def own_columns(whole: Model, h: Hypothesis) -> list[int]:
-    """Where the hypothesis' parameters stand among those of `whole`."""
-    return [k for k, p in enumerate(whole.parameters) if (p.effect, p.where) == h.key]
+def own_columns(full: Model, h: Hypothesis) -> list[int]:
+    """Where the hypothesis' parameters stand among those of `full`."""
+    return [k for k, p in enumerate(full.parameters) if (p.effect, p.where) == h.key]
 
 
 # Columns of every hypothesis at the fitted arm: one symbolic model with everything in it.
@@ -404,13 +404,13 @@ class Columns:
     """B of the model, of direct hypotheses and of the chain's entries, row by row of the table.
 
     `rows` (n_rows, size, K) at the fitted values, raw; `places` says which columns of it belong to
-    an effect (or entry) at a place.  `whole` is the model with all of them, at x (K,).
+    an effect (or entry) at a place.  `full` is the model with all of them, at x (K,).
     """
 
     base: Baseline
     rows: Array
     places: dict[tuple[str, str], slice]
-    whole: Model
+    full: Model
     x: Array
 
     def observed(self, rows: Array) -> Array:
@@ -423,7 +423,7 @@ class Columns:
 
     def from_each_start(self, hypothesis: Hypothesis) -> Iterator[Array]:
         """Its columns (n_rows, size, k) about each of the starts of which `of` has the best."""
-        for _, columns in tangents(self.whole, hypothesis, self.base, self.x, self.rows):
+        for _, columns in tangents(self.full, hypothesis, self.base, self.x, self.rows):
             yield columns
 
     def torques(self) -> Array:
@@ -471,17 +471,17 @@ def compute_columns(
     )
     extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
     key = "columns", spec.effects
-    whole = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
+    full = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
     at = dict(zip(model.names, base.x, strict=True)) | (found or {})
-    x = np.array([at.get(p.name, p.nominal) for p in whole.parameters])
-    observed = observe(table, whole.observe)
-    B = whole.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
-    B = with_tangents(whole, direct, base, x, B)
+    x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
+    observed = observe(table, full.observe)
+    B = full.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
+    B = with_tangents(full, direct, base, x, B)
     spans: dict[tuple[str, str], list[int]] = {}
-    for k, p in enumerate(whole.parameters):
+    for k, p in enumerate(full.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
-    return Columns(base, B, places, whole, x)
+    return Columns(base, B, places, full, x)
 
 
 def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:

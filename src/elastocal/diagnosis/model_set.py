@@ -1,4 +1,4 @@
-"""A set of additions to the model: its noise, its evidence, its estimates, what looks alike."""
+"""A set of additions to the model: its noise, its evidence, its estimates, its imitators."""
 
 from __future__ import annotations
 
@@ -158,19 +158,16 @@ def _within_bounds(items: tuple[Item, ...], at: Projection) -> float:
     posterior's share of that half, each parameter taken by itself.
     """
     bounded = [
-        isinstance(item.what, Hypothesis)
-        and any(p.lower == p.nominal for p in item.what.parameters)
-        for item in items
+        (span.start + k)
+        for item, span in zip(items, spans_of(items, len(at.beta)), strict=True)
+        if isinstance(item.what, Hypothesis)
+        for k, p in enumerate(item.what.parameters)
+        if p.lower == p.nominal
     ]
-    if not any(bounded):
+    if not bounded:
         return 0.0
     z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
-    total = 0.0
-    for item, span in zip(items, spans_of(items, len(z)), strict=True):
-        if isinstance(item.what, Hypothesis):
-            for p, share in zip(item.what.parameters, log_ndtr(z[span]), strict=True):
-                total += float(np.log(2) + share) if p.lower == p.nominal else 0.0
-    return total
+    return sum(float(np.log(2) + share) for share in log_ndtr(z[bounded]))
 
 
 def _mixed_scales(
@@ -240,7 +237,7 @@ def _best_along(settings: Array, s: int, trial: Array, evidence: Callable[[Array
 def with_items(
     dataset: DiagnosisData, items: tuple[Item, ...], scales: tuple[float, ...]
 ) -> NoisyData:
-    """The scene's data with the items' columns at the given scales."""
+    """The data with the items' columns at the given scales."""
     if not items:
         return dataset.data
     columns = np.concatenate([packed_columns(dataset, item) for item in items], axis=2)
@@ -276,16 +273,14 @@ def distances(
     v, data = signal_of(dataset, chosen, k), beside(dataset, chosen, k)
     at = project(replace(data, r=v), chosen.noise)
     grams = Grams(dataset, data, at)
-    whole = float((v * at.u).sum())
+    signal = float((v * at.u).sum())
     out: dict[tuple[str, str], float] = {}
     for h in dataset.hypotheses:
-        if h is chosen.items[k].what:
-            continue
-        found = grams.of_hypothesis(h, settings_to_try(dataset, h, chosen.items[k]))
-        s = PLAUSIBLE * float(h.scales.max())
-        explained = float(found.explained(s).max())
-        out[h.key] = float(np.sqrt(max(whole - explained, 0.0)))
-    return float(np.sqrt(max(whole, 0.0))), out
+        if h is not chosen.items[k].what:
+            found = grams.of_hypothesis(h, settings_to_try(dataset, h, chosen.items[k]))
+            explained = float(found.explained(PLAUSIBLE * float(h.scales.max())).max())
+            out[h.key] = float(np.sqrt(max(signal - explained, 0.0)))
+    return float(np.sqrt(max(signal, 0.0))), out
 
 
 def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Array | None:
@@ -298,8 +293,8 @@ def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Ar
     values = dataset.grids[rival.key].values
     if not isinstance(what, Hypothesis):
         return values
-    alike = [s.kind for s in rival.settings] == [s.kind for s in what.settings]
-    within = alike and all(
+    same_kinds = [s.kind for s in rival.settings] == [s.kind for s in what.settings]
+    within = same_kinds and all(
         s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True)
     )
     return np.vstack([values, item.settings]) if within else values

@@ -25,7 +25,7 @@ from elastocal.diagnosis.model_set import (
 )
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
 from elastocal.diagnosis.unknown import Generic, generic_blocks
-from elastocal.diagnosis.verdict import ALIKE, UNKNOWN_EFFECT
+from elastocal.diagnosis.verdict import TOO_NEAR, UNKNOWN_EFFECT
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
 from elastocal.model.effects.compliances import JointCompliance
@@ -251,7 +251,7 @@ def with_neighbours(
         free = [
             key
             for key, (_, p) in known.items()
-            if key not in taken and (near[key] < ALIKE or (near[key] < NEAR and p >= CHANCE))
+            if key not in taken and (near[key] < TOO_NEAR or (near[key] < NEAR and p >= CHANCE))
         ]
         free = sorted(free, key=lambda key: near[key])[: max(MOST - len(s.rivals), 0)]
         rivals = [*s.rivals, *(known[key][0] for key in free)]
@@ -290,7 +290,7 @@ NEARLY = 4.0  # in d²: two standard deviations
 SETTINGS = 6  # of a rival that are tried, at most
 
 
-def imitations(
+def alternatives(
     dataset: DiagnosisData, noise: NoiseValues, rivals: RivalSet
 ) -> tuple[tuple[Item, ...], ...]:
     """Of each rival that has settings the item at those which explain most of another's signal,

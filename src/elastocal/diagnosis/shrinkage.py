@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from elastocal.diagnosis.backlash_model import EFFECT, under_other_law
+from elastocal.diagnosis.backlash_model import EFFECT, under_other_backlash_model
 from elastocal.diagnosis.baseline import Baseline, Blocks, visits
 from elastocal.diagnosis.diagnosis import FittedParameter, Gap
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, from_centre, prior_deviations
@@ -540,7 +540,7 @@ class Confirmation:
             like = replace(self.chosen, items=self._with(k, item))
             at = replace(self.fitted, model=extended(self.plain.model, _known(like.items)))
             out += self._draws(at, like, item, before, rivals[0][1] * share)
-        out = self._under_both_laws(k, before, out)
+        out = self._under_both_backlash_models(k, before, out)
         for item, share in rivals[1:]:
             if share < WORTH_A_DRAW or not item.known:
                 continue
@@ -549,15 +549,15 @@ class Confirmation:
             out += self._draws(at, rival, item, before, share)
         return out
 
-    def _under_both_laws(
+    def _under_both_backlash_models(
         self, k: int, before: Array, posterior_draws: list[PosteriorDraw]
     ) -> list[PosteriorDraw]:
         """What is true if item k, where it is play, follows its law, and if it follows another."""
-        doubt, item = self.dataset.other_play, self.chosen.items[k]
+        doubt, item = self.dataset.other_backlash, self.chosen.items[k]
         if not (isinstance(item.what, Hypothesis) and item.what.name == EFFECT and doubt):
             return posterior_draws
         held = [replace(d, probability=d.probability * (1 - doubt)) for d in posterior_draws]
-        other = extended(under_other_law(self.plain.model), _known(self.chosen.items))
+        other = extended(under_other_backlash_model(self.plain.model), _known(self.chosen.items))
         share = doubt * sum(d.probability for d in posterior_draws)
         at = replace(self.fitted, model=other)
         return held + self._draws(at, self.chosen, item, before, share)

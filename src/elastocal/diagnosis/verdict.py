@@ -21,7 +21,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData, OutlierScreening
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, ModelSet, distances
+from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
@@ -30,8 +30,8 @@ UNKNOWN_EFFECT = "unknown_effect"
 SET, LARGEST_SET = 0.95, 3  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
-ALIKE = 2.0
-ALIKE_PROBABILITY = 0.89
+TOO_NEAR = 2.0
+TOO_NEAR_PROBABILITY = 0.89
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def judge(found: SelectedEffects) -> Answer:
     if found.chosen.unknown:
         verdict: Verdict = "unknown_effect"
         # What is named beside something without a name may be part of its imitation.
-        probability = [min(p, ALIKE_PROBABILITY) for p in probability]
+        probability = [min(p, TOO_NEAR_PROBABILITY) for p in probability]
     elif all(len(r) == 1 for r in rivals):
         verdict = "explained"
     else:
@@ -90,23 +90,21 @@ def _of_item(
         return float(each[own]), ((item, float(each[own])),)
     near = distances(found.dataset, found.chosen, k)[1]
     taken = {id(other.what) for other in found.chosen.items}
-    alike = [
+    same = [
         i
         for i, other in enumerate(slot.items)
-        if isinstance(other.what, Hypothesis)
-        and id(other.what) not in taken
-        and near[other.key] < ALIKE
+        if other.known and id(other.what) not in taken and near[other.key] < TOO_NEAR
     ]
     # More than so many are no answer; the others stand among the candidates.
-    alike = sorted(alike, key=lambda i: -each[i])[: LARGEST_SET - 1]
+    same = sorted(same, key=lambda i: -each[i])[: LARGEST_SET - 1]
     p = each.copy()
-    if alike and p[own] > ALIKE_PROBABILITY:
+    if same and p[own] > TOO_NEAR_PROBABILITY:
         # Their columns are the same in these poses; what separates the scores is only how many
         # parameters each would need.
-        spare = p[own] - ALIKE_PROBABILITY
-        p[own] = ALIKE_PROBABILITY
-        p[alike] += spare / len(alike)
-    chosen = [own, *alike]
+        spare = p[own] - TOO_NEAR_PROBABILITY
+        p[own] = TOO_NEAR_PROBABILITY
+        p[same] += spare / len(same)
+    chosen = [own, *same]
     if p[own] < NAMED:
         # Of the blocks only the likeliest: they all say "something else, about there".
         blocks = [i for i in range(len(p)) if not slot.items[i].known]
@@ -167,7 +165,7 @@ def _sorted(shares: dict[str, float]) -> dict[str, float]:
     return {k: v for k, v in sorted(shares.items(), key=lambda kv: -kv[1]) if v > 1e-6}
 
 
-# The shape of a dependence that has no name: the motion as a function of what drives it.
+# The shape of a dependence that has no name: the motion as a function of the covariate.
 
 MOST_CURVES = 3
 TRANSLATIONS = ((" x", "m"), (" y", "m"), (" z", "m"))
@@ -204,7 +202,7 @@ DETECTABLE = 1.0  # standard deviations: below, a typical size does not move the
 STATED_LOW, STATED_HIGH = 0.67, 1.5
 FAULTY_SHARE = 0.02
 SUSPECT_SHARE = 0.05
-OPEN_LAW = 0.2  # probability of the other law of play from which the reader is told
+OPEN_BACKLASH = 0.2  # probability of the other backlash model from which the reader is told
 
 
 def candidates(
@@ -223,13 +221,10 @@ def candidates(
             what = item.what
             if not isinstance(what, Hypothesis):
                 continue
-            settings = {s.key: float(v) for s, v in zip(what.settings, item.settings, strict=True)}
-            probability = named.get(id(what), float(p))
-            key = what.key
+            probability, key = named.get(id(what), float(p)), what.key
             row = Candidate(
-                what.name, what.where, what.stage, probability, float(score),
-                distance[key], settings,
-            )  # fmt: skip
+                *key, what.stage, probability, float(score), distance[key], settings_of(item)
+            )
             if key not in best or row.probability > best[key].probability:
                 best[key] = row
     return tuple(sorted(best.values(), key=lambda c: (-c.probability, -c.score)))
@@ -238,19 +233,16 @@ def candidates(
 def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested, ...]:
     """Hypotheses whose typical size these poses would not show."""
     chosen = {id(item.what) for item in found.chosen.items}
-    rows = []
-    for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True):
-        if s.distance < DETECTABLE and id(h) not in chosen:
-            rows.append(
-                Untested(
-                    h.name,
-                    h.where,
-                    "at its typical size it does not show in these poses: the fitted parameters "
-                    "follow it, or it is smaller than the noise",
-                    "spread the poses over more of the work space, or raise the load",
-                )
-            )
-    return tuple(rows)
+    reason = (
+        "at its typical size it does not show in these poses: the fitted parameters follow it, or "
+        "it is smaller than the noise"
+    )
+    advice = "spread the poses over more of the work space, or raise the load"
+    return tuple(
+        Untested(*h.key, reason, advice)
+        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+        if s.distance < DETECTABLE and id(h) not in chosen
+    )
 
 
 def warnings(
@@ -278,18 +270,18 @@ def warnings(
             f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
             "other to be accidents; they were kept: look at them with `elastocal identify` first"
         )
-    if text := _undecided_play(found):
+    if text := _undecided_backlash(found):
         out.append(text)
     if dataset.table.time is None:
         out.append("without times neither drifts nor jumps can be seen: record time_s")
     return tuple(out)
 
 
-def _undecided_play(found: SelectedEffects) -> str:
-    """That the law of the play that was found is not known, where it is not."""
+def _undecided_backlash(found: SelectedEffects) -> str:
+    """That the model of the backlash that was found is not known, where it is not."""
     named = [i.what.where for i in found.chosen.items if isinstance(i.what, Hypothesis)
              and i.what.name == EFFECT]  # fmt: skip
-    if not named or found.dataset.other_play <= OPEN_LAW:
+    if not named or found.dataset.other_backlash <= OPEN_BACKLASH:
         return ""
     places = " and ".join(named)
     return (

@@ -18,12 +18,12 @@ from elastocal.diagnosis import (
     NoiseValues,
     RivalSet,
     VisitPool,
+    alternatives,
     campaign_of,
     expected,
     expected_of_random,
     fewest,
     fit_baseline,
-    imitations,
     joined,
     possible,
     prior_deviations,
@@ -32,7 +32,7 @@ from elastocal.diagnosis import (
 )
 from elastocal.diagnosis.discrimination import DRAWS
 from elastocal.diagnosis.rivals import SETTINGS
-from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
+from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.measurements import Measurements
 from elastocal.model import Model
 from elastocal.simulation import values_from
@@ -198,8 +198,8 @@ def test_what_the_verdict_calls_alike_is_named_with_no_more_than_it_allows(discr
         draws=discrimination.draws[:2], before=np.full((2, 2, 1), -40.0), classes=np.arange(2),
     )  # fmt: skip
     apart = 1 - np.eye(2)[:, :, None]
-    assert two.probability(0.99 * ALIKE**2 * apart) == pytest.approx(ALIKE_PROBABILITY)
-    assert two.probability(1.01 * ALIKE**2 * apart) > 0.99
+    assert two.probability(0.99 * TOO_NEAR**2 * apart) == pytest.approx(TOO_NEAR_PROBABILITY)
+    assert two.probability(1.01 * TOO_NEAR**2 * apart) > 0.99
 
 
 def test_the_search_finds_the_best_pair_of_visits(discrimination) -> None:
@@ -229,7 +229,7 @@ def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, discriminat
     found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
     whole = campaign_of(base, pool, [drift.what], type("Found", (), {"noise": found}))
     rivals = RivalSet.of([drift, quick], [0.5, 0.5], [])
-    drifts = imitations(whole.so_far, NOISE, rivals)[1]
+    drifts = alternatives(whole.so_far, NOISE, rivals)[1]
     assert drifts[0].settings[0] == pytest.approx(TIME_CONSTANT)
     assert 1 < len({float(item.settings[0]) for item in drifts}) == len(drifts) <= SETTINGS
     d = Discrimination.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
