@@ -1,4 +1,4 @@
-"""The measured shrinkage against the true one, on a linear world whose truth is known."""
+"""The measured shrinkage against the true one, on a linear world where what is true is known."""
 
 from __future__ import annotations
 

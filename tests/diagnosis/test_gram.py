@@ -36,8 +36,8 @@ def made() -> DiagnosisData:
     return diagnosis_data_of(fit_baseline(model, table), hypotheses)
 
 
-def fresh() -> DiagnosisData:
-    """The scene without what it has kept."""
+def unused() -> DiagnosisData:
+    """The data without what it has kept."""
     known = made()
     return DiagnosisData(
         known.base, known.columns, known.hypotheses, known.data, known.fitted, known.load_point
@@ -57,7 +57,7 @@ def test_every_setting_scores_as_the_columns_it_stands_for(
     at = project(made().data, NOISE)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (5, len(made().blocks.member)))
     h = hypothesis(name)
-    found = Grams(fresh(), made().data, at, signs).of_hypothesis(h)
+    found = Grams(unused(), made().data, at, signs).of_hypothesis(h)
     values = made().grids[h.name, h.where].values
     assert len(found.lam) == len(values)
     for k in range(0, len(values), max(len(values) // 7, 1)):
@@ -81,7 +81,7 @@ def test_nothing_hangs_on_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = made().direction(h, settings)
     assert made().direction(h, settings) is kept
     monkeypatch.setattr(dataset, "KEPT", 0)
-    forgetful = fresh()
+    forgetful = unused()
     first = forgetful.direction(h, settings)
     assert forgetful.direction(h, settings) is not first
     np.testing.assert_array_equal(first, kept)

@@ -165,7 +165,7 @@ def test_some_configurations_are_as_if_the_others_had_not_been_measured() -> Non
 
 @pytest.mark.parametrize("n", [60, 400, 1100])
 def test_the_noise_found_is_the_most_probable_one(n: int) -> None:
-    """No search from it or from the truth finds a twentieth of −2 log posterior more."""
+    """No search from it or from the true noise finds a twentieth of −2 log posterior more."""
     true_noise = NoiseValues(1.4, np.array([5e-6, 1.5e-5]), 0.6)
     data = drawn(true_noise, n, 3)
     best = fit_noise(data)

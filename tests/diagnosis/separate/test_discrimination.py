@@ -149,7 +149,7 @@ def test_more_visits_never_bring_rivals_nearer(discrimination) -> None:
 
 
 def test_draws_have_the_mean_of_the_ridge_estimate(base, discrimination) -> None:
-    """Antithetic draws average to the estimate, which is nearer the truth than nothing is."""
+    """Antithetic draws average to the estimate, which is nearer what is true than nothing is."""
     posterior_draw = np.array([2e-4, -1e-4]) / 1e-4
     estimate = discrimination.draws[0].mean(axis=0)
     spread = discrimination.draws[0].std(axis=0)
