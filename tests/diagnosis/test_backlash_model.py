@@ -36,7 +36,7 @@ PLAY = Fault("backlash", "joint3", {"backlash": 3e-4})
 
 @lru_cache
 def dataset(side: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> DiagnosisData:
-    """Readings of an arm with play under `side`, looked at as the diagnosis would at first."""
+    """Readings of an arm with play that rests by `side`, looked at as the diagnosis would at first."""
     chain = kr270_chain()
     table = plan(chain, 40, 3)
     table = measured(chain, cell(play_side=side), [PLAY], table, 3)
@@ -47,7 +47,7 @@ def dataset(side: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> 
 
 
 @pytest.mark.parametrize("side", ["load", "load_and_approach"])
-def test_the_readings_tell_the_law(side: str) -> None:
+def test_the_readings_tell_the_backlash_model(side: str) -> None:
     first = dataset(side)
     assert first.base.model.cell.model.play_side == "load_and_approach"
     told = with_likelier_backlash_model(first)

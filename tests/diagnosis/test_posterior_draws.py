@@ -143,7 +143,7 @@ def test_readings_are_numbered_by_fresh_pose() -> None:
 
 
 def test_a_rival_is_held_for_true_as_often_as_it_is_probable() -> None:
-    """Unlikely ones and blocks without a name are never drawn as true; the settings share the item's."""
+    """Unlikely ones and blocks without a name never are; the settings share the item's."""
     found, item = confirmation("encoder_scale:joint3")
     others = {(h.name, h.where): h for h in found.dataset.hypotheses}
     rival = Item(others["gear_eccentricity", "joint4"], np.zeros(0), 0.0)

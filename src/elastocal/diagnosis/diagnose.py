@@ -105,8 +105,6 @@ def diagnose(
     gap, steps = budget(dataset, found, rng)
     findings = _findings(found, answer, base, rng)
     tests = structure_tests(found.first)
-    chosen = found.chosen
-    nothing = found.slots[0].probabilities()[1]
     p_first = exceedance(found.first.flipped, found.first.odds)
     return Diagnosis(
         verdict=answer.verdict,
@@ -116,12 +114,12 @@ def diagnose(
         candidates=candidates(dataset, found, answer),
         indistinguishable=answer.indistinguishable,
         location=location(found, tests),
-        noise=noise_floor(found.dataset, chosen.data, chosen.noise),
+        noise=noise_floor(found.dataset, found.chosen.data, found.chosen.noise),
         structure=tests,
-        probability_nothing=nothing,
+        probability_nothing=found.slots[0].probabilities()[1],
         probability_unknown=_unknown(found),
         p_value=found.p_values[0] if found.p_values else p_first,
-        curves=curves_of(found.dataset, chosen),
+        curves=curves_of(found.dataset, found.chosen),
         untested=(*untested, *too_small(dataset, found)),
         warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
         n_readings=dataset.blocks.n,
@@ -193,10 +191,11 @@ def _findings(
         posterior_draws = confirmation.posterior_draws(k, answer.rivals[k])
         change = between_visits(dataset, chosen, k)
         measured = len(dataset.blocks.member)
-        fall = shrinkage(posterior_draws, measured, confirmation.unnamed, change, rng)
+        reduction, ci90, ci95 = shrinkage(
+            posterior_draws, measured, confirmation.unnamed, change, rng
+        )
+        fitted, settings = parameters[item.key], settings_of(item)
         findings.append(
-            FoundEffect(
-                *item.key, answer.probability[k], *fall, parameters[item.key], settings_of(item)
-            )
+            FoundEffect(*item.key, answer.probability[k], reduction, ci90, ci95, fitted, settings)
         )
     return tuple(findings)

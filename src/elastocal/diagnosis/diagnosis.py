@@ -61,6 +61,7 @@ class ExtraPlan:
 
 Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
 Interval = tuple[float, float]
+MICRO = 1e6
 
 # A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
 # Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
@@ -349,52 +350,33 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         remedy = f"{option('plan', 'extra.csv')} designs the poses that tell the rivals apart."
         yield Finding("rivals_open", "note", {}, remedy)
     if d.dependences:
-        yield Finding(
-            "depends_on", "note",
-            {
-                "drivers": tuple(t.driver for t in d.dependences),
-                "p_family": tuple(t.p_family for t in d.dependences),
-            },
-        )  # fmt: skip
-    yield Finding(
-        "sensitivity", "note",
-        {
-            "smallest_seen_um": d.smallest_seen * 1e6, "candidates": len(d.candidates),
-            "visible": sum(c.visible for c in d.candidates),
-            "hidden": sum(c.hidden for c in d.candidates),
-        },
-    )  # fmt: skip
+        drivers, p_family = zip(*((t.driver, t.p_family) for t in d.dependences), strict=True)
+        yield Finding("depends_on", "note", {"drivers": drivers, "p_family": p_family})
+    visible, hidden = (sum(c.visible for c in d.candidates), sum(c.hidden for c in d.candidates))
+    numbers = {"smallest_seen_um": d.smallest_seen * MICRO, "candidates": len(d.candidates)}
+    yield Finding("sensitivity", "note", numbers | {"visible": visible, "hidden": hidden})
     if d.noise.faulty:
-        worst = max(f.error for f in d.noise.faulty)
-        yield Finding(
-            "faulty_readings", "note", {"left_out": len(d.noise.faulty), "worst_um": worst * 1e6}
-        )
+        worst = max(f.error for f in d.noise.faulty) * MICRO
+        numbers = {"left_out": len(d.noise.faulty), "worst_um": worst}
+        yield Finding("faulty_readings", "note", numbers)
 
 
 def _remedy(verdict: Verdict) -> str:
     """What to do after a verdict."""
-    if verdict == "explained":
-        return (
-            f"Identify with the cell that {option('cell_out')} writes, and check the promise on "
-            f"poses that were never fitted (identify with {option('test')})."
-        )
-    if verdict == "ambiguous":
-        return (
-            "Compensating with the likeliest of the set serves poses and loads like those "
-            "measured; beyond them the rivals may predict differently."
-        )
-    if verdict == "unknown_effect":
-        return (
-            "Look for a physical cause where the evidence points, and measure more where the curve "
-            "is steep; compensate nothing by a name that the data do not support."
-        )
-    return "Nothing calls for another effect in the model."
+    return {
+        "explained": f"Identify with the cell that {option('cell_out')} writes, and check the "
+        f"promise on poses that were never fitted (identify with {option('test')}).",
+        "ambiguous": "Compensating with the likeliest of the set serves poses and loads like those "
+        "measured; beyond them the rivals may predict differently.",
+        "unknown_effect": "Look for a physical cause where the evidence points, and measure more "
+        "where the curve is steep; compensate nothing by a name that the data do not support.",
+        "nothing_significant": "Nothing calls for another effect in the model.",
+    }[verdict]
 
 
 # A diagnosis as JSON: schema elastocal/diagnosis/1.
 
 SCHEMA = "elastocal/diagnosis/1"
-MICRO = 1e6
 NORMAL_95 = 1.959964
 
 

@@ -370,7 +370,7 @@ def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
     return out
 
 
-def _moments(dataset: DiagnosisData) -> Array:
+def _moments(dataset: DiagnosisData) -> Array | IntArray:
     """When each observation (N,) was made; its row in the table where no times are recorded."""
     time = dataset.table.time
     return dataset.lead if time is None else time[dataset.lead]

@@ -276,13 +276,10 @@ class ForwardSelection:
 
         Beside other items it has to be better than the set without it.
         """
-        options = self._options(current, scanned)
-        slot = Slot(tuple(item for item, _ in options), np.array([s for _, s in options]))
-        base = current.score
-        close = self._close(slot, behind)
+        slot, base = self._options(current, scanned), current.score
         best: ModelSet | None = None
         scores = slot.scores.copy()
-        for k in close:
+        for k in self._close(slot, behind):
             item = slot.items[k]
             if any(item.same_as(other) for other in current.items):
                 scores[k] = -np.inf
@@ -295,18 +292,21 @@ class ForwardSelection:
             best = None
         return best, Slot(slot.items, scores)
 
-    def _options(self, current: ModelSet, scanned: Scan) -> list[tuple[Item, float]]:
+    def _options(self, current: ModelSet, scanned: Scan) -> Slot:
+        """Everything that could be added, scored under the scan's noise."""
         prior = self._prior(current)
         # Scores count from the set as it is, under the noise that suits it best.
         offset = base_score(self.dataset, current, scanned) - current.score
-        options = []
-        for h, s, w in zip(self.dataset.hypotheses, scanned.scored, prior.hypotheses, strict=True):
-            # What the search over settings costs stays with the item.
-            item = Item(h, s.settings, float(w + s.evidence - s.best))
-            options.append((item, float(w + s.evidence + offset)))
-        for g, s, w in zip(self.generic, scanned.blocks, prior.blocks, strict=True):
-            options.append((Item(g, s.settings, float(w)), float(w + s.evidence + offset)))
-        return options
+        weights, each = (*prior.hypotheses, *prior.blocks), (*scanned.scored, *scanned.blocks)
+        # What the search over settings costs stays with the item; blocks have none.
+        items = tuple(
+            Item(what, s.settings, float(w + s.evidence - s.best))
+            for what, s, w in zip(
+                (*self.dataset.hypotheses, *self.generic), each, weights, strict=True
+            )
+        )
+        scores = [float(w + s.evidence + offset) for s, w in zip(each, weights, strict=True)]
+        return Slot(items, np.array(scores))
 
     def _with(self, current: ModelSet, item: Item) -> ModelSet:
         """The set with one item more, its noise and settings fitted; kept, since it is asked for

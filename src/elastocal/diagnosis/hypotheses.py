@@ -131,7 +131,7 @@ def possible(
             if key := _unset(h, chain, cell):
                 reason = f"{key} is not known, and only settings of a driven effect are searched"
                 advice = f"state {key} in [model.nominal.settings.{h.where}]"
-                untested.append(Untested(name, h.where, reason, advice))
+                untested.append(Untested(*h.key, reason, advice))
             else:
                 hypotheses.append(h)
     return [h for h in hypotheses if h.parameters], untested
@@ -321,12 +321,9 @@ def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
     values = np.arange(LOWEST_ORDER, HIGHEST_ORDER, step)
     known = [] if setting.default is None else [setting.default]
     share = KNOWN_SHARE if known else 0.0
-    prior = np.concatenate(
-        [np.full(len(known), share), np.full(len(values), (1 - share) / len(values))]
-    )
-    return SettingsGrid(
-        np.concatenate([known, values])[:, None], np.log(prior), np.full((len(prior), 1), step)
-    )
+    prior = np.append(np.full(len(known), share), np.full(len(values), (1 - share) / len(values)))
+    values = np.append(known, values)[:, None]
+    return SettingsGrid(values, np.log(prior), np.full((len(prior), 1), step))
 
 
 # Columns of effects whose other parameters say nothing while the first is zero.
@@ -493,8 +490,8 @@ def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:
     moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
     rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
     signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
-    typical = [p.typical for p in hypothesis.parameters]
-    return np.array([s if t is None else t for s, t in zip(signal, typical, strict=True)])
+    sized = zip(signal, hypothesis.parameters, strict=True)
+    return np.array([s if p.typical is None else p.typical for s, p in sized])
 
 
 class RegressorDirection:

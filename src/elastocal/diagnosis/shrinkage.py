@@ -126,7 +126,8 @@ def budget(
     steps += [_step(name, data, nothing, together, rng) for name, data in _fitted_steps(dataset)]
     known = [k for k, item in enumerate(chosen.items) if item.known]
     for n, last in enumerate(known, 1):
-        items, scales = (tuple(of[k] for k in known[:n]) for of in (chosen.items, chosen.scales))
+        items = tuple(chosen.items[k] for k in known[:n])
+        scales = tuple(chosen.scales[k] for k in known[:n])
         data = with_items(found.dataset, items, scales)
         name = ":".join(chosen.items[last].key)
         steps.append(_step(name, data, chosen, together, rng))
@@ -595,9 +596,9 @@ class Confirmation:
         out = []
         for fit in posteriors(self.dataset, base, here, self.noise, measured, self._prior(true)):
             readings = at.prediction + B @ (fit.x - start)
-            errors = (before - readings, self._after - readings, B @ fit.spread)
+            errors = lengths(before - readings), lengths(self._after - readings)
             pose, share = self.observed.configuration, probability / len(self.noise)
-            out.append(PosteriorDraw(*map(lengths, errors), pose, share))
+            out.append(PosteriorDraw(*errors, lengths(B @ fit.spread), pose, share))
         return out
 
     def _prior(self, true: ModelSet) -> dict[str, float]:
