@@ -36,7 +36,7 @@ PLAY = Fault("backlash", "joint3", {"backlash": 3e-4})
 
 @lru_cache
 def dataset(side: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> DiagnosisData:
-    """Readings of an arm with play that rests by `side`, looked at as the diagnosis would at first."""
+    """Readings of an arm whose play rests by `side`, looked at as the diagnosis would at first."""
     chain = kr270_chain()
     table = plan(chain, 40, 3)
     table = measured(chain, cell(play_side=side), [PLAY], table, 3)

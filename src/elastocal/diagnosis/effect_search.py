@@ -297,16 +297,15 @@ class ForwardSelection:
         prior = self._prior(current)
         # Scores count from the set as it is, under the noise that suits it best.
         offset = base_score(self.dataset, current, scanned) - current.score
-        weights, each = (*prior.hypotheses, *prior.blocks), (*scanned.scored, *scanned.blocks)
-        # What the search over settings costs stays with the item; blocks have none.
-        items = tuple(
-            Item(what, s.settings, float(w + s.evidence - s.best))
-            for what, s, w in zip(
-                (*self.dataset.hypotheses, *self.generic), each, weights, strict=True
-            )
-        )
-        scores = [float(w + s.evidence + offset) for s, w in zip(each, weights, strict=True)]
-        return Slot(items, np.array(scores))
+        items, scores = [], []
+        for h, s, w in zip(self.dataset.hypotheses, scanned.scored, prior.hypotheses, strict=True):
+            # What the search over settings costs stays with the item.
+            items.append(Item(h, s.settings, float(w + s.evidence - s.best)))
+            scores.append(float(w + s.evidence + offset))
+        for g, s, w in zip(self.generic, scanned.blocks, prior.blocks, strict=True):
+            items.append(Item(g, s.settings, float(w)))
+            scores.append(float(w + s.evidence + offset))
+        return Slot(tuple(items), np.array(scores))
 
     def _with(self, current: ModelSet, item: Item) -> ModelSet:
         """The set with one item more, its noise and settings fitted; kept, since it is asked for
