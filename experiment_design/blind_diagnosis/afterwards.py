@@ -25,7 +25,6 @@ from elastocal.diagnosis import (
     fit_baseline,
     possible,
     project,
-    scales_of,
 )
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model import Model
@@ -83,7 +82,7 @@ def distances(base: Baseline, world: World, without: tuple[str, ...] = ()) -> li
 
 
 def _explained(grams: Grams, h: Hypothesis) -> float:
-    return float(grams.of_hypothesis(h).explained(float(scales_of(h).max())).max())
+    return float(grams.of_hypothesis(h).explained(float(h.scales.max())).max())
 
 
 def _beside(
@@ -91,7 +90,7 @@ def _beside(
 ) -> NoisyData:
     """The data with the columns of an effect that is there too."""
     C = scene.packed(h, np.array([settings[s.key] for s in h.settings]))
-    return data.with_columns(C, np.full(C.shape[2], scales_of(h).max() ** -2.0))
+    return data.with_columns(C, np.full(C.shape[2], h.scales.max() ** -2.0))
 
 
 def true_reduction(base: Baseline, answer: dict[str, Any], extended: Path, fresh: Path) -> float:

@@ -21,7 +21,7 @@ from elastocal.diagnosis import (
     rms_with_interval,
     squared_lengths,
 )
-from elastocal.diagnosis.gap import _left_out_together
+from elastocal.diagnosis.shrinkage import _left_out_together
 
 NOISE = NoiseValues(1.2, np.array([4e-6, 9e-6, 1e-5]), 0.4)
 SEEDS = range(4)

@@ -1,4 +1,4 @@
-"""The measured shrinkage against the true one, on a linear world whose truth is known."""
+"""The measured shrinkage against the true one, on a linear world where what is true is known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from elastocal.diagnosis import Change, PosteriorDraw
-from elastocal.diagnosis.shrinkage import FRESH, shrinkage
+from elastocal.diagnosis.shrinkage import NEW_POSES, shrinkage
 
 SIGMA, P, K = 1e-5, 8, 2
 N = 10_000  # measured poses: as many kinds of pose as there are
@@ -23,21 +23,18 @@ def columns(poses: int, rng: np.random.Generator) -> np.ndarray:
 
 def world(seed: int, poses: int, size: float) -> tuple[PosteriorDraw, float]:
     """What is known of an effect of rms `size` (m) after a fit with and one without it, and by
-    how much the errors at 100 fresh poses really fall."""
+    how much the errors at 100 new poses really fall."""
     rng = np.random.default_rng((seed, poses))
     X = columns(poses, rng).reshape(-1, P + K)
-    posterior_draw = np.concatenate([rng.normal(size=P), size / 1e-5 * np.array([0.8, -0.6])])
-    y = X @ posterior_draw + SIGMA * rng.normal(size=len(X))
+    true = np.concatenate([rng.normal(size=P), size / 1e-5 * np.array([0.8, -0.6])])
+    y = X @ true + SIGMA * rng.normal(size=len(X))
     after = np.linalg.lstsq(X, y)[0]
     before = np.concatenate([np.linalg.lstsq(X[:, :P], y)[0], np.zeros(K)])
     spread = SIGMA * np.linalg.inv(np.linalg.cholesky(X.T @ X)).T
-    real = columns(FRESH, rng)
-    rms = [
-        np.sqrt(((real @ (fit - posterior_draw)) ** 2).sum(axis=2).mean())
-        for fit in (before, after)
-    ]
-    fresh = columns(300, rng)
-    rows = fresh.reshape(-1, 3, P + K)
+    real = columns(NEW_POSES, rng)
+    rms = [np.sqrt(((real @ (fit - true)) ** 2).sum(axis=2).mean()) for fit in (before, after)]
+    new = columns(300, rng)
+    rows = new.reshape(-1, 3, P + K)
     pose = np.repeat(np.arange(300), 3)
     found = PosteriorDraw(rows @ (before - after), rows @ (after - after), rows @ spread, pose, 1.0)
     return found, float(1 - rms[1] / rms[0])

@@ -36,12 +36,11 @@ def made() -> DiagnosisData:
     return diagnosis_data_of(fit_baseline(model, table), hypotheses)
 
 
-def fresh() -> DiagnosisData:
-    """The scene without what it has kept."""
+def unused() -> DiagnosisData:
+    """The data without what it has kept."""
     known = made()
     return DiagnosisData(
-        known.base, known.columns, known.hypotheses, known.blocks, known.places, known.data,
-        known.fitted, known.load_point,
+        known.base, known.columns, known.hypotheses, known.data, known.fitted, known.load_point
     )  # fmt: skip
 
 
@@ -58,7 +57,7 @@ def test_every_setting_scores_as_the_columns_it_stands_for(
     at = project(made().data, NOISE)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (5, len(made().blocks.member)))
     h = hypothesis(name)
-    found = Grams(fresh(), made().data, at, signs).of_hypothesis(h)
+    found = Grams(unused(), made().data, at, signs).of_hypothesis(h)
     values = made().grids[h.name, h.where].values
     assert len(found.lam) == len(values)
     for k in range(0, len(values), max(len(values) // 7, 1)):
@@ -73,16 +72,16 @@ def test_what_follows_a_joint_angle_is_evaluated_once_for_a_configuration() -> N
     assert visits > 1
     for name, of_each in (("gear_ripple", 1), ("frame_jump", visits)):
         h = hypothesis(name)
-        assert known.drive(h, known.grids[h.name, h.where].values[:3]).shape[1] == of_each
+        assert known.direction(h, known.grids[h.name, h.where].values[:3]).shape[1] == of_each
 
 
 def test_nothing_hangs_on_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     h = hypothesis("gear_ripple")
     settings = made().grids[h.name, h.where].values
-    kept = made().drive(h, settings)
-    assert made().drive(h, settings) is kept
+    kept = made().direction(h, settings)
+    assert made().direction(h, settings) is kept
     monkeypatch.setattr(dataset, "KEPT", 0)
-    forgetful = fresh()
-    first = forgetful.drive(h, settings)
-    assert forgetful.drive(h, settings) is not first
+    forgetful = unused()
+    first = forgetful.direction(h, settings)
+    assert forgetful.direction(h, settings) is not first
     np.testing.assert_array_equal(first, kept)

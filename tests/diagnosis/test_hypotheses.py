@@ -89,6 +89,6 @@ def test_instruments_that_were_not_used_are_not_suspected() -> None:
 def test_a_misspelt_effect_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(InputError, match="gear_eccentricity"):
         DiagnosisOptions(without=("gear_excentricity",))
-    with pytest.raises(InputError, match="false-alarm"):
+    with pytest.raises(InputError, match="false_alarm"):
         DiagnosisOptions(false_alarm=0.0)
     assert DiagnosisOptions(without=tuple(CATALOGUE)).without == tuple(CATALOGUE)

@@ -124,33 +124,33 @@ def test_residuals_to_be_flipped_scatter_as_the_noise_does(seed: int) -> None:
         np.testing.assert_allclose(fitted[c], at.H[c].T @ e, rtol=1e-5, atol=1e-6)
 
 
-def drawn(posterior_draw: NoiseValues, n: int, seed: int) -> NoisyData:
+def drawn(true_noise: NoiseValues, n: int, seed: int) -> NoisyData:
     """Readings of two or three markers in two visits to each of n configurations."""
     rng = np.random.default_rng(seed)
     count = rng.choice([4, 6], n)
     configuration = np.repeat(np.arange(n), count)
     visit = 2 * configuration + np.concatenate([np.arange(k) >= k // 2 for k in count])
     blocks = Blocks.of(configuration, visit, 3)
-    base = random_data(seed, blocks, p=5, joints=len(posterior_draw.joint))
+    base = random_data(seed, blocks, p=5, joints=len(true_noise.joint))
     base = replace(base, left_out=blocks.absent, precision=np.full(5, 1e-6))
-    V = covariance(base, posterior_draw)
+    V = covariance(base, true_noise)
     noise = (np.linalg.cholesky(V) @ rng.normal(size=(*V.shape[:2], 1)))[..., 0]
     return replace(base, r=base.masked(noise + base.X @ rng.normal(size=5)))
 
 
 @pytest.mark.parametrize(
-    "truth",
+    "true_noise",
     [
         NoiseValues(1.4, np.array([5e-6, 1.5e-5]), 0.6),
         NoiseValues(0.7, np.array([1.2e-5, 8e-6]), 0.2),
     ],
 )
-def test_the_noise_that_made_the_readings_is_found(posterior_draw: NoiseValues) -> None:
+def test_the_noise_that_made_the_readings_is_found(true_noise: NoiseValues) -> None:
     """Nearly: 400 configurations tell the joints to a tenth, what they share to a fifth."""
-    found = fit_noise(drawn(posterior_draw, 400, 3))
-    assert found.factor == pytest.approx(posterior_draw.factor, rel=0.05)
-    np.testing.assert_allclose(found.joint, posterior_draw.joint, rtol=0.2)
-    assert found.shared == pytest.approx(posterior_draw.shared, abs=0.35)
+    found = fit_noise(drawn(true_noise, 400, 3))
+    assert found.factor == pytest.approx(true_noise.factor, rel=0.05)
+    np.testing.assert_allclose(found.joint, true_noise.joint, rtol=0.2)
+    assert found.shared == pytest.approx(true_noise.shared, abs=0.35)
 
 
 def test_some_configurations_are_as_if_the_others_had_not_been_measured() -> None:
@@ -165,11 +165,11 @@ def test_some_configurations_are_as_if_the_others_had_not_been_measured() -> Non
 
 @pytest.mark.parametrize("n", [60, 400, 1100])
 def test_the_noise_found_is_the_most_probable_one(n: int) -> None:
-    """No search from it or from the truth finds a twentieth of −2 log posterior more."""
-    posterior_draw = NoiseValues(1.4, np.array([5e-6, 1.5e-5]), 0.6)
-    data = drawn(posterior_draw, n, 3)
+    """No search from it or from the true noise finds a twentieth of −2 log posterior more."""
+    true_noise = NoiseValues(1.4, np.array([5e-6, 1.5e-5]), 0.6)
+    data = drawn(true_noise, n, 3)
     best = fit_noise(data)
-    for start in (best, posterior_draw):
+    for start in (best, true_noise):
         further = optimize.minimize(
             lambda t: likelihood(data, NoiseValues.of_logs(t)), start.logs(), jac=True,
             method="BFGS",

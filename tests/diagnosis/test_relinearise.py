@@ -1,4 +1,4 @@
-"""About the exact fit the linear scene leaves exactly what the exact fit leaves."""
+"""About the exact fit the linear data leaves exactly what the exact fit leaves."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from elastocal.diagnosis import (
     DiagnosisData,
     Item,
     ModelSet,
-    away,
     diagnosis_data_of,
     fit_baseline,
     fit_extended,
     fit_set,
+    from_centre,
     is_far,
     possible,
+    prior_deviations,
     relinearised,
 )
 
@@ -27,7 +28,7 @@ SPRING = ("gravity_compensator", "joint2")
 
 @lru_cache
 def about_the_spring() -> tuple[DiagnosisData, DiagnosisData, ModelSet, Baseline]:
-    """The scene before and after, the set with the spring, and the exact fit with it."""
+    """The data before and after, the set with the spring, and the exact fit with it."""
     model, table = campaign(":".join(SPRING))
     base = fit_baseline(model, table)
     dataset = diagnosis_data_of(base, possible(model, table)[0])
@@ -43,28 +44,27 @@ def about_the_spring() -> tuple[DiagnosisData, DiagnosisData, ModelSet, Baseline
 
 def test_the_residual_at_the_exact_fit_is_that_of_the_exact_fit() -> None:
     """A spring makes a signal of hundreds of deviations: a thousandth of it would not do."""
-    dataset, fresh, chosen, exact = about_the_spring()
+    dataset, about_fit, chosen, exact = about_the_spring()
     assert is_far(dataset, chosen)
     h = chosen.items[0].what
     x = dict(zip(exact.model.names, exact.x, strict=True))
     moved = np.array([x[f"{h.where}.{p.key}"] - p.nominal for p in h.parameters])
     moved[1:3] = 0.0  # the anchor may be anywhere about the joint: it has no size from the example
-    explained = fresh.packed(h, np.zeros(0)) @ (moved / fresh.sizes[SPRING])
-    width = fresh.fitted.width
-    beta = np.zeros(len(width))
-    n = len(away(fresh.base))
+    explained = about_fit.packed(h, np.zeros(0)) @ (moved / about_fit.sizes[SPRING])
+    beta = np.zeros(about_fit.data.X.shape[2])
+    n = len(from_centre(about_fit.base))
     shown = np.abs(exact.model.regressor(exact.observed.table, exact.x).B[:, :n]).max(axis=0) > 0
     assert shown.sum() <= len(beta)
-    beta[: shown.sum()] = (away(fresh.base)[shown]) / width[: shown.sum()]
-    left = fresh.data.r - fresh.data.X @ beta - explained
-    expected = fresh.blocks.pack(exact.residual.reshape(-1, 3, 1))[:, :, 0]
+    beta[: shown.sum()] = (from_centre(about_fit.base) / prior_deviations(about_fit.base))[shown]
+    left = about_fit.data.r - about_fit.data.X @ beta - explained
+    expected = about_fit.blocks.pack(exact.residual.reshape(-1, 3, 1))[:, :, 0]
     np.testing.assert_allclose(left, expected, atol=1e-9)
 
 
 def test_the_spring_leaves_nothing_for_its_imitators() -> None:
     """Before, its geometry is linearised where it is not, and eccentricity takes up the rest."""
-    _, fresh, chosen, _ = about_the_spring()
-    (other,) = (h for h in fresh.hypotheses if h.label == "gear_eccentricity at joint2")
-    alone = fit_set(fresh, chosen.items, chosen.noise)
-    both = fit_set(fresh, (*chosen.items, Item(other, np.zeros(0), 0.0)), chosen.noise)
+    _, about_fit, chosen, _ = about_the_spring()
+    (other,) = (h for h in about_fit.hypotheses if h.label == "gear_eccentricity at joint2")
+    alone = fit_set(about_fit, chosen.items, chosen.noise)
+    both = fit_set(about_fit, (*chosen.items, Item(other, np.zeros(0), 0.0)), chosen.noise)
     assert both.score < alone.score + 5

@@ -38,7 +38,7 @@ NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
 
 @lru_cache
 def empty() -> DiagnosisData:
-    """A scene with five effects to try; residuals are put in by `noisy`."""
+    """A data with five effects to try; residuals are put in by `noisy`."""
     model, table = campaign(n=24)
     hypotheses = [h for h in possible(model, table)[0] if h.name in TRIED]
     return diagnosis_data_of(fit_baseline(model, table), hypotheses)

@@ -42,14 +42,14 @@ def ripple(orders: tuple[float, ...], q: np.ndarray, visits: Measurements) -> Se
     model = Model.assembled(kr270_chain(), replace(plain.cell, model=spec))
     at = visits.q.copy()
     at[:, 3] = q
-    return grid_of(hypothesis("gear_ripple", "joint4", model), replace(visits, q=at), model.chain)
+    return grid_of(hypothesis("gear_ripple", "joint4", model), replace(visits, q=at))
 
 
 def test_the_prior_of_every_search_sums_to_one(visits) -> None:
     model, table = campaign()
     searched = set()
     for h in possible(model, table)[0]:
-        grid = grid_of(h, visits, model.chain)
+        grid = grid_of(h, visits)
         assert np.exp(grid.log_prior).sum() == pytest.approx(1.0)
         assert grid.values.shape == (len(grid.log_prior), len(h.settings)) == grid.step.shape
         searched |= {s.kind for s in h.settings}
@@ -74,7 +74,7 @@ def test_of_many_moments_some_are_tried_from_first_to_last() -> None:
 
 
 def test_time_constants_span_the_campaign(visits) -> None:
-    grid = grid_of(hypothesis("joint_drift", "joint2"), visits, campaign()[0].chain)
+    grid = grid_of(hypothesis("joint_drift", "joint2"), visits)
     span = np.ptp(visits.time)
     assert grid.values.min() < span / 10 and grid.values.max() > 2 * span
     # A drift between two grid points keeps nearly all of its shape.
@@ -123,7 +123,7 @@ def test_a_ripple_of_any_order_keeps_nine_tenths_of_its_size_on_the_grid(
 
 
 def test_what_has_no_constant_to_search_has_one_point(visits) -> None:
-    grid = grid_of(hypothesis("gear_eccentricity", "joint1"), visits, campaign()[0].chain)
+    grid = grid_of(hypothesis("gear_eccentricity", "joint1"), visits)
     assert grid.values.shape == (1, 0) and grid.log_prior[0] == 0
     assert (
         CATALOGUE["gear_eccentricity"].settings("joint1", kr270_chain(), campaign()[0].cell) == ()

@@ -97,11 +97,11 @@ def test_a_plan_lets_a_spring_be_anchored_anew(against_a_spring) -> None:
     """The distance from a spring is the one to whichever start imitates best in all visits, and
     the best start so far is one of them."""
     discrimination, chosen = against_a_spring, (3, 11, 20)
-    plain, about = discrimination.rows.imitations
+    plain, about = discrimination.rows.alternatives
     assert len(about) == 12 and plain == (discrimination.rows.groups[0],)
 
     def by(span: slice) -> np.ndarray:
-        rows = replace(discrimination.rows, imitations=(plain, (span,)))
+        rows = replace(discrimination.rows, alternatives=(plain, (span,)))
         one = replace(discrimination, rows=rows)
         return one.squared(one.gram(chosen))[0, 1]
 

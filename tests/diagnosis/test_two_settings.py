@@ -41,7 +41,8 @@ def readings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Model, 
     with forgotten():
         load_plugins(None, [str(write_example(folder, "settling_joint.py"))])
         chain, plain = kr270_chain(), cell()
-        yield Model(chain, plain), measured(chain, plain, [SETTLED], plan(chain, 40, 1), 1)
+        table = measured(chain, plain, [SETTLED], plan(chain, 40, 1), 1)
+        yield Model.assembled(chain, plain), table
 
 
 def hypothesis(model: Model, table: Measurements) -> Hypothesis:
@@ -63,7 +64,7 @@ def test_it_is_found_with_both_of_its_settings(readings) -> None:
 
 def test_the_grid_holds_every_combination_and_its_prior_sums_to_one(readings) -> None:
     model, table = readings
-    grid = grid_of(hypothesis(model, table), table, model.chain)
+    grid = grid_of(hypothesis(model, table), table)
     first, second = (np.unique(column) for column in grid.values.T)
     assert len(grid.values) == len(first) * len(second) == len(np.unique(grid.values, axis=0))
     assert np.exp(grid.log_prior).sum() == pytest.approx(1.0)
@@ -92,7 +93,7 @@ def test_a_product_too_large_is_thinned_evenly(readings) -> None:
         Setting("first_order", "order", None, 0.5, 1000.0),
         Setting("second_order", "order", 121.0, 0.5, 1000.0),
     )
-    grid = grid_of(replace(hypothesis(model, table), settings=orders), table, model.chain)
+    grid = grid_of(replace(hypothesis(model, table), settings=orders), table)
     assert MOST_POINTS / 2 < len(grid.values) <= MOST_POINTS
     assert np.exp(grid.log_prior).sum() == pytest.approx(1.0)
     first = np.unique(grid.values[:, 0])

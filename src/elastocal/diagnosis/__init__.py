@@ -3,7 +3,7 @@
 from elastocal import loaded_on_demand
 
 ROOMS = {
-    "backlash_model": "doubt under_other_law with_likelier_backlash_model",
+    "backlash_model": "doubt under_other_backlash_model with_likelier_backlash_model",
     "baseline": "Baseline Blocks VisitPlaces fit_baseline made_once thinned",
     "diagnose": "DiagnosisOptions",
     "diagnosis": (
@@ -11,14 +11,14 @@ ROOMS = {
         "FoundEffect Gap Location NoiseFloor RivalPair StructureTest Untested publish"
     ),
     "diagnosis_data": (
-        "DiagnosisData OutlierScreening away describe_faulty diagnosis_data_of reading_errors "
-        "screen_outliers widths"
+        "DiagnosisData OutlierScreening describe_faulty diagnosis_data_of from_centre "
+        "prior_deviations reading_errors screen_outliers"
     ),
     "discrimination": (
         "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"
     ),
     "effect_search": "ForwardSelection SelectedEffects Slot base_score is_far relinearised",
-    "evidence": "EntrySums Grams Prior Scan direct evidence_of scales_of scan",
+    "evidence": "EntrySums Grams Prior Scan direct evidence_of scan",
     "extended_cell": "write_extended_cell",
     "extra_poses": "expected expected_of_random fewest measuring_order plan_extra",
     "hypotheses": (
@@ -33,7 +33,7 @@ ROOMS = {
         "NoiseValues NoisyData Weighted covariance fit_noise likelihood log_prior noise_draws "
         "posterior project"
     ),
-    "rivals": "RivalSet Suspects imitations with_neighbours",
+    "rivals": "RivalSet Suspects alternatives with_neighbours",
     "shrinkage": (
         "Change Confirmation PosteriorDraw blocks_of_time left_out_residual new_pose_table "
         "noise_rms rms_with_interval squared_lengths"

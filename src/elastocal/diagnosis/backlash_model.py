@@ -1,4 +1,4 @@
-"""On which law the play of an arm's gears follows: load alone, or load and last motion.
+"""The backlash model of an arm's gears: whether play follows load alone, or load and last motion.
 
 A gear whose friction is small swings into the middle of its play, or onto the flank that any
 load pushes it to; one that is stiff in its bearings stays where the last motion left it until the
@@ -14,7 +14,8 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import Grams, scales_of
+from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.hypotheses import with_keys
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.model.effects.play import Backlash
@@ -22,58 +23,53 @@ from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
 EFFECT, BY_LOAD, BY_BOTH = Backlash.name, "load", "load_and_approach"
-LAWS = {BY_LOAD: BY_BOTH, BY_BOTH: BY_LOAD}
 
 
 def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
-    """The scene under the law of play that its readings make likelier.
+    """The data under the backlash model that its readings make likelier.
 
     Where no side of approach is recorded, or the cell has play already, it stays as it is.
     """
-    spec = dataset.base.model.cell.model
+    model, noise = dataset.base.model, dataset.noise
     play = [h for h in dataset.hypotheses if h.name == EFFECT]
-    if spec.play_side != BY_BOTH or not play:
+    if model.cell.model.play_side != BY_BOTH or not play:
         return dataset
-    noise = dataset.noise
-    other = replace(dataset.base, model=under_other_law(dataset.base.model))
+    other = replace(dataset.base, model=under_other_backlash_model(model))
     under_other = diagnosis_data_of(other, play)
-    under_other = replace(
-        under_other, data=replace(under_other.data, left_out=dataset.data.left_out)
-    )
-    here, there = _likeliest(dataset, noise), _likeliest(under_other, noise)
+    data = replace(under_other.data, left_out=dataset.data.left_out)
+    here, there = (_likeliest(d, noise) for d in (dataset, replace(under_other, data=data)))
     if there.score <= here.score:
-        return dataset.changed(other_play=doubt(here, there))
+        return dataset.changed(other_backlash=doubt(here, there))
     rows = dataset.columns.rows.copy()
     for h in play:
-        rows[:, :, dataset.columns.places[h.name, h.where]] = under_other.columns.of(h)
+        rows[:, :, dataset.columns.places[h.key]] = under_other.columns.of(h)
     return dataset.changed(
         base=other, columns=replace(dataset.columns, base=other, rows=rows),
-        other_play=doubt(there, here),
+        other_backlash=doubt(there, here),
     )  # fmt: skip
 
 
-def under_other_law(model: Model) -> Model:
-    """The model with play under the law that it does not have."""
-    spec = model.cell.model
-    spec = replace(spec, play_side=LAWS[spec.play_side])  # type: ignore[arg-type]
-    return Model.assembled(model.chain, replace(model.cell, model=spec))
+def under_other_backlash_model(model: Model) -> Model:
+    """The model with play under the backlash model that it does not have."""
+    by_load = model.cell.model.play_side == BY_LOAD
+    return with_keys(model, play_side=BY_BOTH if by_load else BY_LOAD)
 
 
 def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
     """Play in the joint where it is likeliest, the noise fitted beside it."""
     play = [h for h in dataset.hypotheses if h.name == EFFECT]
     grams = Grams(dataset, dataset.data, project(dataset.data, noise))
-    evidence = [float(grams.of_hypothesis(h).evidence(scales_of(h)).max()) for h in play]
+    evidence = [float(grams.of_hypothesis(h).evidence(h.scales).max()) for h in play]
     likeliest = play[int(np.argmax(evidence))]
     return fit_set(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
 
 
 def doubt(better: ModelSet, other: ModelSet) -> float:
-    """Probability of the less likely law: the larger of 1/(1 + exp Σ d) and Φ(−Σ d / √Σ d²).
+    """Probability of the less likely model: the larger of 1/(1 + exp Σ d) and Φ(−Σ d / √Σ d²).
 
     d (configurations,) is what each adds to the log likelihood ratio under the noise of `better`.
-    Both laws idealise what happens in the dead zone, so that one or two configurations there may
-    speak loudly for the wrong one; by the test of Vuong (1989, Econometrica 57) for laws of which
+    Both models idealise what happens in the dead zone, so that one or two configurations there may
+    speak loudly for the wrong one; by the test of Vuong (1989, Econometrica 57) for models of which
     none is quite true, their ratio counts against its own scatter.
     """
     others = _squares(other.data, project(other.data, better.noise))

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from elastocal.errors import InputError
 from elastocal.identification.identifiability import Problem
-from elastocal.identification.least_squares import Fit
 from elastocal.identification.solve import PLACING, is_placed, sizes_and_check, tied_fit
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import (
@@ -26,8 +25,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
 from elastocal.tracker_noise import available_noise
 from elastocal.units import Array, IntArray
-
-# Readings gathered by configuration: what shares noise stands in one block.
 
 
 @dataclass(frozen=True)
@@ -138,9 +135,6 @@ class VisitPlaces:
         return out
 
 
-# The calibrated arm before any further effect, and what its readings look like beside it.
-
-
 @dataclass(frozen=True)
 class Baseline:
     """The cell's own model fitted to the table, all parameters weakly tied to their start.
@@ -160,6 +154,15 @@ class Baseline:
     nominal: Array
     stated: Array | None
     planned: int = 0
+
+    @property
+    def covariance(self) -> Array:
+        """The noise (N, size, size) that is stated; else only its shape, the residual's variances
+        along the axes."""
+        if self.stated is not None:
+            return self.stated
+        each = self.residual.reshape(-1, self.observed.size)
+        return np.tile(np.diag(np.maximum(each.var(axis=0), 1e-18)), (len(each), 1, 1))
 
     @property
     def n_measured(self) -> int:
@@ -199,9 +202,11 @@ def fit_baseline(
     if len(placed) and not started:
         base = tied_fit(replace(problem, free=placed), sizes, PLACING)
         problem, nominal = replace(problem, x0=base.x), base.residual
-    found: Fit | None = tied_fit(problem, sizes, PLACING) if len(free) else None
-    x = x0 if found is None else found.x
-    residual = residual_at(model, problem.parts, x) if found is None else found.residual
+    if len(free):
+        found = tied_fit(problem, sizes, PLACING)
+        x, residual = found.x, found.residual
+    else:
+        x, residual = x0, residual_at(model, problem.parts, x0)
     if nominal is None:
         unknown = np.full_like(residual, np.nan)
         nominal = unknown if started else residual_at(model, problem.parts, problem.x0)
@@ -217,10 +222,8 @@ def _stated(observed: Observations, model: Model, weights: Weights) -> Array | N
         rows = stated_covariance(observed, model.cell.tracker, kind)[0]
     except InputError:
         return None
-    squared = observed.combine.power(2)
-    return np.asarray(squared @ rows.reshape(len(rows), -1)).reshape(
-        -1, observed.size, observed.size
-    )
+    stated = observed.combine.power(2) @ rows.reshape(len(rows), -1)
+    return np.asarray(stated).reshape(-1, observed.size, observed.size)
 
 
 # Large tables are looked at in part: what more readings would add is time and memory.
@@ -238,17 +241,17 @@ def thinned(table: Measurements) -> tuple[Measurements, str | None]:
     configurations those evenly spaced in the order they were measured, so that whatever changes
     with time still does.
     """
-    kept = table.take(_first_of_each(table))
-    labels, first, rows = np.unique(kept.configuration, return_index=True, return_counts=True)
+    part = table.take(_first_of_each(table))
+    labels, first, rows = np.unique(part.configuration, return_index=True, return_counts=True)
     order = labels[np.argsort(first)]
     wanted = int(MOST_ROWS / rows.mean())
     if len(order) > wanted:
         chosen = order[np.linspace(0, len(order) - 1, wanted).round().astype(int)]
-        kept = kept.take(np.isin(kept.configuration, chosen))
-    if len(kept) == len(table):
+        part = part.take(np.isin(part.configuration, chosen))
+    if len(part) == len(table):
         return table, None
-    return kept, (
-        f"the table is large: {len(kept)} of {len(table)} rows were looked at, from "
+    return part, (
+        f"the table is large: {len(part)} of {len(table)} rows were looked at, from "
         f"{min(len(order), wanted)} of {len(order)} configurations, evenly spaced"
     )
 

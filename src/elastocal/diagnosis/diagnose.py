@@ -18,21 +18,27 @@ from elastocal.diagnosis.diagnosis_data import (
 )
 from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
-from elastocal.diagnosis.gap import budget, curves_of, location, structure_tests
-from elastocal.diagnosis.hypotheses import Hypothesis, model_keys, possible, with_recorded_drivers
+from elastocal.diagnosis.hypotheses import model_keys, possible, with_recorded_drivers
 from elastocal.diagnosis.model_set import settings_of
-from elastocal.diagnosis.shrinkage import Confirmation, between_visits, refit, shrinkage
+from elastocal.diagnosis.shrinkage import Confirmation, between_visits, budget, refit, shrinkage
 from elastocal.diagnosis.unknown import generic_blocks
-from elastocal.diagnosis.verdict import Answer, candidates, judge, too_small, warnings
+from elastocal.diagnosis.verdict import (
+    Answer,
+    candidates,
+    curves_of,
+    judge,
+    location,
+    structure_tests,
+    too_small,
+    warnings,
+)
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed
-from elastocal.units import Progress
-
-# How to diagnose.
+from elastocal.units import BoolArray, Progress
 
 
 @dataclass(frozen=True)
@@ -61,8 +67,6 @@ class DiagnosisOptions:
                     f"the catalogue has: {listed(list(CATALOGUE))}"
                 )
 
-
-# Why the arm still differs from its model: the whole diagnosis, step by step.
 
 FEWEST = 8  # configurations
 
@@ -101,8 +105,6 @@ def diagnose(
     gap, steps = budget(dataset, found, rng)
     findings = _findings(found, answer, base, rng)
     tests = structure_tests(found.first)
-    chosen = found.chosen
-    nothing = found.slots[0].probabilities()[1]
     p_first = exceedance(found.first.flipped, found.first.odds)
     return Diagnosis(
         verdict=answer.verdict,
@@ -112,12 +114,12 @@ def diagnose(
         candidates=candidates(dataset, found, answer),
         indistinguishable=answer.indistinguishable,
         location=location(found, tests),
-        noise=noise_floor(found.dataset, chosen.data, chosen.noise),
+        noise=noise_floor(found.dataset, found.chosen.data, found.chosen.noise),
         structure=tests,
-        probability_nothing=nothing,
+        probability_nothing=found.slots[0].probabilities()[1],
         probability_unknown=_unknown(found),
         p_value=found.p_values[0] if found.p_values else p_first,
-        curves=curves_of(found.dataset, chosen),
+        curves=curves_of(found.dataset, found.chosen),
         untested=(*untested, *too_small(dataset, found)),
         warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
         n_readings=dataset.blocks.n,
@@ -142,26 +144,26 @@ def _unknown(found: SelectedEffects) -> float:
 def _searched(
     dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
 ) -> tuple[DiagnosisData, SelectedEffects, OutlierScreening]:
-    """What is missing, and the scene without the faulty readings, which are sought twice: beside a
+    """What is missing, and the data without the faulty readings, which are sought twice: beside a
     large effect nothing looks faulty, or the wrong readings do."""
+
+    def search_without(faulty: BoolArray) -> tuple[ForwardSelection, SelectedEffects]:
+        good = dataset.without(faulty)
+        blocks, level = generic_blocks(good), options.false_alarm
+        search = ForwardSelection(good, blocks, good.noise, level, options.seed)
+        return search, search.run()
+
     progress("noise floor")
     screened = screen_outliers(dataset, dataset.data)
     progress("searching for what is missing")
-    search = _search(dataset.without(screened.faulty), options)
-    found = search.run()
+    search, found = search_without(screened.faulty)
     if found.chosen.items:
         before = screened.faulty
         screened = screen_outliers(found.dataset, found.chosen.data.without(np.zeros_like(before)))
         if (screened.faulty != before).any():
             progress("searching again without faulty readings")
-            search = _search(dataset.without(screened.faulty), options)
-            found = search.run()
+            search, found = search_without(screened.faulty)
     return dataset.without(screened.faulty), search.settled(found), screened
-
-
-def _search(dataset: DiagnosisData, options: DiagnosisOptions) -> ForwardSelection:
-    blocks = generic_blocks(dataset)
-    return ForwardSelection(dataset, blocks, dataset.noise, options.false_alarm, options.seed)
 
 
 def _check_enough(table: Measurements) -> None:
@@ -185,22 +187,15 @@ def _findings(
     parameters = refit(confirmation.parameters, [chosen.items[k] for k in known])
     findings = []
     for k in known:
-        what = chosen.items[k].what
-        assert isinstance(what, Hypothesis)
+        item = chosen.items[k]
         posterior_draws = confirmation.posterior_draws(k, answer.rivals[k])
         change = between_visits(dataset, chosen, k)
         measured = len(dataset.blocks.member)
-        fall = shrinkage(posterior_draws, measured, confirmation.unnamed, change, rng)
+        reduction, ci90, ci95 = shrinkage(
+            posterior_draws, measured, confirmation.unnamed, change, rng
+        )
+        fitted, settings = parameters[item.key], settings_of(item)
         findings.append(
-            FoundEffect(
-                what.name,
-                what.where,
-                answer.probability[k],
-                fall.reduction,
-                fall.ci90,
-                fall.ci95,
-                parameters[what.name, what.where],
-                settings_of(chosen.items[k]),
-            )
+            FoundEffect(*item.key, answer.probability[k], reduction, ci90, ci95, fitted, settings)
         )
     return tuple(findings)

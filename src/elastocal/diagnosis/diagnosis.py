@@ -45,15 +45,15 @@ class ExtraPlan:
     approach direction, time, monuments).
     """
 
+    separable: bool
+    inseparable: tuple[tuple[str, ...], ...]
+    n_poses: int
     rivals: tuple[str, ...]
     pairs: tuple[RivalPair, ...]
     plan: Measurements | None
-    n_poses: int
     probability_before: float
     probability_after: float
     probability_random: float
-    separable: bool
-    inseparable: tuple[tuple[str, ...], ...]
     advice: tuple[str, ...]
 
 
@@ -61,11 +61,12 @@ class ExtraPlan:
 
 Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
 Interval = tuple[float, float]
+MICRO = 1e6
 
 # A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
 # Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
-SEEN, FAINTEST = 5.0, 3.0
-STRUCTURE = 0.05  # family-wise p-value from which on a driver is told
+VISIBLE, FAINTEST = 5.0, 3.0
+STRUCTURE = 0.05  # family-wise p-value up to which the dependence on a covariate is told
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class FoundEffect:
     """An effect held to be real (or, where the verdict is ambiguous, the likeliest of a set).
 
     `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
-    the 3-D error of noise-free fresh poses falls when the effect joins the model, with 90 and 95 %
+    the 3-D error of noise-free new poses falls when the effect joins the model, with 90 and 95 %
     intervals.  `settings` are its searched constants (orders, times) by their keys.
     """
 
@@ -125,12 +126,12 @@ class Candidate:
     @property
     def seen_from(self) -> float:
         """The size, in typical sizes, from which it would have been seen."""
-        return SEEN / self.detectable if self.detectable > 0 else math.inf
+        return VISIBLE / self.detectable if self.detectable > 0 else math.inf
 
     @property
     def visible(self) -> bool:
         """Whether it would have shown at its typical size."""
-        return self.detectable >= SEEN
+        return self.detectable >= VISIBLE
 
     @property
     def hidden(self) -> bool:
@@ -160,11 +161,11 @@ class Gap:
 
 @dataclass(frozen=True)
 class StructureTest:
-    """Does the residual depend on `driver` at all?  Names no effect.
+    """Does the residual depend on the covariate `driver` at all?  Names no effect.
 
-    `driver` is "joint2 angle", "joint3 torque", "time", "load", "approach of joint1", ….
-    `p_value` by sign flips of whole configurations, for the largest statistic of the driver's
-    tests; `p_family` the same against the largest over all drivers.
+    It is "joint2 angle", "joint3 torque", "time", "load", "approach of joint1", ….  `p_value` by
+    sign flips of whole configurations, for the largest statistic of the covariate's tests;
+    `p_family` the same against the largest over all covariates.
     """
 
     driver: str
@@ -174,7 +175,8 @@ class StructureTest:
 
 @dataclass(frozen=True)
 class Curve:
-    """The shape of an unknown dependence: motion of `entry` as a smooth function of `driver`.
+    """The shape of an unknown dependence: motion of `entry` as a smooth function of a covariate,
+    `driver`.
 
     `x` in `x_unit` over the measured range, `y` and its standard deviation `sd` in `y_unit`.
     One curve per component of the entry that moves.
@@ -302,7 +304,7 @@ class Diagnosis(Result):
 
     @property
     def dependences(self) -> tuple[StructureTest, ...]:
-        """Drivers that the residual depends on, the most conspicuous first."""
+        """Covariates that the residual depends on, the most conspicuous first."""
         found = [t for t in self.structure if t.p_family <= STRUCTURE]
         return tuple(sorted(found, key=lambda t: t.p_family))
 
@@ -315,7 +317,7 @@ class Diagnosis(Result):
         readings and loads per configuration only make smaller effects visible.
         """
         independent = 3 * self.n_configurations
-        return SEEN * self.gap.noise_floor / math.sqrt(independent) if independent else math.nan
+        return VISIBLE * self.gap.noise_floor / math.sqrt(independent) if independent else math.nan
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -348,52 +350,33 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         remedy = f"{option('plan', 'extra.csv')} designs the poses that tell the rivals apart."
         yield Finding("rivals_open", "note", {}, remedy)
     if d.dependences:
-        yield Finding(
-            "depends_on", "note",
-            {
-                "drivers": tuple(t.driver for t in d.dependences),
-                "p_family": tuple(t.p_family for t in d.dependences),
-            },
-        )  # fmt: skip
-    yield Finding(
-        "sensitivity", "note",
-        {
-            "smallest_seen_um": d.smallest_seen * 1e6, "candidates": len(d.candidates),
-            "visible": sum(c.visible for c in d.candidates),
-            "hidden": sum(c.hidden for c in d.candidates),
-        },
-    )  # fmt: skip
+        drivers, p_family = zip(*((t.driver, t.p_family) for t in d.dependences), strict=True)
+        yield Finding("depends_on", "note", {"drivers": drivers, "p_family": p_family})
+    visible, hidden = (sum(c.visible for c in d.candidates), sum(c.hidden for c in d.candidates))
+    numbers = {"smallest_seen_um": d.smallest_seen * MICRO, "candidates": len(d.candidates)}
+    yield Finding("sensitivity", "note", numbers | {"visible": visible, "hidden": hidden})
     if d.noise.faulty:
-        worst = max(f.error for f in d.noise.faulty)
-        yield Finding(
-            "faulty_readings", "note", {"left_out": len(d.noise.faulty), "worst_um": worst * 1e6}
-        )
+        worst = max(f.error for f in d.noise.faulty) * MICRO
+        numbers = {"left_out": len(d.noise.faulty), "worst_um": worst}
+        yield Finding("faulty_readings", "note", numbers)
 
 
 def _remedy(verdict: Verdict) -> str:
     """What to do after a verdict."""
-    if verdict == "explained":
-        return (
-            f"Identify with the cell that {option('cell_out')} writes, and check the promise on "
-            f"poses that were never fitted (identify with {option('test')})."
-        )
-    if verdict == "ambiguous":
-        return (
-            "Compensating with the likeliest of the set serves poses and loads like those "
-            "measured; beyond them the rivals may predict differently."
-        )
-    if verdict == "unknown_effect":
-        return (
-            "Look for a physical cause where the evidence points, and measure more where the curve "
-            "is steep; compensate nothing by a name that the data do not support."
-        )
-    return "Nothing calls for another effect in the model."
+    return {
+        "explained": f"Identify with the cell that {option('cell_out')} writes, and check the "
+        f"promise on poses that were never fitted (identify with {option('test')}).",
+        "ambiguous": "Compensating with the likeliest of the set serves poses and loads like those "
+        "measured; beyond them the rivals may predict differently.",
+        "unknown_effect": "Look for a physical cause where the evidence points, and measure more "
+        "where the curve is steep; compensate nothing by a name that the data do not support.",
+        "nothing_significant": "Nothing calls for another effect in the model.",
+    }[verdict]
 
 
 # A diagnosis as JSON: schema elastocal/diagnosis/1.
 
 SCHEMA = "elastocal/diagnosis/1"
-MICRO = 1e6
 NORMAL_95 = 1.959964
 
 
@@ -421,12 +404,12 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
             "noise_floor_um": d.gap.noise_floor * MICRO,
         },
         "budget": [_step(step) for step in d.budget],
-        "effects": [_finding(finding) for finding in d.effects],
-        "candidates": [_candidate(candidate) for candidate in d.candidates],
-        "indistinguishable": [[_place(e) for e in rivals] for rivals in d.indistinguishable],
+        "effects": [_found(effect) for effect in d.effects],
+        "candidates": [vars(candidate) for candidate in d.candidates],
+        "indistinguishable": [[vars(e) for e in rivals] for rivals in d.indistinguishable],
         "location": None if d.location is None else _location(d.location),
         "structure": [vars(test) for test in d.structure],
-        "curves": [_curve(curve) for curve in d.curves],
+        "curves": [vars(curve) for curve in d.curves],
         "noise": _noise(d.noise, model.chain.kinds),
         "untested": [vars(u) for u in d.untested],
         "extra_plan": None if d.extra is None else _extra(d.extra),
@@ -441,62 +424,20 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
 
 
 def _step(step: BudgetStep) -> dict[str, Any]:
-    return {
-        "step": step.step,
-        "heldout_rms_um": step.heldout_rms * MICRO,
-        "ci95": [end * MICRO for end in step.ci95],
-    }
+    ends = [end * MICRO for end in step.ci95]
+    return {"step": step.step, "heldout_rms_um": step.heldout_rms * MICRO, "ci95": ends}
 
 
-def _place(e: EffectAt | FoundEffect | Candidate) -> dict[str, Any]:
-    return {"effect": e.effect, "where": e.where}
+def _found(f: FoundEffect) -> dict[str, Any]:
+    def ends(p: FittedParameter) -> list[float]:
+        return [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]
 
-
-def _finding(f: FoundEffect) -> dict[str, Any]:
-    return _place(f) | {
-        "probability": f.probability,
-        "gap_reduction": f.gap_reduction,
-        "gap_reduction_ci90": f.gap_reduction_ci90,
-        "gap_reduction_ci95": f.gap_reduction_ci95,
-        "parameters": [
-            {
-                "name": p.name,
-                "value": p.value,
-                "unit": p.unit,
-                "std": p.std,
-                "ci95": [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std],
-            }
-            for p in f.parameters
-        ],
-        "settings": f.settings,
-    }
-
-
-def _candidate(c: Candidate) -> dict[str, Any]:
-    return _place(c) | {
-        "stage": c.stage,
-        "probability": c.probability,
-        "score": c.score,
-        "detectable": c.detectable,
-        "settings": c.settings,
-    }
+    return vars(f) | {"parameters": [vars(p) | {"ci95": ends(p)} for p in f.parameters]}
 
 
 def _location(location: Location) -> dict[str, Any]:
-    return {
-        "stage": location.stage,
-        "where": location.where,
-        "probability": location.probability,
-        "evidence": {
-            "stages": location.stages,
-            "places": location.places,
-            "drivers": location.drivers,
-        },
-    }
-
-
-def _curve(c: Curve) -> dict[str, Any]:
-    return vars(c) | {name: list(getattr(c, name)) for name in ("x", "y", "sd")}
+    out = dict(vars(location))
+    return out | {"evidence": {key: out.pop(key) for key in ("stages", "places", "drivers")}}
 
 
 def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
@@ -505,12 +446,8 @@ def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
         "stated_factor": noise.stated_factor,
         "reading_sigma_um": noise.reading_sigma * MICRO,
         "repeatability": [
-            {
-                "where": f"joint{i + 1}",
-                "value": value,
-                "unit": "rad" if kind == "revolute" else "m",
-            }
-            for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
+            {"where": f"joint{i}", "value": value, "unit": "rad" if kind == "revolute" else "m"}
+            for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True), 1)
         ],
         "shared": noise.shared,
         "pure_error_um": None if noise.pure_error is None else noise.pure_error * MICRO,
@@ -520,23 +457,11 @@ def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
 
 def _faulty(reading: FaultyReading) -> dict[str, Any]:
     return {
-        "line": reading.line,
-        "configuration": reading.configuration,
-        "marker": reading.marker,
-        "error_um": reading.error * MICRO,
-        "sigmas": reading.sigmas,
+        "error_um" if key == "error" else key: value * MICRO if key == "error" else value
+        for key, value in vars(reading).items()
     }
 
 
 def _extra(extra: ExtraPlan) -> dict[str, Any]:
-    return {
-        "separable": extra.separable,
-        "inseparable": [list(group) for group in extra.inseparable],
-        "n_poses": extra.n_poses,
-        "rivals": list(extra.rivals),
-        "pairs": [vars(pair) for pair in extra.pairs],
-        "probability_before": extra.probability_before,
-        "probability_after": extra.probability_after,
-        "probability_random": extra.probability_random,
-        "advice": list(extra.advice),
-    }
+    content = {key: value for key, value in vars(extra).items() if key != "plan"}
+    return content | {"pairs": [vars(pair) for pair in extra.pairs]}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,9 +18,7 @@ from elastocal.diagnosis.hypotheses import (
     RegressorDirection,
     SettingsGrid,
     compute_columns,
-    entry_key,
     grid_of,
-    is_driven,
     moments_between,
     recorded,
     typical_sizes,
@@ -31,9 +29,7 @@ from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE, effect_of
 from elastocal.model.effects.loads import PayloadError
 from elastocal.model.manipulator import Model
-from elastocal.units import Array, BoolArray
-
-# Everything that a diagnosis looks at: readings in blocks, fitted columns, what could be added.
+from elastocal.units import Array, BoolArray, IntArray
 
 # Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough
 # to leave them to the data, narrow enough that what no reading shows stays where it is.
@@ -41,17 +37,9 @@ FITTED, FITTED_COMPLIANCE = 5.0, 1.0
 # m or rad: base and markers.  The fit has placed them, but an error that it took for another
 # geometry may have moved them by as much; the true effect must be free to bring them back.
 PLACED = 0.1
-KEPT = 20_000_000  # numbers of a search's drives that are kept from scan to scan
+KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
 # The load hangs on a flange frame that the markers' freedom leaves undetermined to millimetres.
 LOAD_POINT_TOLERANCE = 2e-3
-
-
-@dataclass(frozen=True)
-class FittedColumns:
-    """What the columns of the data's X are: `effect` of each, `width` (p,) that scales it."""
-
-    effect: tuple[str, ...]
-    width: Array
 
 
 @dataclass(frozen=True)
@@ -59,28 +47,38 @@ class DiagnosisData:
     """A baseline with the columns of all hypotheses, packed by configuration.
 
     `data` holds the residual at the prior's centre, linearised at the fit, the fitted columns
-    (scaled to their prior deviations) and noise shapes; `load_point` (C, m, 3) what a shift of the
-    hook does, per m, None without a load.  `other_play` is the probability that play follows the
-    law that the base's model does not have.
+    (scaled to their prior deviations) and noise shapes; `fitted` names the effect of each of these
+    columns, `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a
+    load.  `other_backlash` is the probability that play follows the backlash model that the base's
+    model does not have.
     """
 
     base: Baseline
     columns: Columns
     hypotheses: tuple[Hypothesis, ...]
-    blocks: Blocks
-    places: VisitPlaces
     data: NoisyData
-    fitted: FittedColumns
+    fitted: tuple[str, ...]
     load_point: Array | None = None
-    other_play: float = 0.0
+    other_backlash: float = 0.0
+    _packed: dict[EntryKey | tuple[str, str], Array] = field(init=False, default_factory=dict)
+    _kept: dict[tuple[str, str, bytes], Array] = field(init=False, default_factory=dict)
 
-    @cached_property
-    def _packed(self) -> dict[EntryKey | tuple[str, str], Array]:
-        return {}
+    @property
+    def blocks(self) -> Blocks:
+        return self.data.blocks
 
-    @cached_property
-    def _kept(self) -> dict[tuple[str, str, bytes], Array]:
-        return {}
+    @property
+    def places(self) -> VisitPlaces:
+        return self.blocks.places
+
+    @property
+    def table(self) -> Measurements:
+        return self.base.observed.table
+
+    @property
+    def lead(self) -> IntArray:
+        """Row (N,) of the table that each observation stands in first."""
+        return self.base.observed.lead
 
     @cached_property
     def noise(self) -> NoiseValues:
@@ -90,9 +88,7 @@ class DiagnosisData:
     @cached_property
     def visit_table(self) -> Measurements:
         """One row for each visit (C·v), the first of its readings."""
-        return self.base.observed.table.take(
-            self.base.observed.lead[np.maximum(self.places.example, 0)].ravel()
-        )
+        return self.table.take(self.lead[np.maximum(self.places.example, 0)].ravel())
 
     @property
     def present(self) -> BoolArray:
@@ -112,31 +108,26 @@ class DiagnosisData:
     @cached_property
     def sizes(self) -> dict[tuple[str, str], Array]:
         """Typical size of every hypothesis' parameters, by effect and place."""
-        return {(h.name, h.where): self._sizes(h) for h in self.hypotheses}
+        return {
+            h.key: np.array([p.typical or 0.0 for p in h.parameters]) if h.driven
+            else self.sizes_in(h, self.columns.of(h))
+            for h in self.hypotheses
+        }  # fmt: skip
 
-    def _sizes(self, h: Hypothesis) -> Array:
-        if is_driven(h):
-            return np.array([p.typical or 0.0 for p in h.parameters])
-        measured = self.columns.observed(self.columns.of(h))[: self.base.n_measured]
-        return typical_sizes(h, measured)
+    def sizes_in(self, h: Hypothesis, rows: Array) -> Array:
+        """Its typical sizes by columns (n_rows, size, k), what is only planned not counted."""
+        return typical_sizes(h, self.columns.observed(rows)[: self.base.n_measured])
 
     @cached_property
-    def drives(self) -> dict[tuple[str, str], RegressorDirection]:
-        return {
-            (h.name, h.where): RegressorDirection(h, self.base.model)
-            for h in self.hypotheses
-            if is_driven(h)
-        }
+    def directions(self) -> dict[tuple[str, str], RegressorDirection]:
+        model = self.base.model
+        return {h.key: RegressorDirection(h, model) for h in self.hypotheses if h.driven}
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
         """Settings that are searched, by effect and place."""
-        table, model = self.visit_table.take(self.present.ravel()), self.base.model
-        return {
-            (h.name, h.where): grid_of(h, table, model.chain)
-            for h in self.hypotheses
-            if is_driven(h)
-        }
+        table = self.visit_table.take(self.present.ravel())
+        return {h.key: grid_of(h, table) for h in self.hypotheses if h.driven}
 
     @cached_property
     def moments(self) -> Array:
@@ -145,14 +136,14 @@ class DiagnosisData:
         time = self.visit_table.time
         return np.zeros(0) if time is None else moments_between(time[self.present.ravel()])
 
-    def drive(self, h: Hypothesis, settings: Array) -> Array:
+    def direction(self, h: Hypothesis, settings: Array) -> Array:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)
-        where all visits of a configuration are driven alike."""
-        key = h.name, h.where, settings.tobytes()
+        where it is the same in all visits of a configuration."""
+        key = *h.key, settings.tobytes()
         if key in self._kept:
             return self._kept[key]
-        visits, present = self._driven_visits[h.name, h.where]
-        D = self.drives[h.name, h.where](visits, settings) * self.sizes[h.name, h.where]
+        visits, present = self._driven_visits[h.key]
+        D = self.directions[h.key](visits, settings) * self.sizes[h.key]
         D = D.reshape(*present.shape, *D.shape[1:]) * present[:, :, None, None, None]
         D = np.ascontiguousarray(D.transpose(0, 1, 3, 2, 4))
         if D.size + sum(kept.size for kept in self._kept.values()) <= KEPT:
@@ -161,33 +152,32 @@ class DiagnosisData:
 
     @cached_property
     def _driven_visits(self) -> dict[tuple[str, str], tuple[Measurements, BoolArray]]:
-        """Of each driven hypothesis the visits (C·v) that its drive is evaluated at and which of
-        them there are (C, v): one of each configuration where the others are driven alike."""
+        """Of each driven hypothesis the visits (C·v) that its direction is evaluated at and which
+        of them there are (C, v): one of each configuration where it is the same in the others."""
         every, present = self.visit_table, self.present
         first = np.zeros_like(present)
         first[:, 0] = True
         one_each = every.take(first.ravel())
         out = {}
-        for key, drive in self.drives.items():
-            asked = drive.asked(every).reshape(*present.shape, -1)
-            alike = (asked == asked[:, :1]) | ~present[:, :, None]
-            out[key] = (one_each, present[:, :1]) if alike.all() else (every, present)
+        for key, direction in self.directions.items():
+            asked = direction.asked(every).reshape(*present.shape, -1)
+            same = (asked == asked[:, :1]) | ~present[:, :, None]
+            out[key] = (one_each, present[:, :1]) if same.all() else (every, present)
         return out
 
     def packed(self, h: Hypothesis, settings: Array) -> Array:
         """Columns (C, m, k) of a hypothesis at one value of its `settings` (…,), scaled; not to be
         written to."""
-        size = self.sizes[h.name, h.where]
-        if not is_driven(h):
-            if (h.name, h.where) not in self._packed:
-                self._packed[h.name, h.where] = self.pack(self.columns.of(h)) * size
-            return self._packed[h.name, h.where]
-        D = self.drives[h.name, h.where](self.base.observed.table, settings[None])[:, 0]
-        rows = self.columns.entry(entry_key(h, self.base.model)) @ D
-        return self.pack(rows) * size
+        size = self.sizes[h.key]
+        if not h.driven:
+            if h.key not in self._packed:
+                self._packed[h.key] = self.pack(self.columns.of(h)) * size
+            return self._packed[h.key]
+        D = self.directions[h.key](self.table, settings[None])[:, 0]
+        return self.pack(self.columns.entry(h.entry_key(self.base.model)) @ D) * size
 
     def changed(self, **changes: Any) -> DiagnosisData:
-        """The same readings seen otherwise: their noise beside the fitted parameters stays."""
+        """The same readings with other columns: their noise beside the fitted parameters stays."""
         other = replace(self, **changes)
         if "noise" in self.__dict__:
             other.__dict__["noise"] = self.noise
@@ -211,57 +201,45 @@ def diagnosis_data_of(
     `around` is the base's model with some of the hypotheses in it, at its values x: columns are
     those there, and the residual is the baseline's.
     """
-    model, observed = base.model, base.observed
-    hook = _load_hypothesis(base)
-    known = {(h.name, h.where) for h in hypotheses}
-    asked = [*hypotheses, *(h for h in hook if (h.name, h.where) not in known)]
+    model, observed, blocks = base.model, base.observed, base.blocks
+    loads = _load_hypotheses(base)
+    known = {h.key for h in hypotheses}
+    asked = [*hypotheses, *(h for h in loads if h.key not in known)]
     if around is None or x is None:
         around, x = model, base.x
     columns = compute_columns(base, asked, dict(zip(around.names, x, strict=True)))
-    blocks = base.blocks
     own = np.array([around.names.index(name) for name in model.names], dtype=np.int64)
     at = around.regressor(observed.table, x, own, observed)
-    width = widths(base)
+    width = prior_deviations(base)
     effects = [p.effect for p in model.parameters]
     B = at.B.reshape(len(observed.lead), observed.size, -1) * width
-    residual = base.residual.reshape(-1, observed.size) + B @ (away(base) / width)
+    residual = base.residual.reshape(-1, observed.size) + B @ (from_centre(base) / width)
     load_point = None
-    for h in hook:
+    for h in loads:
         keys = [k for k, p in enumerate(h.parameters) if p.key.startswith("load_point")]
         shift = columns.observed(columns.of(h)[:, :, keys])
         load_point = blocks.pack(shift)
         B = np.concatenate([B, shift * LOAD_POINT_TOLERANCE], axis=2)
-        width = np.append(width, np.full(len(keys), LOAD_POINT_TOLERANCE))
-        effects = effects + [h.name] * len(keys)
+        effects += [h.name] * len(keys)
     used = np.abs(B).max(axis=(0, 1), initial=0.0) > 0
     B = B[:, :, used]
-    n_joints = model.chain.n_joints
-    names = [("joint_motion", f"joint{i + 1}") for i in range(n_joints)]
-    G = np.concatenate([columns.rows[:, :, columns.places[k]] for k in names], axis=2)[
-        observed.lead
-    ]
-    stated = base.stated
-    if stated is None:
-        each = base.residual.reshape(-1, observed.size)
-        stated = np.tile(np.diag(np.maximum(each.var(axis=0), 1e-18)), (len(each), 1, 1))
+    joints = tuple(f"joint{i + 1}" for i in range(model.chain.n_joints))
     data = NoisyData(
         blocks=blocks,
         r=blocks.pack(residual[:, :, None])[:, :, 0],
         X=blocks.pack(B),
         precision=np.ones(B.shape[2]),
-        covariance=blocks.pack_square(stated),
-        G=blocks.pack(G),
+        covariance=blocks.pack_square(base.covariance),
+        G=blocks.pack(columns.entry(("joint_motion", joints))[observed.lead]),
         same_visit=blocks.same_visit,
         left_out=blocks.absent,
         stated=base.stated is not None,
     )
-    fitted = FittedColumns(tuple(e for e, u in zip(effects, used, strict=True) if u), width[used])
-    return DiagnosisData(
-        base, columns, tuple(hypotheses), blocks, blocks.places, data, fitted, load_point
-    )
+    fitted = tuple(e for e, u in zip(effects, used, strict=True) if u)
+    return DiagnosisData(base, columns, tuple(hypotheses), data, fitted, load_point)
 
 
-def away(base: Baseline) -> Array:
+def from_centre(base: Baseline) -> Array:
     """How far (parameters,) the fit is from the centre of the prior: nominal, but for what
     registration placed, which is where it is.
 
@@ -270,19 +248,18 @@ def away(base: Baseline) -> Array:
     return np.where(is_placed(base.model), 0.0, base.x - base.model.nominal)
 
 
-def widths(base: Baseline) -> Array:
+def prior_deviations(base: Baseline) -> Array:
     """Prior standard deviation (parameters,) of each fitted parameter."""
     compliant = [effect_of(p.effect).sized_by_value for p in base.model.parameters]
     wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
     return np.where(is_placed(base.model), PLACED, wide)
 
 
-def _load_hypothesis(base: Baseline) -> list[Hypothesis]:
-    """The load's own error, whose hook point has a tolerance in any case."""
+def _load_hypotheses(base: Baseline) -> list[Hypothesis]:
+    """The load's own error, whose load point has a tolerance in any case."""
     effect, model = CATALOGUE[PayloadError.name], base.model
-    if not recorded(base.observed.table, "load") or model.cell.model.torque == "measured":
-        return []
-    if any(p.effect == effect.name for p in model.parameters):
+    acting = recorded(base.observed.table, "load") and model.cell.model.torque != "measured"
+    if not acting or any(p.effect == effect.name for p in model.parameters):
         return []
     return [
         Hypothesis(effect, w, effect.parameters(w, model.chain, model.cell), ())
@@ -294,7 +271,7 @@ def _load_hypothesis(base: Baseline) -> list[Hypothesis]:
 
 ROUNDS = 20
 LEVEL = 0.01  # chance that any of all good readings is taken for faulty
-MOST = 0.1  # share of readings beyond which "faulty" is no accident of measuring
+MOST = 0.1  # share of readings from which on "faulty" is no accident of measuring
 RUN = 3  # so many neighbours in a row, of one marker, are no accident either
 ACCIDENT = 1e-3  # chance below which suspects stand together by more than accident
 
@@ -309,7 +286,7 @@ class OutlierScreening:
 
 
 def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening:
-    """The faulty ones among the readings of `data`, the scene's with what was found beside.
+    """The faulty ones among the readings of `data`, those of `dataset` with what was found beside.
 
     A reading i left out has the error P_ii⁻¹u_i with covariance P_ii⁻¹ (u = P r), so
     uᵢᵀP_ii⁻¹u_i follows χ² with as many degrees of freedom as it has components.  The noise is the
@@ -322,13 +299,13 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening
     blocks = dataset.blocks
     usual = NoiseValues.usual(data.G.shape[2])
     limit = stats.chi2.isf(LEVEL / blocks.n, blocks.size)
-    middle = stats.chi2.median(blocks.size)
+    median = stats.chi2.median(blocks.size)
     faulty = np.zeros(blocks.n, dtype=bool)
-    beyond = faulty.copy()
+    conspicuous = faulty.copy()
     for _ in range(ROUNDS):
         squared = reading_errors(dataset, project(data.without(faulty), usual))
-        suspect = squared > limit * np.nanmedian(squared) / middle
-        beyond |= suspect
+        suspect = squared > limit * np.nanmedian(squared) / median
+        conspicuous |= suspect
         suspect &= ~in_a_run(dataset, suspect)
         worst = np.zeros(int(blocks.visit.max()) + 1)
         np.maximum.at(worst, blocks.visit, np.where(suspect, squared, 0.0))
@@ -341,17 +318,16 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening
         others = faulty.copy()
         others[k] = False
         squared = reading_errors(dataset, project(data.without(others), usual))
-        faulty[k] = squared[k] > limit * np.nanmedian(squared) / middle
+        faulty[k] = squared[k] > limit * np.nanmedian(squared) / median
     if faulty.mean() > MOST or not accidental(dataset, faulty):
         faulty[:] = False
-    return OutlierScreening(faulty, beyond & ~faulty)
+    return OutlierScreening(faulty, conspicuous & ~faulty)
 
 
 def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
     """Whether the faulty readings (N,) spread over markers, load states and time as all do."""
-    table, lead = dataset.base.observed.table, dataset.base.observed.lead
+    table, lead, moment = dataset.table, dataset.lead, _moments(dataset)
     loaded = np.any(table.force != 0, axis=1)[lead]
-    moment = lead if table.time is None else table.time[lead]
     for label in (table.marker[lead], loaded, moment > np.median(moment)):
         groups = np.unique(label)
         if len(groups) < 2 or not faulty.any():
@@ -369,9 +345,8 @@ def reading_errors(dataset: DiagnosisData, at: Projection) -> Array:
     """uᵢᵀP_ii⁻¹u_i (N,) of every observation; NaN where it is left out."""
     blocks, size = dataset.blocks, dataset.blocks.size
     C, M = blocks.member.shape
-    P = at.inverse - at.H @ at.H.transpose(0, 2, 1)
     place = np.arange(M)
-    own = P.reshape(C, M, size, M, size)[:, place, :, place, :].transpose(1, 0, 2, 3)
+    own = at.P.reshape(C, M, size, M, size)[:, place, :, place, :].transpose(1, 0, 2, 3)
     u = at.u.reshape(C, M, size)
     own = own + 1e-12 * np.trace(own, axis1=2, axis2=3)[..., None, None] * np.eye(size)
     squared = (u * np.linalg.solve(own, u[..., None])[..., 0]).sum(axis=2)
@@ -383,17 +358,22 @@ def reading_errors(dataset: DiagnosisData, at: Projection) -> Array:
 
 def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
     """Suspects (N,) that stand in a row of RUN or more readings of the same marker in time."""
-    table, lead = dataset.base.observed.table, dataset.base.observed.lead
-    moment = lead if table.time is None else table.time[lead]
+    marker_of, moment = dataset.table.marker[dataset.lead], _moments(dataset)
     out = np.zeros(len(suspect), dtype=bool)
-    for marker in np.unique(table.marker[lead]):
-        mine = np.flatnonzero(table.marker[lead] == marker)
+    for marker in np.unique(marker_of):
+        mine = np.flatnonzero(marker_of == marker)
         mine = mine[np.argsort(moment[mine], kind="stable")]
         edges = np.flatnonzero(np.diff(np.concatenate([[0], suspect[mine].astype(int), [0]])))
         for start, stop in edges.reshape(-1, 2):
             if stop - start >= RUN:
                 out[mine[start:stop]] = True
     return out
+
+
+def _moments(dataset: DiagnosisData) -> Array | IntArray:
+    """When each observation (N,) was made; its row in the table where no times are recorded."""
+    time = dataset.table.time
+    return dataset.lead if time is None else time[dataset.lead]
 
 
 def describe_faulty(
@@ -407,7 +387,7 @@ def describe_faulty(
     at = project(data, noise)
     e = blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
     sigma = np.sqrt(np.einsum("nii->ni", blocks.unpack_square(data.covariance)) * noise.factor**2)
-    table, lead = dataset.base.observed.table, dataset.base.observed.lead
+    table, lead = dataset.table, dataset.lead
     return tuple(
         FaultyReading(
             int(table.row[lead[k]]),
@@ -436,9 +416,8 @@ def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> 
 
 def pure_error(dataset: DiagnosisData) -> float | None:
     """Scatter in m per axis among repeats of the same pose, load and marker; None without any."""
-    observed, table = dataset.base.observed, dataset.base.observed.table
-    out = dataset.data.faulty
-    rows = observed.lead[~out]
+    observed, table, good = dataset.base.observed, dataset.table, ~dataset.data.faulty
+    rows = observed.lead[good]
     force = np.round(table.force[rows], 6)
     key = np.column_stack([table.configuration[rows], table.marker[rows], force])
     _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
@@ -446,7 +425,7 @@ def pure_error(dataset: DiagnosisData) -> float | None:
     repeated = count[group] > 1
     if not repeated.any():
         return None
-    values = observed.value.reshape(-1, observed.size)[~out][:, : min(observed.size, 3)]
+    values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
     mean = np.zeros((len(count), values.shape[1]))
     np.add.at(mean, group, values)
     mean /= count[:, None]

@@ -17,17 +17,17 @@ from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import evidence_of
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import PLAUSIBLE, Item, packed_columns
+from elastocal.diagnosis.model_set import PLAUSIBLE, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, covariance
 from elastocal.diagnosis.rivals import (
     RivalSet,
     Suspects,
+    alternatives,
     columns_of_starts,
-    imitations,
     left_out,
     noise_found,
 )
-from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
+from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -131,12 +131,11 @@ def load_forces(table: Measurements) -> Array:
     _, group, count = np.unique(
         np.round(force / NEWTON), axis=0, return_inverse=True, return_counts=True
     )
-    usual = [k for k in range(len(count)) if count[k] >= RARE * len(force)]
-    loaded = np.any(force != 0, axis=1)
-    if not usual or (loaded.any() and not loaded[np.isin(group.ravel(), usual)].any()):
-        means = [force[part].mean(axis=0) for part in (~loaded, loaded) if part.any()]
-        return np.array(means)
-    means = [force[group.ravel() == k].mean(axis=0) for k in usual]
+    usual = np.flatnonzero(count >= RARE * len(force))
+    loaded, group = np.any(force != 0, axis=1), group.ravel()
+    if not len(usual) or (loaded.any() and not loaded[np.isin(group, usual)].any()):
+        return np.array([force[part].mean(axis=0) for part in (~loaded, loaded) if part.any()])
+    means = [force[group == k].mean(axis=0) for k in usual]
     return np.array(sorted(means, key=lambda f: float(np.linalg.norm(f))))
 
 
@@ -162,10 +161,8 @@ def joined(first: Measurements, second: Measurements) -> Measurements:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Data so far and pool in one scene, whose first `measured` configurations are the data.
-
-    `noise` is what the diagnosis found.
-    """
+    """Data so far and pool in one, the first `measured` configurations being the data; `noise` is
+    what the diagnosis found."""
 
     dataset: DiagnosisData
     measured: int
@@ -173,14 +170,10 @@ class Campaign:
 
     @property
     def so_far(self) -> DiagnosisData:
-        """The scene in which only the data so far count."""
-        blocks = self.dataset.blocks
-        later = np.zeros(blocks.n, dtype=bool)
-        members = blocks.member[self.measured :]
-        later[members[members < blocks.n]] = True
-        return replace(
-            self.dataset, data=self.dataset.data.without(later | self.dataset.data.faulty)
-        )
+        """The same where only the data so far count."""
+        data, blocks = self.dataset.data, self.dataset.blocks
+        later = np.isin(np.arange(blocks.n), blocks.member[self.measured :])
+        return replace(self.dataset, data=data.without(later | data.faulty))
 
 
 def campaign_of(
@@ -192,23 +185,19 @@ def campaign_of(
     """
     table = base.observed.table
     observed = observe(joined(table, pool.table), base.model.observe)
-    n, size = len(base.observed.lead), observed.size
-    stated = base.stated
-    if stated is None:
-        spread = base.residual.reshape(n, size).var(axis=0)
-        stated = np.tile(np.diag(np.maximum(spread, 1e-18)), (n, 1, 1))
+    n, size, stated = len(base.observed.lead), observed.size, base.covariance
     marker = table.marker[base.observed.lead]
     usual = np.zeros((len(table.marker_names), size, size))
     usual[:] = stated.mean(axis=0)
     for k in np.unique(marker):
         usual[k] = stated[marker == k].mean(axis=0)
     later = observed.table.marker[observed.lead[n:]]
-    whole = replace(
+    both = replace(
         base, observed=observed, stated=np.concatenate([stated, usual[later]]),
         residual=np.concatenate([base.residual, np.zeros(size * len(later))]), planned=len(later),
     )  # fmt: skip
     measured = len(np.unique(table.configuration[base.observed.lead]))
-    dataset = diagnosis_data_of(whole, hypotheses).without(left_out(whole, diagnosis))
+    dataset = diagnosis_data_of(both, hypotheses).without(left_out(both, diagnosis))
     return Campaign(dataset, measured, noise_found(diagnosis))
 
 
@@ -218,9 +207,9 @@ class WhitenedRows:
 
     `gram` (w, w) = Wᵀ V⁻¹ W of the data so far, with the nuisance's prior precision; `pool`
     (N, m, w) = V^−½ W of each candidate; `response` (w,) = Wᵀ V⁻¹ r.  Columns W: the `nuisance`
-    first ones are those of the fitted parameters and of the effects beside the rivals, then each
-    rival's own, at `groups`, and at `imitations` those with which it may imitate others instead:
-    at other settings or about other starts, each by itself.
+    first ones are those of the fitted parameters and of the effects beside the rivals.  Counted
+    from there come each rival's own, at `groups`, and at `alternatives` those with which it may
+    imitate others instead: at other settings or about other starts, each by itself.
     """
 
     gram: Array
@@ -228,22 +217,26 @@ class WhitenedRows:
     response: Array
     nuisance: int
     groups: tuple[slice, ...]
-    imitations: tuple[tuple[slice, ...], ...]
+    alternatives: tuple[tuple[slice, ...], ...]
 
 
-def rows_of(campaign: Campaign, discrimination: RivalSet) -> WhitenedRows:
-    """Whiten the columns of `contest` by V = covariance of each configuration."""
+def rows_of(campaign: Campaign, rivals: RivalSet) -> WhitenedRows:
+    """Whiten the columns of the rivals by V = covariance of each configuration."""
     dataset, data = campaign.dataset, campaign.dataset.data
-    searched = imitations(campaign.so_far, campaign.noise, discrimination)
-    beside = [_scaled(dataset, item) for item in discrimination.beside]
+    searched = alternatives(campaign.so_far, campaign.noise, rivals)
+    # What is beside counts by the widest size of its prior.
+    beside = [
+        data.masked(packed_columns(dataset, item)) * float(item.scales.max())
+        for item in rivals.beside
+    ]
     others = [
         [*(packed_columns(dataset, i) for i in items), *columns_of_starts(dataset, rival)]
-        for rival, items in zip(discrimination.rivals, searched, strict=True)
+        for rival, items in zip(rivals.rivals, searched, strict=True)
     ]
-    own = [packed_columns(dataset, rival) for rival in discrimination.rivals]
+    own = [packed_columns(dataset, rival) for rival in rivals.rivals]
     own = [data.masked(C) for C in [*own, *chain.from_iterable(others)]]
     nuisance = data.X.shape[2] + sum(C.shape[2] for C in beside)
-    ends = nuisance + np.cumsum([0, *(C.shape[2] for C in own)])
+    ends = np.cumsum([0, *(C.shape[2] for C in own)])
     spans = [slice(int(a), int(b)) for a, b in pairwise(ends)]
     W = np.concatenate(
         [data.masked(data.X), *beside, *own, data.masked(data.r)[:, :, None]], axis=2
@@ -254,18 +247,13 @@ def rows_of(campaign: Campaign, discrimination: RivalSet) -> WhitenedRows:
     fitted = data.X.shape[2]
     gram[:fitted, :fitted] += np.diag(data.precision)
     gram[fitted:nuisance, fitted:nuisance] += np.eye(nuisance - fitted)
-    n = len(discrimination.rivals)
+    n = len(rivals.rivals)
     rest = iter(spans[n:])
     by = [tuple(islice(rest, len(each))) or (spans[b],) for b, each in enumerate(others)]
     return WhitenedRows(
         gram[:-1, :-1], white[campaign.measured :, :, :-1], gram[:-1, -1], nuisance,
         tuple(spans[:n]), tuple(by),
     )  # fmt: skip
-
-
-def _scaled(dataset: DiagnosisData, item: Item) -> Array:
-    """Columns (C, m, k) of an item beside, per widest size of its prior."""
-    return dataset.data.masked(packed_columns(dataset, item)) * float(item.scales.max())
 
 
 def eliminated(gram: Array, nuisance: int) -> tuple[Array, Array]:
@@ -287,7 +275,7 @@ def eliminated(gram: Array, nuisance: int) -> tuple[Array, Array]:
 # with S the Schur complement of the nuisance in the Gram matrix and the smallest over the starts
 # from which b is sought: the T-criterion (Atkinson and Fedorov 1975), and twice the
 # Kullback-Leibler distance (López-Fidalgo et al. 2007).  γ is what the data so far leave of it:
-# draws from its posterior.  If a is the truth, further visits that raise d² by δ² move the log odds
+# draws from its posterior.  If a is at work, further visits that raise d² by δ² move the log odds
 # of a over b from where they stand, L_ab, by N(δ²/2, δ²), so that b wins with probability
 # Φ(−(L_ab + δ²/2)/δ).
 
@@ -296,7 +284,7 @@ DRAWS = 32  # of each sign
 
 @dataclass(frozen=True)
 class Discrimination:
-    """One set of rivals with everything that judges a choice of candidates.
+    """One set of rivals to be told apart, with everything that judges a choice of candidates.
 
     `draws`: γ (draws, k) of each rival; `before` (rivals, rivals, draws) d² in the data so far;
     `classes` (rivals,): those with the same number are not asked to be told apart.
@@ -349,16 +337,14 @@ class Discrimination:
         return self._squared(S + E.transpose(0, 2, 1) @ np.linalg.solve(K, E))
 
     def _squared(self, S: Array) -> Array:
-        n, p = len(self.draws), self.rows.nuisance
+        n = len(self.draws)
         out = np.zeros((len(S), n, n, 2 * DRAWS))
         for a, b in permutations(range(n), 2):
-            posterior_draw, g = self.rows.groups[a], self.draws[a]
-            of_a = slice(posterior_draw.start - p, posterior_draw.stop - p)
+            of_a, g = self.rows.groups[a], self.draws[a]
             size = PLAUSIBLE * self.rivals.rivals[b].scales.max()
             nearest = np.full((len(S), len(g)), np.inf)
-            for rival in self.rows.imitations[b]:
-                of_b = slice(rival.start - p, rival.stop - p)
-                tie = np.eye(rival.stop - rival.start) / size**2
+            for of_b in self.rows.alternatives[b]:
+                tie = np.eye(of_b.stop - of_b.start) / size**2
                 taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
                 D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
                 nearest = np.minimum(nearest, ((g @ D) * g).sum(axis=2))
@@ -379,20 +365,23 @@ class Discrimination:
         return np.asarray((weight * bound).sum(axis=(-2, -1)))
 
     def probability(self, squared: Array) -> Array:
-        """(…,) probability of naming the right class, averaged over truth and its size.
+        """(…,) probability of naming the right class, averaged over the right one and its size.
 
-        By the union bound over the truth's rival classes, each as dangerous as its strongest
+        By the union bound over its rival classes, each as dangerous as its strongest
         member; not below what naming the likeliest so far gives, which nobody has to give up.
         While a pair is as near as the verdict calls alike, no odds name one of the two with more
-        than ALIKE_PROBABILITY.
+        than TOO_NEAR_PROBABILITY.
         """
         p = self.rivals.probability
         odds = np.log(np.bincount(self.classes, p)[self.classes])
         L = (odds[:, None] - odds[None, :])[..., None]
         delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
         beaten = norm.cdf(-(L + delta**2 / 2) / delta)
-        alike = squared < ALIKE**2
-        beaten = np.where(alike, np.maximum(beaten, 1 - ALIKE_PROBABILITY), beaten)
+        beaten = np.where(
+            squared < TOO_NEAR**2,
+            np.maximum(beaten, 1 - TOO_NEAR_PROBABILITY),
+            beaten,
+        )
         lost = np.zeros(beaten.shape[:-2] + beaten.shape[-1:])
         for k in np.unique(self.classes):
             strongest = beaten[..., self.classes == k, :].max(axis=-2)
@@ -415,18 +404,16 @@ class Discrimination:
 def _posterior_draws(
     rivals: RivalSet, rows: WhitenedRows, rng: np.random.Generator
 ) -> tuple[Array, ...]:
-    """γ (2·DRAWS, k) of each rival as if it were the truth, antithetic about its estimate.
+    """γ (2·DRAWS, k) of each rival as if it were the one at work, antithetic about its estimate.
 
     γ | data ~ N(mean, A⁻¹), A = S_aa + I/s², at the scale s of the size prior that explains the
     data best.
     """
-    p = rows.nuisance
-    whole = np.column_stack([rows.gram, rows.response])
-    whole = np.vstack([whole, np.append(rows.response, 0.0)])
-    S = eliminated(whole, p)[0]
+    S = eliminated(np.block([
+        [rows.gram, rows.response[:, None]], [rows.response, np.zeros(1)],
+    ]), rows.nuisance)[0]  # fmt: skip
     out = []
-    for item, g in zip(rivals.rivals, rows.groups, strict=True):
-        of = slice(g.start - p, g.stop - p)
+    for item, of in zip(rivals.rivals, rows.groups, strict=True):
         lam, U = np.linalg.eigh(S[of, of])
         lam = np.maximum(lam, 0.0)
         beta = U.T @ S[of, -1]
@@ -437,7 +424,7 @@ def _posterior_draws(
     return tuple(out)
 
 
-# The contests of a diagnosis over a pool, and which of their rivals any poses can tell apart.
+# The sets of rivals of a diagnosis over a pool, and which of them any poses can tell apart.
 
 # A pair that all candidates together would not tell apart with this probability is inseparable.
 HOPE = 0.9
@@ -446,7 +433,7 @@ HOPE = 0.9
 def discriminations_of(
     base: Baseline, pool: VisitPool, suspects: Suspects, seed: int
 ) -> list[Discrimination]:
-    """The contests of the diagnosis, with the candidates of a pool."""
+    """What the diagnosis leaves to be told apart, with the candidates of a pool."""
     campaign = campaign_of(base, pool, suspects.hypotheses, suspects.diagnosis)
     sets = list(suspects.sets)
     if suspects.unknown:
@@ -455,12 +442,12 @@ def discriminations_of(
 
 
 def judged(
-    discriminations: Sequence[Discrimination],
+    tasks: Sequence[Discrimination],
 ) -> tuple[list[Discrimination], dict[tuple[str, str], float]]:
-    """Each contest in classes that the whole pool could tell apart, and the pairs that it could
-    not, with their distance in all of it."""
+    """Each set in classes that the whole pool could tell apart, and the pairs that it could not,
+    with their distance in all of it."""
     out, hopeless = [], {}
-    for c in discriminations:
+    for c in tasks:
         d = c.distances(c.squared(c.gram(range(len(c.rows.pool)))))
         near = d < 2 * float(norm.ppf(HOPE))
         classes = connected_components(near, directed=False)[1].astype(np.int64)
@@ -479,11 +466,10 @@ def together(c: Discrimination) -> Iterator[tuple[str, ...]]:
             yield tuple(names)
 
 
-def pairs_of(
-    discriminations: Sequence[Discrimination], chosen: Sequence[int]
-) -> tuple[RivalPair, ...]:
+def pairs_of(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[RivalPair, ...]:
+    """Every two rivals, with their distances before and after the chosen visits."""
     out = []
-    for c in discriminations:
+    for c in tasks:
         before, after = c.distances(c.before), c.distances(c.squared(c.gram(chosen)))
         names = c.rivals.names
         for a, b in zip(*np.triu_indices(len(names), 1), strict=True):

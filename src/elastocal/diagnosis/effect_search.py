@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Prior, Scan, exceedance, scan
-from elastocal.diagnosis.hypotheses import Hypothesis, is_driven
+from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_extended, fit_set, refine, signal_of
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
 from elastocal.diagnosis.unknown import Generic
@@ -50,7 +50,7 @@ class SelectedEffects:
     """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
     p-value of every step against all that could have been found by chance.
 
-    `scene` is the one that the set was fitted on: columns about a fit with its large effects.
+    `dataset` is the one that the set was fitted on: columns about a fit with its large effects.
     `first` is the scan beside nothing under its own noise, `alone` under the final noise.
     """
 
@@ -76,7 +76,7 @@ def is_far(dataset: DiagnosisData, chosen: ModelSet) -> bool:
 
 
 def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
-    """The scene about the nonlinear fit with the set's known effects in the model.
+    """The data about the nonlinear fit with the set's known effects in the model.
 
     The residual is that of the fitted parameters alone: what the effects explain is put back, so
     that sets with and without them are judged on the same footing.
@@ -88,8 +88,8 @@ def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
     moved = replace(
         base, x=np.array([x[name] for name in base.model.names]), residual=fitted.residual
     )
-    fresh = diagnosis_data_of(moved, list(dataset.hypotheses), model, fitted.x)
-    # Put back by the scene's own columns, which will have to explain it: those of the equilibrium
+    about_fit = diagnosis_data_of(moved, list(dataset.hypotheses), model, fitted.x)
+    # Put back by the data's own columns, which will have to explain it: those of the equilibrium
     # differ from them by a thousandth, and a large effect is a thousand deviations.
     back = np.zeros((*fitted.residual.reshape(-1, base.observed.size).shape, 1))
     for k in _direct(chosen):
@@ -98,28 +98,24 @@ def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
         # What an effect tries from several starts has no size about any of them.
         starts = what.effect.starts(what.where, model.chain, model.cell)
         open_keys = {key for start in starts for key in start}
-        away = [
+        moved_by = [
             0.0 if p.key in open_keys else x[f"{what.where}.{p.key}"] - p.nominal
             for p in what.parameters
         ]
-        back[:, :, 0] += fresh.columns.observed(fresh.columns.of(what)) @ np.array(away)
+        back[:, :, 0] += about_fit.columns.observed(about_fit.columns.of(what)) @ np.array(moved_by)
+    r = about_fit.data.r + about_fit.blocks.pack(back)[:, :, 0]
     return replace(
-        fresh,
-        base=replace(moved, residual=fitted.residual + back.ravel()),
-        other_play=dataset.other_play,
-        data=replace(
-            fresh.data,
-            r=fresh.data.r + fresh.blocks.pack(back)[:, :, 0],
-            left_out=dataset.data.left_out,
-        ),
-    )
+        about_fit, base=replace(moved, residual=fitted.residual + back.ravel()),
+        other_backlash=dataset.other_backlash,
+        data=replace(about_fit.data, r=r, left_out=dataset.data.left_out),
+    )  # fmt: skip
 
 
 def _direct(chosen: ModelSet) -> list[int]:
     return [
         k
         for k, item in enumerate(chosen.items)
-        if isinstance(item.what, Hypothesis) and not is_driven(item.what)
+        if isinstance(item.what, Hypothesis) and not item.what.driven
     ]
 
 
@@ -147,10 +143,10 @@ MOST_EFFECTS, MOST_BESIDE_UNKNOWN = 4, 2
 KEPT = 4  # scans that are kept, the last ones
 
 
-def base_score(dataset: DiagnosisData, current: ModelSet, seen: Scan) -> float:
+def base_score(dataset: DiagnosisData, current: ModelSet, scanned: Scan) -> float:
     """Log posterior of the set as it is under the scan's noise."""
     items = sum(item.log_prior for item in current.items)
-    return seen.at.marginal + items - 0.5 * log_prior(dataset.data.stated, seen.noise)[0]
+    return scanned.at.marginal + items - 0.5 * log_prior(dataset.data.stated, scanned.noise)[0]
 
 
 def _rivalled(slot: Slot) -> bool:
@@ -161,7 +157,7 @@ def _rivalled(slot: Slot) -> bool:
 
 @dataclass
 class ForwardSelection:
-    """The search's means: scene, blocks, flips of signs, and the level of a claim."""
+    """The search's means: data, blocks, flips of signs, and the level of a claim."""
 
     dataset: DiagnosisData
     generic: list[Generic]
@@ -182,11 +178,11 @@ class ForwardSelection:
     def run(self) -> SelectedEffects:
         self._start = dataset = self.dataset
         nothing = current = fit_set(dataset, (), self.noise)
-        seen = first = alone = self._scan(current, flips=True)
+        scanned = first = alone = self._scan(current, flips=True)
         slots: list[Slot] = []
         p_values: list[float] = []
         while True:
-            best, slot = self._best_addition(current, seen)
+            best, slot = self._best_addition(current, scanned)
             most = MOST_BESIDE_UNKNOWN if current.unknown else MOST_EFFECTS
             if best is None or len(current.items) >= most:
                 break
@@ -202,26 +198,22 @@ class ForwardSelection:
                 break
             after = self._scan(best, flips=True)
             p = exceedance(after.flipped, observed.odds)
-            if p > self.level:
+            if p > self.level or self._been_at(best):
                 break
-            if self._been_at(best):
-                break
-            current, seen = best, after
+            current, scanned = best, after
             slots.append(slot)
             p_values.append(p)
             if is_far(self.dataset, current):
                 self.dataset = relinearised(self.dataset, current)
                 self._forget()
                 current = fit_set(self.dataset, current.items, current.noise)
-                seen = self._scan(current)
+                scanned = self._scan(current)
             if len(current.items) > 1:
-                current, slots, seen = self._reexamined(current, slots, seen)
-        if not slots:
-            slots = [slot]
+                current, slots, scanned = self._reexamined(current, slots, scanned)
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
         return SelectedEffects(
-            self.dataset, current, tuple(slots), tuple(p_values), nothing, first, alone
+            self.dataset, current, tuple(slots or [slot]), tuple(p_values), nothing, first, alone
         )
 
     def settled(self, found: SelectedEffects) -> SelectedEffects:
@@ -243,7 +235,7 @@ class ForwardSelection:
         )
 
     def _forget(self) -> None:
-        """What was fitted and scanned about another scene is void."""
+        """What was fitted and scanned about another fit is void."""
         self._fitted.clear()
         self._scanned.clear()
 
@@ -265,18 +257,12 @@ class ForwardSelection:
         for known in (True, flips):
             if (*key, known) in self._scanned:
                 return self._scanned[*key, known]
-        seen = scan(
-            self.dataset,
-            self.generic,
-            self._prior(current),
-            current.data,
-            noise,
-            self.signs if flips else self.signs[:0],
-        )
-        self._scanned[*key, flips] = seen
+        prior, signs = self._prior(current), self.signs if flips else self.signs[:0]
+        scanned = scan(self.dataset, self.generic, prior, current.data, noise, signs)
+        self._scanned[*key, flips] = scanned
         while len(self._scanned) > KEPT:
             self._scanned.pop(next(iter(self._scanned)))
-        return seen
+        return scanned
 
     def _prior(self, current: ModelSet) -> Prior:
         """Of one item more."""
@@ -284,19 +270,16 @@ class ForwardSelection:
         return Prior.of(self.dataset.hypotheses, self.generic, something)
 
     def _best_addition(
-        self, current: ModelSet, seen: Scan, behind: float = FAR_BEHIND
+        self, current: ModelSet, scanned: Scan, behind: float = FAR_BEHIND
     ) -> tuple[ModelSet | None, Slot]:
         """The best set with one item more (None: none is worth it), and the slot it fills.
 
         Beside other items it has to be better than the set without it.
         """
-        options = self._options(current, seen)
-        slot = Slot(tuple(item for item, _ in options), np.array([s for _, s in options]))
-        base = current.score
-        close = self._close(slot, behind)
+        slot, base = self._options(current, scanned), current.score
         best: ModelSet | None = None
         scores = slot.scores.copy()
-        for k in close:
+        for k in self._close(slot, behind):
             item = slot.items[k]
             if any(item.same_as(other) for other in current.items):
                 scores[k] = -np.inf
@@ -309,18 +292,20 @@ class ForwardSelection:
             best = None
         return best, Slot(slot.items, scores)
 
-    def _options(self, current: ModelSet, seen: Scan) -> list[tuple[Item, float]]:
+    def _options(self, current: ModelSet, scanned: Scan) -> Slot:
+        """Everything that could be added, scored under the scan's noise."""
         prior = self._prior(current)
         # Scores count from the set as it is, under the noise that suits it best.
-        offset = base_score(self.dataset, current, seen) - current.score
-        options = []
-        for h, s, w in zip(self.dataset.hypotheses, seen.scored, prior.hypotheses, strict=True):
+        offset = base_score(self.dataset, current, scanned) - current.score
+        items, scores = [], []
+        for h, s, w in zip(self.dataset.hypotheses, scanned.scored, prior.hypotheses, strict=True):
             # What the search over settings costs stays with the item.
-            item = Item(h, s.settings, float(w + s.evidence - s.best))
-            options.append((item, float(w + s.evidence + offset)))
-        for g, s, w in zip(self.generic, seen.blocks, prior.blocks, strict=True):
-            options.append((Item(g, s.settings, float(w)), float(w + s.evidence + offset)))
-        return options
+            items.append(Item(h, s.settings, float(w + s.evidence - s.best)))
+            scores.append(float(w + s.evidence + offset))
+        for g, s, w in zip(self.generic, scanned.blocks, prior.blocks, strict=True):
+            items.append(Item(g, s.settings, float(w)))
+            scores.append(float(w + s.evidence + offset))
+        return Slot(tuple(items), np.array(scores))
 
     def _with(self, current: ModelSet, item: Item) -> ModelSet:
         """The set with one item more, its noise and settings fitted; kept, since it is asked for
@@ -336,19 +321,15 @@ class ForwardSelection:
         known = np.array([item.known for item in slot.items])
         order = np.argsort(-slot.scores, kind="stable")
         order = order[slot.scores[order] > HOPELESS]
-        near = slot.scores[order] > slot.scores[order[:1]].max(initial=-np.inf) - behind
-        order = order[near]
-        hypotheses = order[known[order]][:CLOSE]
-        blocks = order[~known[order]][:CLOSE_BLOCKS]
-        return np.concatenate([hypotheses, blocks])
+        order = order[slot.scores[order] > slot.scores[order[:1]].max(initial=-np.inf) - behind]
+        return np.concatenate([order[known[order]][:CLOSE], order[~known[order]][:CLOSE_BLOCKS]])
 
     def _reexamined(
-        self, current: ModelSet, slots: list[Slot], seen: Scan
+        self, current: ModelSet, slots: list[Slot], scanned: Scan
     ) -> tuple[ModelSet, list[Slot], Scan]:
         """Every item against all that could stand in its place, the others given."""
         for _ in range(2):
-            changed = False
-            k = 0
+            changed, k = False, 0
             while k < len(current.items):
                 others = fit_set(self.dataset, current.without(k), current.noise)
                 beside = self._scan(others, current.noise)

@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from elastocal.diagnosis.baseline import VisitPlaces
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.hypotheses import EntryKey, Hypothesis, entry_key, is_driven
+from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.unknown import Generic
 from elastocal.units import Array
@@ -27,10 +27,7 @@ from elastocal.units import Array
 #
 #     log ev(s) = ½ Σ_k [s²β_k² / (1 + s²λ_k) − log(1 + s²λ_k)].
 
-SCALES = np.array([0.3, 1.0, 3.0])
-# A size that nobody has stated is known to an order of magnitude at best.
-UNSIZED_SCALES = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
-FEW = 3  # columns of a group that is turned entry by entry
+FEW = 3  # columns of a group that is multiplied element by element
 
 
 @dataclass(frozen=True)
@@ -46,12 +43,8 @@ class Spectrum:
     @classmethod
     def joined(cls, pieces: list[Spectrum]) -> Spectrum:
         """The groups of several spectra as one."""
-        if len(pieces) == 1:
-            return pieces[0]
-        return cls(
-            np.concatenate([s.lam for s in pieces]), np.concatenate([s.beta for s in pieces]),
-            np.concatenate([s.flips for s in pieces], axis=1),
-        )  # fmt: skip
+        lam, beta, flips = zip(*((s.lam, s.beta, s.flips) for s in pieces), strict=True)
+        return cls(np.concatenate(lam), np.concatenate(beta), np.concatenate(flips, axis=1))
 
     @property
     def distance(self) -> Array:
@@ -108,7 +101,7 @@ def _turned(b: Array, U: Array) -> Array:
     """Σ_k b_fvk U_vkl (F, V, K)."""
     if U.shape[1] > FEW:
         return np.asarray((b.transpose(1, 0, 2) @ U).transpose(1, 0, 2))
-    # Thousands of tiny products: sums over their few entries are faster than a call for each.
+    # Thousands of tiny products: sums over their few elements are faster than a call for each.
     out = np.empty_like(b)
     for j in range(U.shape[1]):
         out[..., j] = sum(b[..., k] * U[:, k, j] for k in range(U.shape[1]))
@@ -154,16 +147,16 @@ def _shares(names: list[str]) -> Array:
     return np.array([1 / (len(count) * count[name]) for name in names])
 
 
-# Gram matrices of whatever drives an entry of the chain, without forming its columns.
+# Gram matrices of regressor directions at an entry of the chain, without forming columns.
 #
 # Columns of a driven group are C = E ∘ D: the entry's columns E (N, size, d), the same motion in
-# all readings of a visit, times the visit's drive D (d, k).  So
+# all readings of a visit, times the visit's regressor direction D (d, k).  So
 #
 #     CᵀV⁻¹C = Σ_blocks Σ_{v,w} D_vᵀ (E_vᵀV⁻¹E_w) D_w,
 #     HᵀC = Σ_v (H_vᵀE_v) D_v,   CᵀPr = Σ_v D_vᵀ E_vᵀu
 #
-# and a search over thousands of drives costs a few products of matrices, all of them at once.
-# Where a drive is the same in all visits of a configuration, the sums over visits come first.
+# and a search over thousands of directions costs a few products of matrices, all of them at once.
+# Where D is the same in all visits of a configuration, the sums over visits come first.
 
 
 @dataclass(frozen=True)
@@ -200,7 +193,7 @@ class EntrySums:
 
     @cached_property
     def _of_configurations(self) -> EntrySums:
-        """The same for drives that do not differ within a configuration: v = 1."""
+        """The same for directions that do not differ within a configuration: v = 1."""
         return replace(
             self, local=self.local.sum(axis=(1, 3), keepdims=True),
             H=self.H.sum(axis=2, keepdims=True), b=self.b.sum(axis=1, keepdims=True),
@@ -208,8 +201,8 @@ class EntrySums:
         )  # fmt: skip
 
     def driven(self, D: Array) -> Spectrum:
-        """Spectrum of the groups with drives D (C, v, d, V, k), or (C, 1, d, V, k) where all
-        visits of a configuration are driven alike."""
+        """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
+        are the same in all visits of a configuration."""
         if D.shape[1] < self.b.shape[1]:
             return self._of_configurations.driven(D)
         C, v, d, V, k = D.shape
@@ -259,7 +252,7 @@ def direct(C: Array, at: Projection, signs: Array | None = None) -> Spectrum:
 
 # Spectra of hypotheses and blocks beside a model, each entry's sums computed once.
 
-HELD = 4_000_000  # numbers of drives that are held at a time
+HELD = 4_000_000  # numbers of regressor directions that are held at a time
 
 
 @dataclass
@@ -281,28 +274,24 @@ class Grams:
 
     def of_hypothesis(self, h: Hypothesis, settings: Array | None = None) -> Spectrum:
         """At every one of the `settings` (G, …), by default those of the search."""
-        if not is_driven(h):
-            return direct(
-                self.data.masked(self.dataset.packed(h, np.zeros(0))), self.at, self.signs
-            )
+        if not h.driven:
+            return self._direct(self.dataset.packed(h, np.zeros(0)))
         if settings is None:
-            settings = self.dataset.grids[h.name, h.where].values
-        sums = self.entry(entry_key(h, self.dataset.base.model))
-        # A large table's drives at thousands of settings do not fit into memory at once.
+            settings = self.dataset.grids[h.key].values
+        sums = self.entry(h.entry_key(self.dataset.base.model))
+        # A large table's directions at thousands of settings do not fit into memory at once.
         each = max(1, HELD // (sums.b.size * len(h.parameters)))
         pieces = [settings[i : i + each] for i in range(0, len(settings), each)]
-        return Spectrum.joined([sums.driven(self.dataset.drive(h, piece)) for piece in pieces])
+        return Spectrum.joined([sums.driven(self.dataset.direction(h, piece)) for piece in pieces])
 
     def of_block(self, g: Generic) -> Spectrum:
         if g.columns is not None:
-            return direct(self.data.masked(g.columns), self.at, self.signs)
-        assert g.entry is not None and g.drive is not None
-        return self.entry(g.entry).driven(g.drive[:, :, :, None, :])
+            return self._direct(g.columns)
+        assert g.entry is not None and g.direction is not None
+        return self.entry(g.entry).driven(g.direction[:, :, :, None, :])
 
-
-def scales_of(h: Hypothesis) -> Array:
-    """Scales of the size prior: wider where no typical size is known."""
-    return UNSIZED_SCALES if any(p.typical is None for p in h.parameters) else SCALES
+    def _direct(self, columns: Array) -> Spectrum:
+        return direct(self.data.masked(columns), self.at, self.signs)
 
 
 # The evidence of everything that could be added to a model, under one noise.
@@ -328,23 +317,22 @@ class Scan:
 
     `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior,
     `flipped` (F,) the same for residuals whose configurations had their signs flipped;
-    `driver_odds` the largest evidence among the blocks of a driver, and its flips.
+    `covariate_odds` the largest evidence among the blocks of a covariate, and its flips.
     """
 
     scored: tuple[Scored, ...]
     blocks: tuple[Scored, ...]
     odds: float
     flipped: Array
-    driver_odds: dict[str, float]
-    driver_flips: dict[str, Array]
+    covariate_odds: dict[str, float]
+    covariate_flips: dict[str, Array]
     at: Projection
     noise: NoiseValues
 
 
 def scan(
     dataset: DiagnosisData, generic: list[Generic], prior: Prior, data: NoisyData,
-    noise: NoiseValues,
-    signs: Array,
+    noise: NoiseValues, signs: Array,
 ) -> Scan:  # fmt: skip
     """Score all hypotheses and blocks beside the columns already in `data`.
 
@@ -352,36 +340,31 @@ def scan(
     """
     at = project(data, noise)
     grams = Grams(dataset, data, at, signs)
-    scored, blocks = [], []
-    total, flips = [], []
+    scored, blocks, total, flips = [], [], [], []
     for h, weight in zip(dataset.hypotheses, prior.hypotheses, strict=True):
-        found = grams.of_hypothesis(h)
-        grid = dataset.grids[h.name, h.where] if is_driven(h) else None
-        log_prior = np.zeros(1) if grid is None else grid.log_prior
-        scales = scales_of(h)
-        each = found.evidence(scales)
-        evidence = float(log_sum(each + log_prior))
-        k = int(np.argmax(each + log_prior))
-        settings = np.zeros(0) if grid is None else grid.values[k]
-        scored.append(Scored(evidence, float(each[k]), settings, float(found.distance[k])))
+        found, grid = grams.of_hypothesis(h), dataset.grids.get(h.key, NO_SETTINGS)
+        each = found.evidence(h.scales)
+        evidence = float(log_sum(each + grid.log_prior))
+        k = int(np.argmax(each + grid.log_prior))
+        scored.append(Scored(evidence, float(each[k]), grid.values[k], float(found.distance[k])))
         total.append(weight + evidence)
         if len(signs):
-            flips.append(weight + log_sum(found.flipped(scales) + log_prior))
-    covariates: dict[str, list[float]] = {}
-    driver_flips: dict[str, list[Array]] = {}
+            flips.append(weight + log_sum(found.flipped(h.scales) + grid.log_prior))
+    covariate_odds: dict[str, list[float]] = {}
+    covariate_flips: dict[str, list[Array]] = {}
     for g, weight in zip(generic, prior.blocks, strict=True):
         found = grams.of_block(g)
         evidence = float(found.evidence()[0])
         blocks.append(Scored(evidence, evidence, np.zeros(0), float(found.distance[0])))
         total.append(weight + evidence)
-        covariates.setdefault(g.covariate, []).append(evidence)
+        covariate_odds.setdefault(g.covariate, []).append(evidence)
         if len(signs):
             flipped = found.flipped()[:, 0]
             flips.append(weight + flipped)
-            driver_flips.setdefault(g.covariate, []).append(flipped)
+            covariate_flips.setdefault(g.covariate, []).append(flipped)
     return Scan(
         tuple(scored), tuple(blocks), float(log_sum(np.array(total))) - prior.total,
         log_sum(np.array(flips), axis=0) - prior.total if flips else np.zeros(0),
-        {d: max(v) for d, v in covariates.items()},
-        {d: np.max(v, axis=0) for d, v in driver_flips.items()}, at, noise,
+        {c: max(v) for c, v in covariate_odds.items()},
+        {c: np.max(v, axis=0) for c, v in covariate_flips.items()}, at, noise,
     )  # fmt: skip

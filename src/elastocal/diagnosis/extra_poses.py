@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import count, islice
 
@@ -21,7 +21,7 @@ from elastocal.diagnosis.discrimination import (
     together,
     visit_pool_of,
 )
-from elastocal.diagnosis.hypotheses import with_recorded_drivers
+from elastocal.diagnosis.hypotheses import with_keys, with_recorded_drivers
 from elastocal.diagnosis.rivals import RivalSet, Suspects, check_open, with_neighbours
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.measurements import Measurements
@@ -43,70 +43,65 @@ WORTH = 1e-3  # relative fall of the error that an exchange is made for
 RANDOM_DRAWS = 32
 
 
-def fewest(
-    discriminations: Sequence[Discrimination], most: int, enough: float = ENOUGH
-) -> list[int]:
+def fewest(tasks: Sequence[Discrimination], most: int, enough: float = ENOUGH) -> list[int]:
     """Candidates, at most `most`, with which the right one is named with a probability of
     `enough`; `most` where fewer do not reach it."""
     chosen: list[int] = []
-    while len(chosen) < min(most, len(discriminations[0].rows.pool)):
-        chosen.append(_best(discriminations, chosen)[0])
-        if expected(discriminations, chosen) >= enough:
+    while len(chosen) < min(most, len(tasks[0].rows.pool)):
+        chosen.append(_best(tasks, chosen)[0])
+        if expected(tasks, chosen) >= enough:
             break
-    _exchange(discriminations, chosen)
-    while len(chosen) > 1 and expected(discriminations, chosen) >= enough:
-        fewer = _without_least(discriminations, chosen)
-        _exchange(discriminations, fewer)
-        if expected(discriminations, fewer) < enough:
+    _exchange(tasks, chosen)
+    while len(chosen) > 1 and expected(tasks, chosen) >= enough:
+        fewer = _without_least(tasks, chosen)
+        _exchange(tasks, fewer)
+        if expected(tasks, fewer) < enough:
             break
         chosen = fewer
     return chosen
 
 
-def expected(discriminations: Sequence[Discrimination], chosen: Sequence[int]) -> float:
+def expected(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
     """Probability that the right one of every set is named after the chosen visits."""
-    each = [c.probability(c.squared(c.gram(chosen))) for c in discriminations]
+    each = [c.probability(c.squared(c.gram(chosen))) for c in tasks]
     return float(np.prod(each))
 
 
-def expected_of_random(
-    discriminations: Sequence[Discrimination], n: int, rng: np.random.Generator
-) -> float:
+def expected_of_random(tasks: Sequence[Discrimination], n: int, rng: np.random.Generator) -> float:
     """The same for as many candidates drawn at random: the mean of RANDOM_DRAWS draws."""
-    N = len(discriminations[0].rows.pool)
+    N = len(tasks[0].rows.pool)
     picks = [rng.choice(N, size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
-    return float(np.mean([expected(discriminations, pick) for pick in picks]))
+    return float(np.mean([expected(tasks, pick) for pick in picks]))
 
 
-def _best(discriminations: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[int, float]:
+def _best(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[int, float]:
     """The candidate not chosen yet that lowers the error most, and the error with it."""
-    error = sum((c.error_bound(c.squared_with_each(c.gram(chosen))) for c in discriminations), 0.0)
-    error = np.array(error)
+    error = np.array(sum(c.error_bound(c.squared_with_each(c.gram(chosen))) for c in tasks))
     error[list(chosen)] = np.inf
     best = int(np.argmin(error))
     return best, float(error[best])
 
 
-def _without_least(discriminations: Sequence[Discrimination], chosen: list[int]) -> list[int]:
+def _without_least(tasks: Sequence[Discrimination], chosen: list[int]) -> list[int]:
     """All but the one without which the error grows least."""
     fewer = [chosen[:k] + chosen[k + 1 :] for k in range(len(chosen))]
-    return min(fewer, key=lambda left: _error(discriminations, left))
+    return min(fewer, key=lambda left: _error(tasks, left))
 
 
-def _error(discriminations: Sequence[Discrimination], chosen: Sequence[int]) -> float:
-    return sum(float(c.error_bound(c.squared(c.gram(chosen)))) for c in discriminations)
+def _error(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
+    return sum(float(c.error_bound(c.squared(c.gram(chosen)))) for c in tasks)
 
 
-def _exchange(discriminations: Sequence[Discrimination], chosen: list[int]) -> None:
+def _exchange(tasks: Sequence[Discrimination], chosen: list[int]) -> None:
     """Replace candidates in place while another one is better."""
     for _ in range(ROUNDS if len(chosen) > 1 else 0):
         changed = False
         for k, own in enumerate(list(chosen)):
             others = chosen[:k] + chosen[k + 1 :]
-            best, error = _best(discriminations, others)
+            best, error = _best(tasks, others)
             if best == own:
                 continue
-            if error < (1 - WORTH) * _error(discriminations, chosen):
+            if error < (1 - WORTH) * _error(tasks, chosen):
                 chosen[k], changed = best, True
         if not changed:
             break
@@ -126,7 +121,7 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
     L, markers = len(pool.forces), len(table.marker_names)
     first_rows = [(k * L + load) * markers for k in order for load in range(L)]
     taken = set(table.configuration_labels)
-    fresh = (name for k in count(1) if (name := f"extra{k}") not in taken)
+    names = (name for k in count(1) if (name := f"extra{k}") not in taken)
     rows = pool.table.take(np.array(first_rows))
     time = rows.time
     if time is not None:
@@ -136,7 +131,7 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
     return replace(
         rows, source="extra poses", row=np.arange(len(rows)) + 2,
         configuration=np.repeat(np.arange(len(order)), L),
-        configuration_labels=tuple(islice(fresh, len(order))),
+        configuration_labels=tuple(islice(names, len(order))),
         position=None, rotation=None, distance=None, torque=None, sigma=None, temperature=None,
         time=time,
     )  # fmt: skip
@@ -145,19 +140,14 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
 def _tour(pool: VisitPool, chosen: list[int], start: Array) -> list[int]:
     """Nearest next, among those that are due first."""
     out: list[int] = []
-    at, left = start, list(chosen)
+    at, left, time = start, list(chosen), pool.time
     while left:
-        due = left if pool.time is None else [k for k in left if pool.time[k] == _first(pool, left)]
+        due = left if time is None else [k for k in left if time[k] == time[left].min()]
         nearest = min(due, key=lambda k: float(np.abs(pool.q[k] - at).max()))
         out.append(nearest)
         left.remove(nearest)
         at = pool.q[nearest]
     return out
-
-
-def _first(pool: VisitPool, left: list[int]) -> float:
-    assert pool.time is not None
-    return float(pool.time[left].min())
 
 
 # What to do besides measuring the extra poses, in words.
@@ -172,44 +162,10 @@ def inseparable_advice(group: Sequence[str], distance: float, tried: int) -> str
     return f"no pose separates {names}: measured in all {tried} poses that were tried {near}"
 
 
-def other_means(pairs: Sequence[tuple[str, str]]) -> list[str]:
+def other_means(pairs: Iterable[tuple[str, str]]) -> list[str]:
     """What else tells the rivals of inseparable pairs apart."""
     effects = [name.partition(":")[0] for pair in pairs for name in pair]
     return list(dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy)))
-
-
-def too_few_advice(n: int, probability: float, reachable: float) -> str:
-    """That the plan stays below what was aimed at."""
-    return (
-        f"{n} poses reach a probability of {probability:.2f} only; many more would reach "
-        f"{reachable:.2f}: allow more poses ({option('poses')}), or repeat each of them"
-    )
-
-
-def none_of_them(missed: float, nothing: float) -> str:
-    """That the right answer may not be among the rivals."""
-    return (
-        f"with probability {missed:.2f} none of these rivals is at work (noise alone: "
-        f"{nothing:.2f}), which the probabilities count with: measure more poses of any kind first"
-    )
-
-
-def pull_advice(n: int, newton: float, without: float, with_pull: float) -> str:
-    """That pulling sideways would help, and how much."""
-    return (
-        f"pull horizontally: {n} poses that are also measured under {newton:.3g} N along x and "
-        f"along y, e.g. by a rope over a pulley, raise the probability from {without:.2f} to "
-        f"{with_pull:.2f}"
-    )
-
-
-def pull_separates(pairs: Sequence[tuple[str, str]], newton: float) -> str:
-    """That pulling sideways tells apart what the load alone does not."""
-    apart = ", ".join(f"{first} and {second}" for first, second in pairs)
-    return (
-        f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a pulley, "
-        f"would separate {apart}: measure poses under it, too"
-    )
 
 
 def recording_advice(sets: Sequence[RivalSet]) -> list[str]:
@@ -248,7 +204,7 @@ def plan_extra(
     the sets that it calls indistinguishable, or what the unknown effect may be.  Candidates are
     feasible poses of the cell in the table's load states, after the campaign; their distances
     come from the columns of the fitted arm with all fitted parameters free (see
-    `contest`).
+    `Discrimination`).
 
     Raises InputError for a verdict that leaves no rivals, or fewer than one pose.
     """
@@ -256,8 +212,7 @@ def plan_extra(
     require(most >= 1, f"extra poses: at least one has to be allowed; found {most}")
     notes: list[str] = []
     if model.cell.model.torque == "measured":
-        spec = replace(model.cell.model, torque="computed")
-        model = Model.assembled(model.chain, replace(model.cell, model=spec))
+        model = with_keys(model, torque="computed")
         notes.append("torques of poses not measured yet are computed from load and weights")
     table, _ = thinned(table)
     model = with_recorded_drivers(model, table, diagnosis)
@@ -285,42 +240,50 @@ def _chosen(
     progress("extra poses: columns of the candidates")
     drawn = discriminations_of(base, pool, suspects, seed)
     sets = [c.rivals for c in drawn]
-    discriminations, hopeless = judged(drawn)
-    groups = tuple(group for c in discriminations for group in together(c))
+    tasks, hopeless = judged(drawn)
+    groups = tuple(group for c in tasks for group in together(c))
     for group in groups:
         near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
         notes.append(inseparable_advice(group, near, len(pool)))
-    notes += other_means(list(hopeless))
+    notes += other_means(hopeless)
     covered = suspects.covered
     if covered < MOSTLY:
-        notes.append(none_of_them(1 - covered, suspects.diagnosis.probability_nothing))
+        notes.append(
+            f"with probability {1 - covered:.2f} none of these rivals is at work (noise alone: "
+            f"{suspects.diagnosis.probability_nothing:.2f}), which the probabilities count with: "
+            "measure more poses of any kind first"
+        )
     # More poses may make up for a small doubt whether the right one is among the rivals.
     enough = ENOUGH / covered if covered * MOST_CERTAIN >= ENOUGH else ENOUGH
     # Where what can be told apart is told apart already, only what cannot be is left.
-    worthwhile = any(c.open for c in discriminations) and expected(discriminations, ()) < enough
+    worthwhile = any(c.open for c in tasks) and expected(tasks, ()) < enough
     progress("extra poses: choosing")
-    chosen = fewest(discriminations, most, enough) if worthwhile else []
-    after = expected(discriminations, chosen)
+    chosen = fewest(tasks, most, enough) if worthwhile else []
+    after = expected(tasks, chosen)
     if after < enough or hopeless:
         progress("extra poses: what a horizontal pull would add")
         if after < enough:
-            reachable = covered * expected(discriminations, range(len(pool)))
-            notes.append(too_few_advice(len(chosen), covered * after, reachable))
+            reachable = covered * expected(tasks, range(len(pool)))
+            notes.append(
+                f"{len(chosen)} poses reach a probability of {covered * after:.2f} only; many more "
+                f"would reach {reachable:.2f}: allow more poses ({option('poses')}), or repeat "
+                "each of them"
+            )
         pulled = _pulled(base, pool, suspects, seed)
         n, newton = len(chosen), _newton(pool)
-        notes += _pull_notes(discriminations, hopeless, pulled, n, after, newton, covered)
+        notes += _pull_notes(tasks, hopeless, pulled, n, after, newton, covered)
     if not worthwhile:
         nothing = _nothing(sets, suspects, tuple(notes))
-        return replace(nothing, pairs=pairs_of(discriminations, chosen), inseparable=groups)
+        return replace(nothing, pairs=pairs_of(tasks, chosen), inseparable=groups)
     rng = np.random.default_rng(seed)
     return ExtraPlan(
         rivals=_names(sets),
-        pairs=pairs_of(discriminations, chosen),
+        pairs=pairs_of(tasks, chosen),
         plan=measuring_order(pool, chosen, base.observed.table),
         n_poses=len(chosen),
-        probability_before=covered * expected(discriminations, ()),
+        probability_before=covered * expected(tasks, ()),
         probability_after=covered * after,
-        probability_random=covered * expected_of_random(discriminations, len(chosen), rng),
+        probability_random=covered * expected_of_random(tasks, len(chosen), rng),
         separable=True,
         inseparable=groups,
         advice=(*recording_advice(sets), *notes),
@@ -338,7 +301,7 @@ def _nothing(sets: Sequence[RivalSet], suspects: Suspects, notes: tuple[str, ...
     likeliest = [float(s.probability.max()) for s in sets]
     p = float(np.prod(likeliest)) if sets else suspects.diagnosis.probability_unknown
     p *= suspects.covered
-    return ExtraPlan(_names(sets), (), None, 0, p, p, p, False, (), notes)
+    return ExtraPlan(False, (), 0, _names(sets), (), None, p, p, p, notes)
 
 
 def _names(sets: Sequence[RivalSet]) -> tuple[str, ...]:
@@ -350,7 +313,7 @@ def _newton(pool: VisitPool) -> float:
 
 
 def _pulled(base: Baseline, pool: VisitPool, suspects: Suspects, seed: int) -> list[Discrimination]:
-    """The contests with every candidate also pulled along x and y as hard as its load pulls.
+    """What is to be told apart, every candidate also pulled along x and y as hard as by its load.
 
     None without a load, nor for what is unknown: how it takes a pull nobody can say.
     """
@@ -363,17 +326,26 @@ def _pulled(base: Baseline, pool: VisitPool, suspects: Suspects, seed: int) -> l
 
 
 def _pull_notes(
-    discriminations: Sequence[Discrimination], hopeless: dict[tuple[str, str], float],
+    tasks: Sequence[Discrimination], hopeless: dict[tuple[str, str], float],
     pulled: Sequence[Discrimination], n: int, after: float, newton: float, covered: float,
 ) -> list[str]:  # fmt: skip
     """Advice to pull sideways, where that helps."""
     still = judged(pulled)[1] if pulled else hopeless
-    helped = [pair for pair in hopeless if pair not in still]
-    notes = [pull_separates(helped, newton)] if helped else []
+    apart = ", ".join(" and ".join(pair) for pair in hopeless if pair not in still)
+    notes = []
+    if apart:
+        notes.append(
+            f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a "
+            f"pulley, would separate {apart}: measure poses under it, too"
+        )
     if pulled and n:
-        alike = [p.in_classes(c.classes) for p, c in zip(pulled, discriminations, strict=True)]
-        chosen = fewest(alike, n)
-        reached = expected(alike, chosen)
+        same = [p.in_classes(c.classes) for p, c in zip(pulled, tasks, strict=True)]
+        chosen = fewest(same, n)
+        reached = expected(same, chosen)
         if reached > after + GAIN:
-            notes.append(pull_advice(len(chosen), newton, covered * after, covered * reached))
+            notes.append(
+                f"pull horizontally: {len(chosen)} poses that are also measured under "
+                f"{newton:.3g} N along x and along y, e.g. by a rope over a pulley, raise the "
+                f"probability from {covered * after:.2f} to {covered * reached:.2f}"
+            )
     return notes

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -36,8 +35,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.units import Array
 
-# What might be missing from the model: every effect at every place where it could act.
-
 # What each need of an effect asks the user to record.
 RECORD = {
     "time": ("the table has no time column", "record time_s or time_min of every reading"),
@@ -52,6 +49,14 @@ RECORD = {
         "[model] link_gravity = true",
     ),
 }
+
+
+# Scales of an effect's prior size, in typical sizes; one that nobody has stated is known to an
+# order of magnitude at best.
+SCALES = np.array([0.3, 1.0, 3.0])
+UNSIZED_SCALES = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
+
+EntryKey = tuple[str, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -76,8 +81,32 @@ class Hypothesis:
         return f"{self.name} at {self.where}"
 
     @property
+    def key(self) -> tuple[str, str]:
+        return self.name, self.where
+
+    @property
     def choice(self) -> EffectChoice:
-        return EffectChoice(self.name, self.where)
+        return EffectChoice(*self.key)
+
+    @property
+    def driven(self) -> bool:
+        """Whether it moves an entry of the chain by a function of the visit."""
+        return isinstance(self.effect, DrivenEffect)
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return len(self.parameters)
+
+    @property
+    def scales(self) -> Array:
+        """Scales of the size prior: wider where no typical size is known."""
+        return UNSIZED_SCALES if any(p.typical is None for p in self.parameters) else SCALES
+
+    def entry_key(self, model: Model) -> EntryKey:
+        """The entry of the chain that a driven hypothesis acts on."""
+        assert isinstance(self.effect, DrivenEffect)
+        return self.effect.entry.name, self.effect.entered_at(self.where, model.chain)
 
 
 def possible(
@@ -102,7 +131,7 @@ def possible(
             if key := _unset(h, chain, cell):
                 reason = f"{key} is not known, and only settings of a driven effect are searched"
                 advice = f"state {key} in [model.nominal.settings.{h.where}]"
-                untested.append(Untested(name, h.where, reason, advice))
+                untested.append(Untested(*h.key, reason, advice))
             else:
                 hypotheses.append(h)
     return [h for h in hypotheses if h.parameters], untested
@@ -117,8 +146,8 @@ def recorded(table: Measurements, need: str) -> bool:
 
 
 def _at(effect: Effect, where: str, chain: Chain, cell: Cell) -> Hypothesis:
-    """Only a drive can be evaluated at many settings; those of other effects stay as the model
-    has them."""
+    """Only a driven effect can be evaluated at many settings; those of other effects stay as the
+    model has them."""
     parameters = effect.parameters(where, chain, cell)
     searched = isinstance(effect, DrivenEffect)
     settings = effect.settings(where, chain, cell) if searched else ()
@@ -157,7 +186,6 @@ def with_recorded_drivers(
     last motion left it where that is known.  Effects that the cell has active stay as they are;
     those of a diagnosis are driven as `found`.
     """
-    spec = model.cell.model
     active = {p.effect for p in model.parameters}
     if found is not None:
         otherwise = {effect for key, _, _, effect in CHOICES if key not in found.model_keys}
@@ -167,21 +195,20 @@ def with_recorded_drivers(
         for key, value, column, effect in CHOICES
         if recorded(table, column) and effect not in active
     }
-    if not keys:
-        return model
-    cell = replace(model.cell, model=replace(spec, **keys))  # type: ignore[arg-type]
+    return with_keys(model, **keys) if keys else model
+
+
+def with_keys(model: Model, **keys: str) -> Model:
+    """The model with these keys of [model]."""
+    cell = replace(model.cell, model=replace(model.cell.model, **keys))  # type: ignore[arg-type]
     return Model.assembled(model.chain, cell)
 
 
 def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
     """Keys of [model] that the effects found rest on."""
-    names = {f.effect for f in found}
-    spec = model.cell.model
-    return {
-        key: value
-        for key, value, _, effect in CHOICES
-        if effect in names and getattr(spec, key) == value
-    }
+    names, spec = {f.effect for f in found}, model.cell.model
+    used = [(key, value) for key, value, _, effect in CHOICES if effect in names]
+    return {key: value for key, value in used if getattr(spec, key) == value}
 
 
 # Where an effect's constants are searched: change times, time constants, orders, ranges.
@@ -209,7 +236,10 @@ class SettingsGrid:
         return int(np.abs(self.values - settings).sum(axis=1).argmin())
 
 
-def grid_of(hypothesis: Hypothesis, visits: Measurements, chain: Chain) -> SettingsGrid:
+NO_SETTINGS = SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
+
+
+def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
     """Grid of a hypothesis' settings for these visits; one empty point where it has none.
 
     Of several settings it holds every combination.  Where those are more than MOST_POINTS, each
@@ -217,7 +247,7 @@ def grid_of(hypothesis: Hypothesis, visits: Measurements, chain: Chain) -> Setti
     """
     axes = [_axis(setting, hypothesis.where, visits) for setting in hypothesis.settings]
     if not axes:
-        return SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
+        return NO_SETTINGS
     if len(axes) == 1:
         return axes[0]
     share = min(1.0, MOST_POINTS / math.prod(len(axis.values) for axis in axes))
@@ -291,12 +321,9 @@ def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
     values = np.arange(LOWEST_ORDER, HIGHEST_ORDER, step)
     known = [] if setting.default is None else [setting.default]
     share = KNOWN_SHARE if known else 0.0
-    prior = np.concatenate(
-        [np.full(len(known), share), np.full(len(values), (1 - share) / len(values))]
-    )
-    return SettingsGrid(
-        np.concatenate([known, values])[:, None], np.log(prior), np.full((len(prior), 1), step)
-    )
+    prior = np.append(np.full(len(known), share), np.full(len(values), (1 - share) / len(values)))
+    values = np.append(known, values)[:, None]
+    return SettingsGrid(values, np.log(prior), np.full((len(prior), 1), step))
 
 
 # Columns of effects whose other parameters say nothing while the first is zero.
@@ -309,38 +336,32 @@ ROWS = 3000  # of the equations, as many as tell one start from another
 
 
 def with_tangents(
-    whole: Model, hypotheses: list[Hypothesis], base: Baseline, x: Array, B: Array
+    full: Model, hypotheses: list[Hypothesis], base: Baseline, x: Array, B: Array
 ) -> Array:
     """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none."""
     for h in hypotheses:
-        own = own_columns(whole, h)
+        own = own_columns(full, h)
         shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
         if shown.all() or shown.sum() != 1:
             continue
-        best = min(tangents(whole, h, base, x, B), key=lambda t: t.left)
         B = B.copy()
-        B[:, :, own] = best.columns
+        B[:, :, own] = min(tangents(full, h, base, x, B), key=lambda tangent: tangent[0])[1]
     return B
 
 
-@dataclass(frozen=True)
-class Tangent:
-    """Columns (n_rows, size, k) of an effect about one of its starts, at the amplitude that the
-    residual asks for, and what is `left` of the residual's sum of squares."""
+def tangents(
+    full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array
+) -> Iterator[tuple[float, Array]]:
+    """For each start that the effect proposes what is left of the residual's sum of squares, and
+    the effect's columns (n_rows, size, k) about it, at the amplitude that the residual asks for.
 
-    left: float
-    columns: Array
-
-
-def tangents(whole: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> Iterator[Tangent]:
-    """One for each start that the effect proposes; x (K,) and B (n_rows, size, K) of `whole`.
-
-    The effect's first parameter is the amplitude that the others have no columns without.
+    x (K,) and B (n_rows, size, K) are those of `full`.  The effect's first parameter is the
+    amplitude that the others have no columns without.
     """
     table, model = base.observed.table, base.model
-    observed = observe(table, whole.observe)
-    names = {name: k for k, name in enumerate(whole.names)}
-    fitted, own = [names[name] for name in model.names], own_columns(whole, h)
+    observed = observe(table, full.observe)
+    names = {name: k for k, name in enumerate(full.names)}
+    fitted, own = [names[name] for name in model.names], own_columns(full, h)
     X = base.observed.apply(B[:, :, fitted]).reshape(len(base.residual), -1) * base.sizes
     # What is only planned has no residual yet that a spring could answer for.
     last = base.n_measured * base.observed.size - 1
@@ -349,34 +370,28 @@ def tangents(whole: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) ->
         at = x.copy()
         for key, value in start.items():
             at[names[f"{h.where}.{key}"]] = value
-        column = whole.regressor(table, at, np.array(own[:1]), observed).B
+        column = full.regressor(table, at, np.array(own[:1]), observed).B
         c = base.observed.apply(column.reshape(len(table), observed.size, 1)).ravel()
         size = max(float(np.abs(c).max()), 1e-300)
         A = np.column_stack([X, c / size])[rows]
         solution, *_ = np.linalg.lstsq(A, base.residual[rows], rcond=1e-9)
         at[own[0]] += solution[-1] / size
-        columns = whole.regressor(table, at, np.array(own), observed).B
+        columns = full.regressor(table, at, np.array(own), observed).B
         columns = columns.reshape(len(table), observed.size, -1)
         columns[:, :, 0] = column.reshape(len(table), observed.size)
-        yield Tangent(float(((base.residual[rows] - A @ solution) ** 2).sum()), columns)
+        yield float(((base.residual[rows] - A @ solution) ** 2).sum()), columns
 
 
-def own_columns(whole: Model, h: Hypothesis) -> list[int]:
-    """Where the hypothesis' parameters stand among those of `whole`."""
-    return [k for k, p in enumerate(whole.parameters) if (p.effect, p.where) == (h.name, h.where)]
+def own_columns(full: Model, h: Hypothesis) -> list[int]:
+    """Where the hypothesis' parameters stand among those of `full`."""
+    return [k for k, p in enumerate(full.parameters) if (p.effect, p.where) == h.key]
 
 
 # Columns of every hypothesis at the fitted arm: one symbolic model with everything in it.
 
-EntryKey = tuple[str, tuple[str, ...]]
-
 ENTRIES: tuple[Entry, ...] = (
-    JointMotion(),
-    LinkLength(),
-    LinkFrame(),
-    BaseMotion(),
-    MarkerMotion(),
-)
+    JointMotion(), LinkLength(), LinkFrame(), BaseMotion(), MarkerMotion()
+)  # fmt: skip
 # The signal that a parameter without a known size is expected to make, rms over its rows.
 UNSIZED_SIGNAL = 2e-4
 
@@ -386,18 +401,14 @@ class Columns:
     """B of the model, of direct hypotheses and of the chain's entries, row by row of the table.
 
     `rows` (n_rows, size, K) at the fitted values, raw; `places` says which columns of it belong to
-    an effect (or entry) at a place.  `whole` is the model with all of them, at x (K,).
+    an effect (or entry) at a place.  `full` is the model with all of them, at x (K,).
     """
 
     base: Baseline
     rows: Array
     places: dict[tuple[str, str], slice]
-    whole: Model
+    full: Model
     x: Array
-
-    @cached_property
-    def table(self) -> Measurements:
-        return self.base.observed.table
 
     def observed(self, rows: Array) -> Array:
         """Per table row (n_rows, size, k) → per observation (N, size, k)."""
@@ -405,12 +416,12 @@ class Columns:
 
     def of(self, hypothesis: Hypothesis) -> Array:
         """Columns (n_rows, size, k) of a hypothesis that is not driven."""
-        return self.rows[:, :, self.places[hypothesis.name, hypothesis.where]]
+        return self.rows[:, :, self.places[hypothesis.key]]
 
     def from_each_start(self, hypothesis: Hypothesis) -> Iterator[Array]:
         """Its columns (n_rows, size, k) about each of the starts of which `of` has the best."""
-        for tangent in tangents(self.whole, hypothesis, self.base, self.x, self.rows):
-            yield tangent.columns
+        for _, columns in tangents(self.full, hypothesis, self.base, self.x, self.rows):
+            yield columns
 
     def torques(self) -> Array:
         """The load's torque τ (n_rows, joints) on every joint, zero where nothing depends on it.
@@ -436,17 +447,6 @@ class Columns:
         return np.concatenate([self.rows[:, :, self.places[name, w]] for w in places], axis=2)
 
 
-def is_driven(hypothesis: Hypothesis) -> bool:
-    return isinstance(hypothesis.effect, DrivenEffect)
-
-
-def entry_key(hypothesis: Hypothesis, model: Model) -> EntryKey:
-    """The entry that a driven hypothesis acts on."""
-    effect = hypothesis.effect
-    assert isinstance(effect, DrivenEffect)
-    return effect.entry.name, effect.entered_at(hypothesis.where, model.chain)
-
-
 def compute_columns(
     base: Baseline, hypotheses: list[Hypothesis], found: dict[str, float] | None = None
 ) -> Columns:
@@ -459,7 +459,7 @@ def compute_columns(
     """
     model, table = base.model, base.observed.table
     chain, cell = model.chain, model.cell
-    direct = [h for h in hypotheses if not is_driven(h)]
+    direct = [h for h in hypotheses if not h.driven]
     spec = replace(
         cell.model,
         effects=(*cell.model.effects, *(h.choice for h in direct)),
@@ -468,17 +468,17 @@ def compute_columns(
     )
     extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
     key = "columns", spec.effects
-    whole = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
+    full = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
     at = dict(zip(model.names, base.x, strict=True)) | (found or {})
-    x = np.array([at.get(p.name, p.nominal) for p in whole.parameters])
-    observed = observe(table, whole.observe)
-    B = whole.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
-    B = with_tangents(whole, direct, base, x, B)
+    x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
+    observed = observe(table, full.observe)
+    B = full.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
+    B = with_tangents(full, direct, base, x, B)
     spans: dict[tuple[str, str], list[int]] = {}
-    for k, p in enumerate(whole.parameters):
+    for k, p in enumerate(full.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
-    return Columns(base, B, places, whole, x)
+    return Columns(base, B, places, full, x)
 
 
 def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:
@@ -490,8 +490,8 @@ def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:
     moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
     rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
     signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
-    typical = [p.typical for p in hypothesis.parameters]
-    return np.array([s if t is None else t for s, t in zip(signal, typical, strict=True)])
+    sized = zip(signal, hypothesis.parameters, strict=True)
+    return np.array([s if p.typical is None else p.typical for s, p in sized])
 
 
 class RegressorDirection:
@@ -507,13 +507,13 @@ class RegressorDirection:
         u = effect.drive(self._arm, hypothesis.where, {**fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
-        # Most drives ask for one or two numbers of a row: evaluated at thousands of settings, all
-        # that the arm declared would be copied as many times.
+        # Most directions ask for one or two numbers of a row: evaluated at thousands of settings,
+        # all that the arm declared would be copied as many times.
         declared = ca.vertcat(*self._arm.inputs.values())
         used = [k for k in range(declared.numel()) if ca.depends_on(D, declared[k])]
         self._used = np.array(used, dtype=np.int64)
         asked = ca.vertcat(ca.SX.zeros(0, 1), *(declared[k] for k in used))
-        self._tape = BatchFunction([asked, constants], [D])
+        self._compiled = BatchFunction([asked, constants], [D])
 
     def asked(self, table: Measurements) -> Array:
         """What D depends on in each row of the table (n_rows, quantities)."""
@@ -523,5 +523,5 @@ class RegressorDirection:
         """D (n_rows, G, d, k) at each of the `settings` (G, number of settings)."""
         G, n = len(settings), len(table)
         asked = np.repeat(self.asked(table), G, axis=0)
-        D = self._tape(asked, np.tile(settings, (n, 1)))[0]
+        D = self._compiled(asked, np.tile(settings, (n, 1)))[0]
         return np.asarray(D.reshape(n, G, *D.shape[1:]))

@@ -1,4 +1,4 @@
-"""A set of additions to the model: its noise, its evidence, its estimates, what looks alike."""
+"""A set of additions to the model: its noise, its evidence, its estimates, its imitators."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.special import log_ndtr, logsumexp
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, made_once
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.evidence import SCALES, Grams, scales_of
-from elastocal.diagnosis.hypotheses import Hypothesis, is_driven
+from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
@@ -52,18 +52,19 @@ class Item:
         return self.what.label
 
     @property
+    def key(self) -> tuple[str, str]:
+        """(effect, place) of a known item."""
+        assert isinstance(self.what, Hypothesis)
+        return self.what.key
+
+    @property
     def scales(self) -> Array:
-        return scales_of(self.what) if isinstance(self.what, Hypothesis) else SCALES
+        return self.what.scales
 
     @property
     def width(self) -> int:
         """Number of columns."""
-        if isinstance(self.what, Hypothesis):
-            return len(self.what.parameters)
-        if self.what.columns is not None:
-            return self.what.columns.shape[2]
-        assert self.what.drive is not None
-        return self.what.drive.shape[3]
+        return self.what.width
 
     def same_as(self, other: Item) -> bool:
         return self.what is other.what
@@ -115,10 +116,9 @@ def packed_columns(dataset: DiagnosisData, item: Item) -> Array:
         return dataset.packed(what, item.settings)
     if what.columns is not None:
         return what.columns
-    assert what.entry is not None and what.drive is not None
-    E = dataset.entry(what.entry)  # (C, m, d)
-    drive = np.einsum("cmv,cvdk->cmdk", dataset.places.one_hot, what.drive)
-    return np.einsum("cmd,cmdk->cmk", E, drive)
+    assert what.entry is not None and what.direction is not None
+    direction = np.einsum("cmv,cvdk->cmdk", dataset.places.one_hot, what.direction)
+    return np.einsum("cmd,cmdk->cmk", dataset.entry(what.entry), direction)
 
 
 def fit_set(
@@ -158,19 +158,16 @@ def _within_bounds(items: tuple[Item, ...], at: Projection) -> float:
     posterior's share of that half, each parameter taken by itself.
     """
     bounded = [
-        isinstance(item.what, Hypothesis)
-        and any(p.lower == p.nominal for p in item.what.parameters)
-        for item in items
+        (span.start + k)
+        for item, span in zip(items, spans_of(items, len(at.beta)), strict=True)
+        if isinstance(item.what, Hypothesis)
+        for k, p in enumerate(item.what.parameters)
+        if p.lower == p.nominal
     ]
-    if not any(bounded):
+    if not bounded:
         return 0.0
     z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
-    total = 0.0
-    for item, span in zip(items, spans_of(items, len(z)), strict=True):
-        if isinstance(item.what, Hypothesis):
-            for p, share in zip(item.what.parameters, log_ndtr(z[span]), strict=True):
-                total += float(np.log(2) + share) if p.lower == p.nominal else 0.0
-    return total
+    return sum(float(np.log(2) + share) for share in log_ndtr(z[bounded]))
 
 
 def _mixed_scales(
@@ -200,11 +197,11 @@ def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
     """
     item = chosen.items[k]
     what = item.what
-    if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
+    if not isinstance(what, Hypothesis) or not what.driven or not what.settings:
         return chosen
     data = beside(dataset, chosen, k)
     grams = Grams(dataset, data, project(data, chosen.noise))
-    grid = dataset.grids[what.name, what.where]
+    grid = dataset.grids[what.key]
 
     def evidence(tried: Array) -> Array:
         return grams.of_hypothesis(what, tried).evidence(item.scales)
@@ -240,7 +237,7 @@ def _best_along(settings: Array, s: int, trial: Array, evidence: Callable[[Array
 def with_items(
     dataset: DiagnosisData, items: tuple[Item, ...], scales: tuple[float, ...]
 ) -> NoisyData:
-    """The scene's data with the items' columns at the given scales."""
+    """The data with the items' columns at the given scales."""
     if not items:
         return dataset.data
     columns = np.concatenate([packed_columns(dataset, item) for item in items], axis=2)
@@ -276,16 +273,14 @@ def distances(
     v, data = signal_of(dataset, chosen, k), beside(dataset, chosen, k)
     at = project(replace(data, r=v), chosen.noise)
     grams = Grams(dataset, data, at)
-    whole = float((v * at.u).sum())
+    signal = float((v * at.u).sum())
     out: dict[tuple[str, str], float] = {}
     for h in dataset.hypotheses:
-        if h is chosen.items[k].what:
-            continue
-        found = grams.of_hypothesis(h, settings_to_try(dataset, h, chosen.items[k]))
-        s = PLAUSIBLE * float(scales_of(h).max())
-        explained = float(found.explained(s).max())
-        out[h.name, h.where] = float(np.sqrt(max(whole - explained, 0.0)))
-    return float(np.sqrt(max(whole, 0.0))), out
+        if h is not chosen.items[k].what:
+            found = grams.of_hypothesis(h, settings_to_try(dataset, h, chosen.items[k]))
+            explained = float(found.explained(PLAUSIBLE * float(h.scales.max())).max())
+            out[h.key] = float(np.sqrt(max(signal - explained, 0.0)))
+    return float(np.sqrt(max(signal, 0.0))), out
 
 
 def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Array | None:
@@ -295,20 +290,14 @@ def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Ar
     what = item.what
     if not rival.settings:
         return None
-    values = dataset.grids[rival.name, rival.where].values
+    values = dataset.grids[rival.key].values
     if not isinstance(what, Hypothesis):
         return values
-    alike = [s.kind for s in rival.settings] == [s.kind for s in what.settings]
-    within = alike and all(
+    same_kinds = [s.kind for s in rival.settings] == [s.kind for s in what.settings]
+    within = same_kinds and all(
         s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True)
     )
     return np.vstack([values, item.settings]) if within else values
-
-
-def item_key(item: Item) -> tuple[str, str]:
-    """(effect, place) of a known item."""
-    assert isinstance(item.what, Hypothesis)
-    return item.what.name, item.what.where
 
 
 # The model with found effects added.
@@ -347,7 +336,7 @@ def linear_estimates(dataset: DiagnosisData, chosen: ModelSet) -> dict[str, floa
     out: dict[str, float] = {}
     for item, span in zip(chosen.items, chosen.spans, strict=True):
         if isinstance(item.what, Hypothesis):
-            values = chosen.at.beta[span] * dataset.sizes[item.what.name, item.what.where]
+            values = chosen.at.beta[span] * dataset.sizes[item.what.key]
             for p, v in zip(item.what.parameters, values, strict=True):
                 out[f"{item.what.where}.{p.key}"] = float(v) + p.nominal
     return out

@@ -16,7 +16,7 @@ from elastocal.units import Array, BoolArray
 #     V = a² Σ_stated + Σ_j s_j² g_j g_jᵀ ∘ (same visit + c² · same configuration)
 #
 # with g_j = ∂(reading)/∂q_j.  a, s_j and c maximise the marginal likelihood of the residuals
-# (projection.py) times priors that keep what the data do not show near its usual size.
+# (below) times priors that keep what the data do not show near its usual size.
 
 # Logarithms' prior standard deviations.  Stated tracker noise is rarely wrong by more than 1.6
 # times; a joint repeats to some 5 µrad on a heavy arm and to 50 on a light one; the joints of an
@@ -155,9 +155,9 @@ def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
     joints = theta[2:]
     n = len(joints)
     inverse = np.linalg.inv(JOINT_SPREAD**2 * np.eye(n) + REPEATABILITY_SPREAD**2)
-    away = joints - np.log(REPEATABILITY)
-    slope[2:] = 2 * inverse @ away
-    return float(z @ z + away @ inverse @ away), slope
+    off = joints - np.log(REPEATABILITY)
+    slope[2:] = 2 * inverse @ off
+    return float(z @ z + off @ inverse @ off), slope
 
 
 # Data under one noise: what is left of the residual, and how probable the noise is.
@@ -188,6 +188,11 @@ class Projection:
     marginal: float
     factor: Array
 
+    @property
+    def P(self) -> Array:
+        """P (C, m, m) of each configuration by itself."""
+        return self.inverse - self.H @ self.H.transpose(0, 2, 1)
+
     @cached_property
     def spread(self) -> tuple[Array, Array]:
         """V⁻¹e and Hᵀe, (C, m) and (C, p), of residuals e that scatter as the noise does.
@@ -195,8 +200,7 @@ class Projection:
         The fit's own residuals are too small, its leverage less than V: u_c has the covariance
         P_cc, so e_c = V_c^½ P_cc^−½ u_c has V_c (Bell and McCaffrey 2002).
         """
-        P = self.inverse - self.H @ self.H.transpose(0, 2, 1)
-        e = _power(self.inverse, -0.5) @ (_power(P, -0.5) @ self.u[..., None])
+        e = _power(self.inverse, -0.5) @ (_power(self.P, -0.5) @ self.u[..., None])
         return (self.inverse @ e)[..., 0], (self.H.transpose(0, 2, 1) @ e)[..., 0]
 
     @property
@@ -263,7 +267,7 @@ class Weighted:
 
 
 def _inverse(K: Array) -> Array:
-    """K⁻¹ of lower triangles K (C, m, m), by halves: a general inverse takes twice as long."""
+    """K⁻¹ of lower triangular K (C, m, m), by halves: a general inverse takes twice as long."""
     if K.shape[1] == 1:
         return 1 / K
     h = K.shape[1] // 2
@@ -275,7 +279,7 @@ def _inverse(K: Array) -> Array:
 
 
 def _divided(rows: Array, L: Array, overwrite: bool = False) -> Array:
-    """rows L⁻ᵀ (…, p) of rows (…, p) and a lower triangle L (p, p)."""
+    """rows L⁻ᵀ (…, p) of rows (…, p) and a lower triangular L (p, p)."""
     flat = rows.reshape(-1, rows.shape[-1])
     # BLAS itself, since scipy's solver hands the rows back column by column.
     divided = linalg.blas.dtrsm(1.0, L, flat.T, lower=1, overwrite_b=overwrite).T
@@ -341,11 +345,8 @@ def fit_noise(data: NoisyData, start: NoiseValues | None = None) -> NoiseValues:
         return _climbed(data, start)
     if len(data.r) >= 2 * SOME:
         return _climbed(data, fit_noise(data.every(len(data.r) // SOME)))
-    starts = [NoiseValues.usual(data.G.shape[2])]
-    if not data.stated:
-        starts.append(_balanced(data))
-    ends = [_climbed(data, s) for s in starts]
-    return min(ends, key=lambda end: posterior(data, end))
+    starts = [NoiseValues.usual(data.G.shape[2]), *([] if data.stated else [_balanced(data)])]
+    return min((_climbed(data, s) for s in starts), key=lambda end: posterior(data, end))
 
 
 def _balanced(data: NoisyData) -> NoiseValues:
@@ -354,24 +355,23 @@ def _balanced(data: NoisyData) -> NoiseValues:
     From far below it the likelihood is flat in a joint's logarithm, and no climb leaves.
     """
     used = ~data.left_out
-    whole = float((data.r[used] ** 2).mean())
+    square = float((data.r[used] ** 2).mean())
     shape = float(np.diagonal(data.covariance, axis1=1, axis2=2)[used].mean())
     moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)
-    joint = np.clip(np.sqrt(0.5 * whole / (len(moved) * moved)), SMALLEST_NOISE, LARGEST)
-    return NoiseValues(float(np.sqrt(0.5 * whole / shape)), joint, SHARED)
+    joint = np.clip(np.sqrt(0.5 * square / (len(moved) * moved)), SMALLEST_NOISE, LARGEST)
+    return NoiseValues(float(np.sqrt(0.5 * square / shape)), joint, SHARED)
 
 
 def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
     n = data.G.shape[2]
-
-    observed: dict[bytes, tuple[float, Array]] = {}
+    known: dict[bytes, tuple[float, Array]] = {}
 
     def cost(theta: Array) -> tuple[float, Array]:
         # A search begins where it has been: at the start, and where the last stride ended.
         key = theta.tobytes()
-        if key not in observed:
-            observed[key] = likelihood(data, NoiseValues.of_logs(theta))
-        value, slope = observed[key]
+        if key not in known:
+            known[key] = likelihood(data, NoiseValues.of_logs(theta))
+        value, slope = known[key]
         return value, slope.copy()
 
     spread = STATED_SPREAD if data.stated else UNSTATED_SPREAD

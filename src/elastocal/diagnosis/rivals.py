@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -14,19 +14,18 @@ from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import Grams, direct
-from elastocal.diagnosis.hypotheses import Hypothesis, possible, typical_sizes
+from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.model_set import (
     Item,
     distances,
     fit_set,
-    item_key,
     packed_columns,
     settings_to_try,
     with_items,
 )
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
 from elastocal.diagnosis.unknown import Generic, generic_blocks
-from elastocal.diagnosis.verdict import ALIKE, UNKNOWN_EFFECT
+from elastocal.diagnosis.verdict import TOO_NEAR, UNKNOWN_EFFECT
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
 from elastocal.model.effects.compliances import JointCompliance
@@ -90,8 +89,7 @@ class RivalSet:
 
 def name_of(item: Item) -> str:
     """ "gear_eccentricity:joint2", or a block's label."""
-    what = item.what
-    return f"{what.name}:{what.where}" if isinstance(what, Hypothesis) else what.label
+    return ":".join(item.key) if item.known else item.label
 
 
 def _depends(what: Hypothesis | Generic, column: str) -> bool:
@@ -106,38 +104,35 @@ class Suspects:
 
     def __init__(self, model: Model, table: Measurements, diagnosis: Diagnosis) -> None:
         self.diagnosis = diagnosis
-        known = {(h.name, h.where): h for h in possible(model, table)[0]}
-        self._items: dict[tuple[str, str], Item] = {}
-        self._probability: dict[tuple[str, str], float] = {}
+        hypotheses = {h.key: h for h in possible(model, table)[0]}
+        # Every effect that was tried, with its probability.
+        self.known: dict[tuple[str, str], tuple[Item, float]] = {}
         for c in diagnosis.candidates:
-            key = c.effect, c.where
-            if key in known:
-                h = known[key]
+            if h := hypotheses.get((c.effect, c.where)):
                 settings = np.array([c.settings[s.key] for s in h.settings])
-                self._items[key] = Item(h, settings, 0.0)
-                self._probability[key] = c.probability
+                self.known[h.key] = Item(h, settings, 0.0), c.probability
         self._found = [(f.effect, f.where) for f in diagnosis.effects]
         named = [(e.effect, e.where) for group in diagnosis.indistinguishable for e in group]
-        named = [key for key in named if key[0] != UNKNOWN_EFFECT]
         for effect, where in [*self._found, *named]:
             require(
-                (effect, where) in self._items,
+                effect == UNKNOWN_EFFECT or (effect, where) in self.known,
                 f"{table.source}: the diagnosis names {effect} at {where}, which this model and "
                 "table cannot test; plan with those that were diagnosed",
             )
         self.sets = tuple(self._named_sets())
 
-    @property
-    def known(self) -> dict[tuple[str, str], tuple[Item, float]]:
-        """Every effect that was tried, with its probability."""
-        return {key: (item, self._probability[key]) for key, item in self._items.items()}
+    def _items(self, keys: Iterable[tuple[str, str]]) -> list[Item]:
+        return [self.known[key][0] for key in keys]
+
+    def _probabilities(self, keys: Iterable[tuple[str, str]]) -> list[float]:
+        return [self.known[key][1] for key in keys]
 
     @property
     def covered(self) -> float:
         """Probability that the right answer is among the rivals: that there is something, and that
         it is none of the effects that are no rivals."""
         d, ours = self.diagnosis, set(self._rivals())
-        others = sum(p for key, p in self._probability.items() if key not in ours)
+        others = sum(p for key, (_, p) in self.known.items() if key not in ours)
         missed = d.probability_nothing + others + (0.0 if self.unknown else d.probability_unknown)
         return min(max(1 - missed, 0.0), 1.0)
 
@@ -151,18 +146,14 @@ class Suspects:
         """The sets that the diagnosis calls indistinguishable."""
         for group in self.diagnosis.indistinguishable:
             keys = [(e.effect, e.where) for e in group if e.effect != UNKNOWN_EFFECT]
-            if len(keys) < 2:
-                continue
-            yield RivalSet.of(
-                [self._items[k] for k in keys],
-                [self._probability[k] for k in keys],
-                [self._items[k] for k in self._found if k not in keys],
-            )
+            if len(keys) > 1:
+                beside = self._items(k for k in self._found if k not in keys)
+                yield RivalSet.of(self._items(keys), self._probabilities(keys), beside)
 
     def _rivals(self) -> list[tuple[str, str]]:
         """The known rivals, and what is at work beside them."""
         items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
-        keys = [item_key(item) for item in items] + self._found
+        keys = [item.key for item in items] + self._found
         return keys + self._likeliest() if self.unknown else keys
 
     @property
@@ -171,8 +162,8 @@ class Suspects:
         keys = self._rivals()
         if self.unknown:
             # Torques, which may drive what is unknown, come from the compliances' columns.
-            keys += [k for k in self._items if k[0] == JointCompliance.name]
-        whats = [self._items[k].what for k in dict.fromkeys(keys)]
+            keys += [k for k in self.known if k[0] == JointCompliance.name]
+        whats = [item.what for item in self._items(dict.fromkeys(keys))]
         return [h for h in whats if isinstance(h, Hypothesis)]
 
     @property
@@ -193,33 +184,29 @@ class Suspects:
 
     def unknown_set(self, dataset: DiagnosisData, noise: NoiseValues) -> RivalSet:
         """The blocks that explain the data best where the diagnosis locates the effect, and the
-        likeliest effects of the catalogue; `scene` with only the data so far counting."""
+        likeliest effects of the catalogue; in `dataset` only the data so far count."""
         location = self.diagnosis.location
         assert location is not None  # an unknown effect was found somewhere
-        places = dict.fromkeys([location.where, *location.places])
-        near = list(places)[:PLACES]
+        near = list(dict.fromkeys([location.where, *location.places]))[:PLACES]
         at = project(dataset.data, noise)
-        items, evidence = [], []
-        for block in generic_blocks(dataset):
-            if block.where in near:
-                item = Item(block, np.zeros(0), 0.0)
-                columns = dataset.data.masked(packed_columns(dataset, item))
-                items.append(item)
-                evidence.append(float(direct(columns, at).evidence()[0]))
-        best = np.argsort(-np.array(evidence), kind="stable")[:BLOCKS]
-        share = self.diagnosis.probability_unknown * softmax(np.array(evidence)[best])
+        blocks = [block for block in generic_blocks(dataset) if block.where in near]
+        items = [Item(block, np.zeros(0), 0.0) for block in blocks]
+        columns = (dataset.data.masked(packed_columns(dataset, item)) for item in items)
+        evidence = np.array([float(direct(C, at).evidence()[0]) for C in columns])
+        best = np.argsort(-evidence, kind="stable")[:BLOCKS]
+        share = self.diagnosis.probability_unknown * softmax(evidence[best])
         keys = self._likeliest()
         return RivalSet.of(
-            [*(items[k] for k in best), *(self._items[k] for k in keys)],
-            [*share, *(self._probability[k] for k in keys)],
-            [self._items[k] for k in self._found],
+            [*(items[k] for k in best), *self._items(keys)],
+            [*share, *self._probabilities(keys)],
+            self._items(self._found),
             LEAST_PROBABILITY_UNKNOWN,
         )
 
     def _likeliest(self) -> list[tuple[str, str]]:
-        free = [k for k in self._items if k not in self._found]
-        free = sorted(free, key=lambda k: -self._probability[k])[:MOST_KNOWN]
-        return [k for n, k in enumerate(free) if n < FEWEST_KNOWN or self._probability[k] >= CHANCE]
+        p = {key: p for key, (_, p) in self.known.items() if key not in self._found}
+        free = sorted(p, key=lambda key: -p[key])[:MOST_KNOWN]
+        return [key for n, key in enumerate(free) if n < FEWEST_KNOWN or p[key] >= CHANCE]
 
 
 def check_open(diagnosis: Diagnosis) -> None:
@@ -260,17 +247,17 @@ def with_neighbours(
         for rival in s.rivals:
             found = distances(dataset, fit_set(dataset, (rival, *s.beside), noise), 0)[1]
             near |= {key: min(near[key], d) for key, d in found.items()}
-        taken = {item_key(item) for item in (*s.rivals, *s.beside)}
+        taken = {item.key for item in (*s.rivals, *s.beside)}
         free = [
             key
             for key, (_, p) in known.items()
-            if key not in taken and (near[key] < ALIKE or (near[key] < NEAR and p >= CHANCE))
+            if key not in taken and (near[key] < TOO_NEAR or (near[key] < NEAR and p >= CHANCE))
         ]
         free = sorted(free, key=lambda key: near[key])[: max(MOST - len(s.rivals), 0)]
         rivals = [*s.rivals, *(known[key][0] for key in free)]
         # Those named have their probability given that there is something, as these need, too.
         something = max(1 - diagnosis.probability_nothing, 1e-9)
-        named = [known[item_key(item)][1] for item in s.rivals]
+        named = [known[item.key][1] for item in s.rivals]
         p = [*named, *(known[key][1] / something for key in free)]
         out.append(RivalSet.of(rivals, p, s.beside))
     return tuple(out)
@@ -279,22 +266,19 @@ def with_neighbours(
 # The starts from which one rival may imitate another: where a spring would be anchored.
 #
 # A spring's geometry is sought by the diagnosis from several starts, and only the best so far has
-# given its columns to the scene.  Once further poses are measured it is sought anew, and what
+# given its columns to the dataset.  Once further poses are measured it is sought anew, and what
 # another start explains of them is no longer told from a rival.
 
 
 def columns_of_starts(dataset: DiagnosisData, item: Item) -> list[Array]:
     """Columns (C, m, k) of an item about each of its starts, per typical size; none without."""
-    what, base = item.what, dataset.base
+    what, model = item.what, dataset.base.model
     if not isinstance(what, Hypothesis):
         return []
-    if not what.effect.starts(what.where, base.model.chain, base.model.cell):
+    if not what.effect.starts(what.where, model.chain, model.cell):
         return []
-    out = []
-    for rows in dataset.columns.from_each_start(what):
-        measured = dataset.columns.observed(rows)[: base.n_measured]
-        out.append(dataset.pack(rows) * typical_sizes(what, measured))
-    return out
+    each = dataset.columns.from_each_start(what)
+    return [dataset.pack(rows) * dataset.sizes_in(what, rows) for rows in each]
 
 
 # The settings with which one rival may imitate the others: its order, its time.
@@ -306,28 +290,27 @@ NEARLY = 4.0  # in d²: two standard deviations
 SETTINGS = 6  # of a rival that are tried, at most
 
 
-def imitations(
-    dataset: DiagnosisData, noise: NoiseValues, discrimination: RivalSet
+def alternatives(
+    dataset: DiagnosisData, noise: NoiseValues, rivals: RivalSet
 ) -> tuple[tuple[Item, ...], ...]:
     """Of each rival that has settings the item at those which explain most of another's signal,
     the bests first, then what explains NEARLY as much; of other rivals nothing.
 
-    A signal is a rival's at its estimate; `scene` with only the data so far counting.
+    A signal is a rival's at its estimate; in `dataset` only the data so far count.
     """
-    rivals = discrimination.rivals
-    widest = tuple(float(item.scales.max()) for item in discrimination.beside)
-    data = with_items(dataset, tuple(discrimination.beside), widest)
-    grams = {}
-    for a, item in enumerate(rivals):
+    widest = tuple(float(item.scales.max()) for item in rivals.beside)
+    data = with_items(dataset, rivals.beside, widest)
+    grams = []
+    for item in rivals.rivals:
         C = data.masked(packed_columns(dataset, item))
         at = project(data.with_columns(C, np.ones(C.shape[2])), noise)
         signal = C @ at.beta[data.X.shape[2] :]
-        grams[a] = Grams(dataset, data, project(replace(data, r=signal), noise))
-    return tuple(_of_rival(dataset, rivals, b, grams) for b in range(len(rivals)))
+        grams.append(Grams(dataset, data, project(replace(data, r=signal), noise)))
+    return tuple(_of_rival(dataset, rivals.rivals, b, grams) for b in range(len(grams)))
 
 
 def _of_rival(
-    dataset: DiagnosisData, rivals: tuple[Item, ...], b: int, grams: dict[int, Grams]
+    dataset: DiagnosisData, rivals: tuple[Item, ...], b: int, grams: list[Grams]
 ) -> tuple[Item, ...]:
     what, size = rivals[b].what, float(rivals[b].scales.max())
     others = [a for a in range(len(rivals)) if a != b]

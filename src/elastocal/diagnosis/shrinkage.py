@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from elastocal.diagnosis.backlash_model import EFFECT, under_other_law
+from elastocal.diagnosis.backlash_model import EFFECT, under_other_backlash_model
 from elastocal.diagnosis.baseline import Baseline, Blocks, visits
-from elastocal.diagnosis.diagnosis import FittedParameter
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, away, widths
+from elastocal.diagnosis.diagnosis import FittedParameter, Gap
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, from_centre, prior_deviations
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, is_driven
+from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
@@ -25,6 +26,7 @@ from elastocal.diagnosis.model_set import (
     fit_extended,
     fit_set,
     signal_of,
+    with_items,
 )
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
@@ -34,8 +36,9 @@ from elastocal.diagnosis.noise_floor import (
     noise_draws,
     project,
 )
-from elastocal.identification.error_budget import resampled_rms
+from elastocal.identification.error_budget import BudgetStep, resampled_rms, stage_of
 from elastocal.measurements import Measurements
+from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, IntArray
@@ -54,8 +57,7 @@ def left_out_residual(at: Projection, together: IntArray | None = None) -> Array
         P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
     """
     if together is None:
-        P = at.inverse - at.H @ at.H.transpose(0, 2, 1)
-        return np.asarray(np.linalg.solve(P, at.u[..., None])[..., 0])
+        return np.asarray(np.linalg.solve(at.P, at.u[..., None])[..., 0])
     Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
     out = Vu[..., 0]
     for g in np.unique(together):
@@ -105,25 +107,88 @@ def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
     return float(np.sqrt(part.sum() / used.sum()))
 
 
+# The gap, step by step: from the nominal arm through the fitted effects to the noise floor.
+
+
+def budget(
+    dataset: DiagnosisData, found: SelectedEffects, rng: np.random.Generator
+) -> tuple[Gap, tuple[BudgetStep, ...]]:
+    """Held-out 3-D errors of each step, and the gap they add up to.
+
+    `dataset` is about the fit without further effects.  Where an effect goes with time, what is
+    left out are tenths of the time: between neighbours a drift needs no model.
+    """
+    nothing, chosen = found.nothing, found.chosen
+    together = _left_out_together(dataset, chosen)
+    # The nominal arm, base and markers placed, as the baseline left it.
+    placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
+    steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
+    steps += [_step(name, data, nothing, together, rng) for name, data in _fitted_steps(dataset)]
+    known = [k for k, item in enumerate(chosen.items) if item.known]
+    for n, last in enumerate(known, 1):
+        items = tuple(chosen.items[k] for k in known[:n])
+        scales = tuple(chosen.scales[k] for k in known[:n])
+        data = with_items(found.dataset, items, scales)
+        name = ":".join(chosen.items[last].key)
+        steps.append(_step(name, data, chosen, together, rng))
+    # Where the noise model does not fit, the readings still say what scatter they leave.
+    left = rms_with_interval(chosen.data, left_out_residual(chosen.at, together), rng)[0]
+    floor = min(noise_rms(chosen.data, chosen.noise), left)
+    calibrated = steps[len(steps) - len(known) - 1].heldout_rms
+    nominal = steps[0].heldout_rms
+    gap = Gap(nominal, calibrated, steps[-1].heldout_rms, floor)
+    unknown = [item.what.where for item in chosen.items if not item.known]
+    if unknown:
+        # What a smooth curve without a name takes away: no explanation, but how much is at stake.
+        steps.append(_step("unknown:" + "+".join(unknown), chosen.data, chosen, together, rng))
+    return gap, (*steps, BudgetStep("noise_floor", floor, (floor, floor)))
+
+
+def _left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | None:
+    time, cell = dataset.table.time, dataset.base.model.cell
+    known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
+    if time is None or not any("time" in what.effect.needed(cell) for what in known):
+        return None
+    return blocks_of_time(dataset.blocks, time[dataset.lead])
+
+
+def _step(
+    name: str, data: NoisyData, fitted: ModelSet, together: IntArray | None,
+    rng: np.random.Generator,
+) -> BudgetStep:  # fmt: skip
+    # Weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
+    # effect is that effect, and weights by it would spare it.
+    residual = left_out_residual(project(data, fitted.noise.of_instrument()), together)
+    return BudgetStep(name, *rms_with_interval(data, residual, rng))
+
+
+def _fitted_steps(dataset: DiagnosisData) -> Iterator[tuple[str, NoisyData]]:
+    """The model's own effects, stage by stage, those of the later step held at nominal."""
+    stage, data = np.array([stage_of(effect) for effect in dataset.fitted]), dataset.data
+    for k, name in ((1, "geometry"), (2, "compliance")):
+        if (stage == k).any():
+            free = stage <= k
+            yield name, replace(data, X=data.X[:, :, free], precision=data.precision[free])
+
+
 # How far the gap shrinks on poses that had no part in choosing or fitting the effect.
 #
-# The error of a model at a fresh pose is its prediction less the truth, without noise:
+# The error of a model at a new pose is its prediction less the true arm's, without noise:
 #
 #     e(θ*) = f(q, x̂) − h(q, θ*),    θ* ~ posterior given all data,
 #
 # where f is the model before and after the effect is added, each fitted by the instrument's noise
-# as a calibration would, and h what is held to be the truth: at times a rival or another constant,
+# as a calibration would, and h what is held to be true: at times a rival or another constant,
 # as probable as each is, which charges the interval for the selection.  The remaining fraction is
-# the ratio of the rms errors over a set of FRESH poses, drawn anew for every θ* from a population
+# the ratio of the rms errors over a set of NEW_POSES, drawn anew for every θ* from a population
 # that is itself known from the campaign's poses only (Bayesian bootstrap, Rubin 1981).
 
 BOOTSTRAP_DRAWS = 400
-FRESH = 100  # poses of the fresh set that the intervals are for
+NEW_POSES = 100  # in the set that the intervals are for
 
 
-@dataclass(frozen=True)
-class Shrinkage:
-    """Fraction by which the fresh-pose error falls: best value, `ci90` and `ci95`."""
+class Shrinkage(NamedTuple):
+    """Fraction by which the error at new poses falls: best value, `ci90` and `ci95`."""
 
     reduction: float
     ci90: tuple[float, float]
@@ -132,9 +197,9 @@ class Shrinkage:
 
 @dataclass(frozen=True)
 class PosteriorDraw:
-    """What may be true: errors (rows, components) of the models `before` and `after` at fresh
-    poses if it is, at its most probable values; the truth moves by `spread` (rows, components, k)
-    times standard normal numbers.  `pose` (rows,) numbers the fresh pose of each reading."""
+    """A draw from the posterior predictive, at its most probable values: errors (rows, components)
+    of the models `before` and `after` at new poses if it is true.  It moves by `spread` (rows,
+    components, k) times standard normal numbers.  `pose` (rows,) numbers each reading's pose."""
 
     before: Array
     after: Array
@@ -155,51 +220,45 @@ class Change:
 
 
 def shrinkage(
-    posterior_draws: Sequence[PosteriorDraw],
-    measured: int,
-    unnamed: float,
-    change: Change,
+    posterior_draws: Sequence[PosteriorDraw], measured: int, unnamed: float, change: Change,
     rng: np.random.Generator,
-) -> Shrinkage:
-    """Reduction of the rms error from before to after, one of `truths` being true.
+) -> Shrinkage:  # fmt: skip
+    """Reduction of the rms error from before to after, one of the draws being true.
 
-    `measured` is the number of poses that tell what poses there are.
-
-    `unnamed` (m²) is the mean squared length of what is known to be there without a name: neither
-    model has it, and it is taken to be as large at fresh poses as it was at the measured ones.
+    `measured` is the number of poses that tell what poses there are; `unnamed` (m²) the mean
+    squared length of what is known to be there without a name: neither model has it, and it is
+    taken to be as large at new poses as it was at the measured ones.
     """
-    weights = np.array([t.probability for t in posterior_draws])
+    weights = np.array([draw.probability for draw in posterior_draws])
     which = rng.choice(len(posterior_draws), BOOTSTRAP_DRAWS, p=weights / weights.sum())
     parts = [
         _reductions(posterior_draws[k], int((which == k).sum()), measured, unnamed, change, rng)
         for k in np.unique(which)
     ]
     drawn = np.concatenate(parts)
-    low95, low90, middle, high90, high95 = np.quantile(drawn, [0.025, 0.05, 0.5, 0.95, 0.975])
-    return Shrinkage(float(middle), (float(low90), float(high90)), (float(low95), float(high95)))
+    low95, low90, middle, high90, high95 = np.quantile(
+        drawn, [0.025, 0.05, 0.5, 0.95, 0.975]
+    ).tolist()
+    return Shrinkage(middle, (low90, high90), (low95, high95))
 
 
 def _reductions(
-    posterior_draw: PosteriorDraw,
-    n: int,
-    measured: int,
-    unnamed: float,
-    change: Change,
+    draw: PosteriorDraw, n: int, measured: int, unnamed: float, change: Change,
     rng: np.random.Generator,
-) -> Array:
+) -> Array:  # fmt: skip
     """(n,) draws."""
-    moved = posterior_draw.spread @ rng.normal(size=(posterior_draw.spread.shape[2], n))
-    poses, at, count = np.unique(posterior_draw.pose, return_inverse=True, return_counts=True)
+    moved = draw.spread @ rng.normal(size=(draw.spread.shape[2], n))
+    poses, at, count = np.unique(draw.pose, return_inverse=True, return_counts=True)
     share = rng.dirichlet(np.full(len(poses), measured / len(poses)), n)
-    chosen = rng.multinomial(FRESH, share)
+    chosen = rng.multinomial(NEW_POSES, share)
     mean = []
-    for error in (posterior_draw.before, posterior_draw.after):
+    for error in (draw.before, draw.after):
         squares = ((error[:, :, None] - moved) ** 2).sum(axis=1)
         total = np.zeros((len(poses), n))
         np.add.at(total, at, squares)
         readings = chosen @ count
         mean.append((chosen.T * total).sum(axis=0) / readings + unnamed)
-    times = round(FRESH * change.visits)
+    times = round(NEW_POSES * change.visits)
     late = rng.binomial(times, change.share * rng.random(n)) / times
     mean[1] = mean[1] + late * change.square
     return np.asarray(1 - np.sqrt(mean[1] / np.maximum(mean[0], 1e-300)))
@@ -214,12 +273,12 @@ ROUNDS, HEAVIEST = 20, 20.0  # of raking, and how many times the mean weight a p
 def new_pose_table(
     model: Model, table: Measurements, n: int, rng: np.random.Generator
 ) -> Measurements:
-    """n fresh configurations like those of the table.
+    """n new configurations like those of the table.
 
     Each repeats the load states, repeats and markers of one that was measured.  Every joint's
     angle (with the side it came from, and the torque at it) is that of another one drawn at
     random, independently of the other joints, and all markers stay inside the box that the
-    measured ones show: floor and fixtures keep fresh poses out of the same regions (unless
+    measured ones show: floor and fixtures keep new poses out of the same regions (unless
     hardly any is inside).  Of those, angles that lead out of the box more often are chosen more
     often, until every joint is as far from its middle as it was in the campaign.  Times are
     uniform over the campaign's.  Readings are left as they are and mean nothing.
@@ -271,30 +330,25 @@ def _recombined(
     rows = np.concatenate(chosen)
     configuration = np.repeat(np.arange(n), [len(r) for r in chosen])
     labels = tuple(str(c + 1) for c in range(n))
-    fresh = replace(table.take(rows), configuration=configuration, configuration_labels=labels)
+    new = replace(table.take(rows), configuration=configuration, configuration_labels=labels)
     place = np.concatenate([np.arange(len(r)) for r in chosen])
-    own = {
-        name: getattr(fresh, name)
-        for name in ("q", "approach", "torque")
-        if getattr(fresh, name) is not None
-    }
+    own = {name: getattr(new, name) for name in ("q", "approach", "torque")}
     donors = rng.integers(len(codes), size=(n, table.q.shape[1]))
     for j, of_joint in enumerate(donors.T):
         of = [rows_of[k] for k in of_joint]
-        source = np.array(
-            [of[c][i % len(of[c])] for c, i in zip(configuration, place, strict=True)]
-        )
+        source = [of[c][i % len(of[c])] for c, i in zip(configuration, place, strict=True)]
         for name, values in own.items():
-            values[:, j] = getattr(table, name)[source, j]
+            if values is not None:
+                values[:, j] = getattr(table, name)[source, j]
     if table.time is None:
-        return fresh, donors
-    at = visits(fresh)
+        return new, donors
+    at = visits(new)
     time = rng.uniform(table.time.min(), table.time.max(), at.max() + 1)[at]
     warmth = None
     if table.temperature is not None:
         order = np.argsort(table.time)
         warmth = np.interp(time, table.time[order], table.temperature[order])
-    return replace(fresh, time=time, temperature=warmth), donors
+    return replace(new, time=time, temperature=warmth), donors
 
 
 # The nonlinear fit of the model with the found effects in it, weighted by the fitted noise.
@@ -314,70 +368,50 @@ class Posterior:
         return np.asarray(np.linalg.norm(self.spread, axis=1))
 
 
-@dataclass(frozen=True)
-class Linear:
-    """A model about the fit `base`: readings as a scene's, scaled columns, and where x = 0 is.
+def posteriors(
+    dataset: DiagnosisData, base: Baseline, at: Regression, noises: Sequence[NoiseValues],
+    further: Array | None = None, prior: Mapping[str, float] | None = None,
+) -> Iterator[Posterior]:  # fmt: skip
+    """One step from the fit `base`, at which the model is evaluated, to the readings of `dataset`
+    under each of the noises.
 
     `further` (rows, k) columns of constants that are not among the model's parameters, scaled to
-    their prior deviations, stand last: at zero in x.
+    their prior deviations, stand last: at zero in x.  `prior` holds standard deviations of
+    parameters by name, where they are not wide.
     """
-
-    base: Baseline
-    data: NoisyData
-    width: Array
-    centre: Array
-
-    @classmethod
-    def of(
-        cls,
-        dataset: DiagnosisData,
-        base: Baseline,
-        further: Array | None = None,
-        prior: Mapping[str, float] | None = None,
-        at: Regression | None = None,
-    ) -> Linear:
-        """`prior` holds standard deviations of parameters by name, where they are not wide; `at`
-        spares evaluating the model at the fit."""
-        observed = base.observed
-        known = prior or {}
-        names = base.model.names
-        width = np.array([known.get(n, w) for n, w in zip(names, widths(base), strict=True)])
-        at = at or base.model.regressor(observed.table, base.x, observations=observed)
-        B = at.B * width
-        residual = at.residual + B @ (away(base) / width)
-        centre = base.x - away(base)
-        if further is not None:
-            k = further.shape[1]
-            B, width = np.hstack([B, further]), np.append(width, np.ones(k))
-            centre = np.append(centre, np.zeros(k))
-        pack, size = dataset.blocks.pack, observed.size
-        data = replace(
-            dataset.data, r=pack(residual.reshape(-1, size, 1))[:, :, 0],
-            X=pack(B.reshape(-1, size, B.shape[1])), precision=np.ones(B.shape[1]),
-        )  # fmt: skip
-        return cls(base, data, width, centre)
-
-    def posterior(self, noise: NoiseValues) -> Posterior:
-        """One step from the fit to the readings, under `noise`."""
-        fit = project(self.data, noise)
-        spread = linalg.solve_triangular(fit.factor, np.diag(self.width), lower=True).T
-        return Posterior(self.base, self.centre + self.width * fit.beta, spread)
+    wide = dict(zip(base.model.names, prior_deviations(base), strict=True))
+    width = np.array([(prior or {}).get(name, wide[name]) for name in wide])
+    B = at.B * width
+    residual = at.residual + B @ (from_centre(base) / width)
+    centre = base.x - from_centre(base)
+    if further is not None:
+        k = further.shape[1]
+        B, width = np.hstack([B, further]), np.append(width, np.ones(k))
+        centre = np.append(centre, np.zeros(k))
+    pack, size = dataset.blocks.pack, base.observed.size
+    data = replace(
+        dataset.data, r=pack(residual.reshape(-1, size, 1))[:, :, 0],
+        X=pack(B.reshape(-1, size, B.shape[1])), precision=np.ones(B.shape[1]),
+    )  # fmt: skip
+    for noise in noises:
+        fit = project(data, noise)
+        spread = linalg.solve_triangular(fit.factor, np.diag(width), lower=True).T
+        yield Posterior(base, centre + width * fit.beta, spread)
 
 
-def refit(fitted: Posterior, items: list[Item]) -> dict[
-    tuple[str, str], tuple[FittedParameter, ...]
-]:  # fmt: skip
+def refit(
+    fitted: Posterior, items: list[Item]
+) -> dict[tuple[str, str], tuple[FittedParameter, ...]]:
     """Parameters of the known `items` with standard deviations, by effect and place."""
     std = fitted.std
     out: dict[tuple[str, str], list[FittedParameter]] = {}
     for k, p in enumerate(fitted.base.model.parameters):
         found = FittedParameter(p.name, float(fitted.x[k]), p.unit, float(std[k]))
         out.setdefault((p.effect, p.where), []).append(found)
-    keys = [(i.what.name, i.what.where) for i in items if isinstance(i.what, Hypothesis)]
-    return {key: tuple(out[key]) for key in keys}
+    return {item.key: tuple(out[item.key]) for item in items}
 
 
-# What an effect's searched constants may be instead, and what that does to fresh poses.
+# What an effect's searched constants may be instead, and what that does at new poses.
 
 MOST = 6  # settings that are kept
 WORTH = 0.02  # probability from which one is
@@ -390,10 +424,10 @@ def other_settings(dataset: DiagnosisData, chosen: ModelSet, k: int) -> list[tup
     """
     item = chosen.items[k]
     what = item.what
-    if not isinstance(what, Hypothesis) or not is_driven(what) or not what.settings:
+    if not isinstance(what, Hypothesis) or not what.driven or not what.settings:
         return [(item, 1.0)]
     data = beside(dataset, chosen, k)
-    grid = dataset.grids[what.name, what.where]
+    grid = dataset.grids[what.key]
     grams = Grams(dataset, data, project(data, chosen.noise))
     own = float(grams.of_hypothesis(what, item.settings[None]).evidence(item.scales)[0])
     each = grams.of_hypothesis(what).evidence(item.scales)
@@ -410,12 +444,12 @@ def other_settings(dataset: DiagnosisData, chosen: ModelSet, k: int) -> list[tup
 def between_visits(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Change:
     """How far readings on the wrong side of a change are off, and how many there may be.
 
-    A change between two visits is put into the middle of the pause; fresh readings that fall
+    A change between two visits is put into the middle of the pause; new readings that fall
     between that and the true moment, a share of up to half the pause over the duration, are
     off by the whole change.  Nothing for effects that do not change once.
     """
     what = chosen.items[k].what
-    time = dataset.base.observed.table.time
+    time = dataset.table.time
     kinds = [s.kind for s in what.settings] if isinstance(what, Hypothesis) else []
     if "change_time" not in kinds or time is None:
         return Change()
@@ -431,20 +465,20 @@ def between_visits(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Change:
     return Change(per_reading, pause / 2, float(dataset.present.sum() / len(dataset.present)))
 
 
-# What may be true at fresh poses, given what was found: each as probable as it is.
+# What may be true at new poses, given what was found: each as probable as it is.
 
-DRAWN = 200  # fresh poses that the sets are drawn from
-NOISES = 10  # values of the noise that a truth is drawn under
+DRAWN = 200  # new poses that the sets are drawn from
+NOISES = 10  # values of the noise that what may be true is drawn under
 NUDGE = 0.01  # of a setting's grid step: a difference quotient in constants that are not parameters
-WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as the truth
+WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as true
 
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Models before and after effects are added, and fresh poses to compare them at.
+    """Models before and after effects are added, and new poses to compare them at.
 
-    `fitted` is the exact model with all known effects, fitted to the scene's readings; `plain` the
-    cell's own model.
+    `fitted` is the exact model with all known effects, fitted to the readings; `plain` the cell's
+    own model.
     """
 
     dataset: DiagnosisData
@@ -466,8 +500,8 @@ class Confirmation:
     @cached_property
     def parameters(self) -> Posterior:
         """The exact model's values, weighted by all the noise that was found."""
-        measured = self._regressions(self.fitted)[0]
-        return Linear.of(self.dataset, self.fitted, at=measured).posterior(self.chosen.noise)
+        measured, noise = self._regressions(self.fitted)[0], self.chosen.noise
+        return next(posteriors(self.dataset, self.fitted, measured, [noise]))
 
     @cached_property
     def _after(self) -> Array:
@@ -478,51 +512,56 @@ class Confirmation:
         return {}
 
     def _regressions(self, base: Baseline) -> tuple[Regression, Regression]:
-        """A model at the measured rows and at the fresh ones; kept, since the truths of all items
+        """A model at the measured rows and at the new ones; kept, since the draws of all items
         begin with the one that was fitted."""
         key = base.model, base.x.tobytes()
         if key not in self._known_regressions:
-            self._known_regressions[key] = (
-                base.model.regressor(base.observed.table, base.x, observations=base.observed),
-                base.model.regressor(self.observed.table, base.x, observations=self.observed),
+            measured, new = (
+                base.model.regressor(observed.table, base.x, observations=observed)
+                for observed in (base.observed, self.observed)
             )
+            self._known_regressions[key] = measured, new
         return self._known_regressions[key]
 
     def posterior_draws(
         self, k: int, rivals: tuple[tuple[Item, float], ...]
     ) -> list[PosteriorDraw]:
-        """Errors without and with item k if the truth is item k at any plausible setting, or one
-        of its `rivals`, of which itself is the first, with their probabilities."""
+        """Errors without and with item k if what is true is item k at any plausible setting, or
+        one of its `rivals`, of which itself is the first, with their probabilities.
+
+        Before it the model is fitted as a calibration would that knows nothing of the joints'
+        scatter: the scatter fitted beside a missing effect is the effect, which weights by it
+        would spare.
+        """
         others = _known(self.chosen.without(k))
-        before = self._calibrated(
-            fit_extended(self.dataset, self.chosen, others) if others else self.plain
-        )
+        plain = fit_extended(self.dataset, self.chosen, others) if others else self.plain
+        before = plain.model.predict(self.observed.table, plain.x, self.observed)
         out = []
         for item, share in other_settings(self.dataset, self.chosen, k):
             like = replace(self.chosen, items=self._with(k, item))
             at = replace(self.fitted, model=extended(self.plain.model, _known(like.items)))
-            out += self._truth(at, like, item, before, rivals[0][1] * share)
-        out = self._under_both_laws(k, before, out)
+            out += self._draws(at, like, item, before, rivals[0][1] * share)
+        out = self._under_both_backlash_models(k, before, out)
         for item, share in rivals[1:]:
             if share < WORTH_A_DRAW or not item.known:
                 continue
             rival = fit_set(self.dataset, self._with(k, item), self.chosen.noise)
             at = fit_extended(self.dataset, rival, _known(rival.items))
-            out += self._truth(at, rival, item, before, share)
+            out += self._draws(at, rival, item, before, share)
         return out
 
-    def _under_both_laws(
+    def _under_both_backlash_models(
         self, k: int, before: Array, posterior_draws: list[PosteriorDraw]
     ) -> list[PosteriorDraw]:
         """What is true if item k, where it is play, follows its law, and if it follows another."""
-        doubt, item = self.dataset.other_play, self.chosen.items[k]
+        doubt, item = self.dataset.other_backlash, self.chosen.items[k]
         if not (isinstance(item.what, Hypothesis) and item.what.name == EFFECT and doubt):
             return posterior_draws
-        held = [replace(t, probability=t.probability * (1 - doubt)) for t in posterior_draws]
-        other = extended(under_other_law(self.plain.model), _known(self.chosen.items))
-        share = doubt * sum(t.probability for t in posterior_draws)
+        held = [replace(d, probability=d.probability * (1 - doubt)) for d in posterior_draws]
+        other = extended(under_other_backlash_model(self.plain.model), _known(self.chosen.items))
+        share = doubt * sum(d.probability for d in posterior_draws)
         at = replace(self.fitted, model=other)
-        return held + self._truth(at, self.chosen, item, before, share)
+        return held + self._draws(at, self.chosen, item, before, share)
 
     def _with(self, k: int, item: Item) -> tuple[Item, ...]:
         return (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
@@ -541,57 +580,42 @@ class Confirmation:
                 total += float(squares.sum() / count.sum())
         return total
 
-    def _calibrated(self, base: Baseline) -> Array:
-        """What a model reads at the fresh poses, fitted as a calibration would that knows nothing
-        of the joints' scatter; and the scatter fitted beside a missing effect is the effect,
-        which weights by it would spare."""
-        return base.model.predict(self.observed.table, base.x, self.observed)
-
-    def _truth(
+    def _draws(
         self, base: Baseline, true: ModelSet, item: Item, before: Array, probability: float
     ) -> list[PosteriorDraw]:
         """If that set is true, fitted as `base`, under each of the noises."""
-        measured, fresh = self._by_constant(base, _known(true.items), item)
+        measured, new = self._by_constant(base, _known(true.items), item)
         here, at = self._regressions(base)
-        linear = Linear.of(self.dataset, base, measured, self._prior(true), here)
-        B = np.hstack([at.B, fresh])
+        B = np.hstack([at.B, new])
         start = np.append(base.x, np.zeros(measured.shape[1]))
         size = self.observed.size
-        shown = min(size, 3)
 
         def lengths(rows: Array) -> Array:
-            return rows.reshape(-1, size, *rows.shape[1:])[:, :shown]
+            return rows.reshape(-1, size, *rows.shape[1:])[:, : min(size, 3)]
 
         out = []
-        for noise in self.noise:
-            fit = linear.posterior(noise)
+        for fit in posteriors(self.dataset, base, here, self.noise, measured, self._prior(true)):
             readings = at.prediction + B @ (fit.x - start)
-            out.append(
-                PosteriorDraw(
-                    lengths(before - readings),
-                    lengths(self._after - readings),
-                    lengths(B @ fit.spread),
-                    self.observed.configuration,
-                    probability / len(self.noise),
-                )
-            )
+            errors = lengths(before - readings), lengths(self._after - readings)
+            pose, share = self.observed.configuration, probability / len(self.noise)
+            out.append(PosteriorDraw(*errors, lengths(B @ fit.spread), pose, share))
         return out
 
     def _prior(self, true: ModelSet) -> dict[str, float]:
         """Prior deviations of the set's parameters: their typical sizes, times the scale that the
-        readings prefer where the effect is larger than usual; a tie to the usual size would
-        make the truth smaller than what was found."""
+        readings prefer where the effect is larger than usual; a tie to the usual size would make
+        what is true smaller than what was found."""
         out = {}
         for item, scale in zip(true.items, true.scales, strict=True):
             if isinstance(item.what, Hypothesis):
-                size = self.dataset.sizes[item.what.name, item.what.where] * max(scale, 1.0)
+                size = self.dataset.sizes[item.what.key] * max(scale, 1.0)
                 for p, s in zip(item.what.parameters, size, strict=True):
                     out[f"{item.what.where}.{p.key}"] = float(s)
         return out
 
     def _by_constant(self, base: Baseline, known: list[Item], item: Item) -> list[Array]:
         """Difference quotients (rows, k) in the item's constants that vary smoothly, of the
-        measured readings and of the fresh ones, each by the step of the grid it was searched on:
+        measured readings and of the new ones, each by the step of the grid it was searched on:
         it is not known better than the data tell."""
         what = item.what
         assert isinstance(what, Hypothesis)
@@ -600,7 +624,7 @@ class Confirmation:
         for s, setting in enumerate(what.settings):
             if setting.kind == "change_time":
                 continue
-            grid = self.dataset.grids[what.name, what.where]
+            grid = self.dataset.grids[what.key]
             step = float(grid.step[grid.nearest(item.settings), s])
             # At a bound, where the search may well end, the quotient is one-sided.
             near = item.settings[s] + NUDGE * step * np.array([1.0, -1.0])

@@ -1,19 +1,20 @@
-"""Dependences without a name: a smooth motion of any place, driven by anything recorded."""
+"""Dependences without a name: any place moves smoothly with anything that was recorded."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.hypotheses import EntryKey, recorded
+from elastocal.diagnosis.hypotheses import SCALES, EntryKey, recorded
 from elastocal.model.effects.base import Stage
 from elastocal.units import Array
 
-# What may drive an unknown effect: angles, time, torque, load, direction, force, view.
+# What an unknown effect may depend on: angles, time, torque, load, direction, force, view.
 
 WAVES, FEW_WAVES = 8, 3  # functions of a smooth dependence, and of one in a product
 
@@ -33,7 +34,7 @@ class Covariate:
 
 @dataclass(frozen=True)
 class Covariates:
-    """Drivers by visit (C, v, …) of a scene."""
+    """What was recorded of each visit (C, v, …)."""
 
     dataset: DiagnosisData
     angle: Array
@@ -45,10 +46,10 @@ class Covariates:
 
     @classmethod
     def of(cls, dataset: DiagnosisData) -> Covariates:
-        table, observed, places = dataset.base.observed.table, dataset.base.observed, dataset.places
+        table = dataset.table
 
         def visits(values: Array) -> Array:
-            return places.gather(values[observed.lead])
+            return dataset.places.gather(values[dataset.lead])
 
         def if_recorded(name: str) -> Array | None:
             return visits(getattr(table, name)) if recorded(table, name) else None
@@ -61,7 +62,7 @@ class Covariates:
         )  # fmt: skip
 
     def smooth(self) -> Iterator[Covariate]:
-        """Every driver that is one number per visit, and every product of two."""
+        """Every covariate that is one number per visit, and every product of two."""
         yield from self._single()
         yield from self._with_load()
         yield from self._with_approach()
@@ -146,13 +147,12 @@ class Covariates:
         dataset = self.dataset
         if self.load is None:
             return
-        table, lead = dataset.base.observed.table, dataset.base.observed.lead
-        for k in range(self.angle.shape[2]):
+        for k in range(self.n):
             E = dataset.columns.entry(("link_frame", (f"link{k + 1}",)))
             if E.shape[1] < 3:
                 return
-            wrench = np.einsum("nsd,ns->nd", E[:, :3], table.force)
-            wrench = dataset.places.gather(wrench[lead])
+            wrench = np.einsum("nsd,ns->nd", E[:, :3], dataset.table.force)
+            wrench = dataset.places.gather(wrench[dataset.lead])
             force, moment = wrench[:, :, :3], wrench[:, :, 3:]
             yield force / max(np.abs(force).max(), 1e-12), moment / max(np.abs(moment).max(), 1e-12)
 
@@ -199,27 +199,24 @@ def _odd_and_even(x: Array, present: NDArray[np.bool_]) -> Array:
     return functions * present[:, :, None]
 
 
-# Dependences without a name: a smooth motion of any place, driven by anything that was recorded.
-#
-# Each block is one driver at one place of the chain: joint i's angle moves joint k or frame k;
-# time, torque, load and approach direction move joints, frames, markers; the load's force and
+# Blocks: each is one covariate at one place of the chain.  Joint i's angle moves joint k or frame
+# k; time, torque, load and approach direction move joints, frames, markers; the load's force and
 # moment give way at a link; a field over the workspace or a marker's angle of view moves the
 # reading; and products of load with time, angle and direction.  Where a block explains the
 # residual better than every effect of the catalogue, the effect is unknown and the block is its
 # location.
 
 # Prior sizes of an entry's components at the largest of a smooth dependence.
-MOTION = {"rad": 1e-4, "m": 1e-4, "1": 1e-4}
-BASE_MOTION = 5e-5
+MOTION, BASE_MOTION = 1e-4, 5e-5  # m or rad
 FRAME_WAVES = 5
-HOOK_MOTION = 1e-2
+LOAD_POINT_MOTION = 1e-2
 
 
 @dataclass(frozen=True)
 class Generic:
-    """A block: `entry` moved by smooth functions of `driver`, or ready columns.
+    """A block: `entry` moved by smooth functions of `covariate`, or ready columns.
 
-    `drive` (C, v, d, k) holds the functions for each component that moves; `columns` (C, m, k)
+    `direction` (C, v, d, k) holds the functions for each component that moves; `columns` (C, m, k)
     are packed columns of blocks that vary within a visit.
     """
 
@@ -227,14 +224,23 @@ class Generic:
     covariate: str
     where: str
     stage: Stage
-    entry: EntryKey | None
-    drive: Array | None
-    columns: Array | None
+    entry: EntryKey | None = None
+    direction: Array | None = None
+    columns: Array | None = None
     source: Covariate | None = None
+
+    scales: ClassVar[Array] = SCALES
 
     @property
     def label(self) -> str:
         return f"{self.covariate} → {self.where}"
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        functions = self.direction if self.columns is None else self.columns
+        assert functions is not None
+        return functions.shape[-1]
 
 
 def generic_blocks(dataset: DiagnosisData) -> list[Generic]:
@@ -249,91 +255,86 @@ def generic_blocks(dataset: DiagnosisData) -> list[Generic]:
 
 def _driven(dataset: DiagnosisData, covariates: Covariates) -> Iterator[Generic]:
     model = dataset.base.model
-    n = model.chain.n_joints
-    joints = [f"joint{k + 1}" for k in range(n)]
+    numbers = range(1, model.chain.n_joints + 1)
 
-    def block(by: Covariate, entry: str, place: str, where: str, stage: Stage) -> Generic:
+    def block(by: Covariate, entry: str, place: str, stage: Stage) -> Generic:
         # Six components each: fewer functions do, since the components share their shape.
         some = by.functions if entry == "joint_motion" else by.functions[:, :, :FRAME_WAVES]
-        drive = _all(dataset, entry, place, some)
-        return Generic(by.kind, by.name, where, stage, (entry, (place,)), drive, None, by)
+        direction = _each_component(dataset, entry, place, some)
+        return Generic(by.kind, by.name, place, stage, (entry, (place,)), direction, source=by)
 
     for by in covariates.smooth():
         under_load = by.kind.startswith(("torque", "load"))
-        for k, joint in enumerate(joints):
-            if by.joint is None or by.joint == k:
+        for k in numbers:
+            if by.joint is None or by.joint == k - 1:
                 stage: Stage = "compliance" if under_load else "transmission"
-                yield block(by, "joint_motion", joint, joint, stage)
+                yield block(by, "joint_motion", f"joint{k}", stage)
         if by.kind in ("angle", "time", "load", "temperature"):
-            for k in range(n):
-                link = f"link{k + 1}"
+            for k in numbers:
                 yield block(
-                    by, "link_frame", link, link, "compliance" if under_load else "geometry"
+                    by, "link_frame", f"link{k}", "compliance" if under_load else "geometry"
                 )
         if by.kind in ("angle", "time", "load", "temperature", "approach"):
-            yield block(by, "base_motion", "base", "base", "tracker")
+            yield block(by, "base_motion", "base", "tracker")
         if by.kind in ("time", "temperature", "load"):
             for marker in model.cell.tool.markers:
-                place = f"marker:{marker}"
-                yield block(by, "marker_motion", place, place, "tool")
+                yield block(by, "marker_motion", f"marker:{marker}", "tool")
         if by.kind in ("angle", "time") and dataset.load_point is not None:
             yield _of_load_point(dataset, by)
 
 
 def _of_load_point(dataset: DiagnosisData, by: Covariate) -> Generic:
-    """The hook moves: few functions for each of its directions, under load only."""
+    """The load point moves: few functions for each of its directions, under load only."""
     assert dataset.load_point is not None
     few = by.functions[:, :, :FEW_WAVES]
-    W = np.einsum("cmv,cvf->cmf", dataset.places.one_hot, few) * HOOK_MOTION
+    W = np.einsum("cmv,cvf->cmf", dataset.places.one_hot, few) * LOAD_POINT_MOTION
     columns = np.einsum("cmd,cmf->cmdf", dataset.load_point, W)
     packed = columns.reshape(*columns.shape[:2], -1)
-    return Generic(f"{by.kind} → load", by.name, "load", "load", None, None, packed)
+    return Generic(f"{by.kind} → load", by.name, "load", "load", columns=packed)
 
 
-def _all(dataset: DiagnosisData, entry: str, place: str, W: Array) -> Array:
+def _each_component(dataset: DiagnosisData, entry: str, place: str, W: Array) -> Array:
     """Each of the functions W (C, v, f) moves each component of the entry: (C, v, d, d·f)."""
     span = dataset.columns.places[entry, place]
     d = span.stop - span.start
-    units = ("m", "m", "m", "rad", "rad", "rad") if d == 6 else ("m",) * 3 if d == 3 else ("rad",)
-    size = [BASE_MOTION if entry == "base_motion" else MOTION[u] for u in units]
-    drive = np.einsum("de,cvf->cvdef", np.diag(size), W)
-    return drive.reshape(*W.shape[:2], d, -1)
+    size = BASE_MOTION if entry == "base_motion" else MOTION
+    return np.einsum("de,cvf->cvdef", size * np.eye(d), W).reshape(*W.shape[:2], d, -1)
 
 
 def _of_force(dataset: DiagnosisData, covariates: Covariates) -> Iterator[Generic]:
     """Force and moment at a link's end, each moving or turning it along any axis."""
     for k, (force, moment) in enumerate(covariates.wrenches()):
         C, v, _ = force.shape
-        drive = np.zeros((C, v, 6, 18))
+        direction = np.zeros((C, v, 6, 18))
         for a in range(3):
-            drive[:, :, a, 3 * a : 3 * a + 3] = MOTION["m"] * force
-            drive[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = MOTION["rad"] * moment
+            direction[:, :, a, 3 * a : 3 * a + 3] = MOTION * force
+            direction[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = MOTION * moment
         link = f"link{k + 1}"
         # Beyond the last link there is only the tool and its markers.
         where = "tool" if k == dataset.base.model.chain.n_joints - 1 else link
         yield Generic("force", f"force at {where}", where, "compliance", ("link_frame", (link,)),
-                      drive, None)  # fmt: skip
+                      direction)  # fmt: skip
 
 
 def _of_reading(dataset: DiagnosisData, covariates: Covariates) -> Iterator[Generic]:
     """What differs from marker to marker in one visit: a field in space, the angle of view."""
-    table, size = dataset.base.observed.table, dataset.base.observed.size
+    table, size = dataset.table, dataset.base.observed.size
     if table.position is None or size < 3:
         return
     offset = table.position - dataset.base.model.cell.tracker.position
-    field = monomials(_standard(offset), 2) * MOTION["m"]
+    field = monomials(_standard(offset), 2) * MOTION
     shift = np.zeros((len(table), size, 3))
     shift[:, :3] = np.eye(3)
     rows = np.einsum("nsd,nf->nsdf", shift, field).reshape(len(table), size, -1)
-    yield Generic("field", "position in the workspace", "tracker", "tracker", None, None,
-                  dataset.pack(rows))  # fmt: skip
+    yield Generic("field", "position in the workspace", "tracker", "tracker",
+                  columns=dataset.pack(rows))  # fmt: skip
     view = covariates.view()
     for marker in dataset.base.model.cell.tool.markers:
         place = f"marker:{marker}"
         E = dataset.columns.entry(("marker_motion", (place,)))
-        rows = np.einsum("nsd,nf->nsdf", E, monomials(view, 2) * MOTION["m"])
-        yield Generic("view", f"angle of view of {marker}", place, "tool", None, None,
-                      dataset.pack(rows.reshape(len(table), size, -1)))  # fmt: skip
+        rows = np.einsum("nsd,nf->nsdf", E, monomials(view, 2) * MOTION)
+        yield Generic("view", f"angle of view of {marker}", place, "tool",
+                      columns=dataset.pack(rows.reshape(len(table), size, -1)))  # fmt: skip
 
 
 def _standard(values: Array) -> Array:

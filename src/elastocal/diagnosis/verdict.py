@@ -1,17 +1,27 @@
-"""From scores to an answer, with everything that was tried, best first."""
+"""What scores mean: the answer, where the gap lies, everything that was tried, best first."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
 
 from elastocal.diagnosis.backlash_model import EFFECT
-from elastocal.diagnosis.diagnosis import Candidate, EffectAt, Untested, Verdict
+from elastocal.diagnosis.diagnosis import (
+    Candidate,
+    Curve,
+    EffectAt,
+    Location,
+    StructureTest,
+    Untested,
+    Verdict,
+)
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, OutlierScreening
 from elastocal.diagnosis.effect_search import SelectedEffects
+from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, distances, item_key
+from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
@@ -20,8 +30,8 @@ UNKNOWN_EFFECT = "unknown_effect"
 SET, LARGEST_SET = 0.95, 3  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
-ALIKE = 2.0
-ALIKE_PROBABILITY = 0.89
+TOO_NEAR = 2.0
+TOO_NEAR_PROBABILITY = 0.89
 
 
 @dataclass(frozen=True)
@@ -44,7 +54,7 @@ class Answer:
 
 def _named(item: Item) -> tuple[str, str]:
     """(effect, place); a block without a name is an unknown effect at its place."""
-    return item_key(item) if item.known else (UNKNOWN_EFFECT, item.what.where)
+    return item.key if item.known else (UNKNOWN_EFFECT, item.what.where)
 
 
 def judge(found: SelectedEffects) -> Answer:
@@ -59,7 +69,7 @@ def judge(found: SelectedEffects) -> Answer:
     if found.chosen.unknown:
         verdict: Verdict = "unknown_effect"
         # What is named beside something without a name may be part of its imitation.
-        probability = [min(p, ALIKE_PROBABILITY) for p in probability]
+        probability = [min(p, TOO_NEAR_PROBABILITY) for p in probability]
     elif all(len(r) == 1 for r in rivals):
         verdict = "explained"
     else:
@@ -80,23 +90,21 @@ def _of_item(
         return float(each[own]), ((item, float(each[own])),)
     near = distances(found.dataset, found.chosen, k)[1]
     taken = {id(other.what) for other in found.chosen.items}
-    alike = [
+    same = [
         i
         for i, other in enumerate(slot.items)
-        if isinstance(other.what, Hypothesis)
-        and id(other.what) not in taken
-        and near[item_key(other)] < ALIKE
+        if other.known and id(other.what) not in taken and near[other.key] < TOO_NEAR
     ]
     # More than so many are no answer; the others stand among the candidates.
-    alike = sorted(alike, key=lambda i: -each[i])[: LARGEST_SET - 1]
+    same = sorted(same, key=lambda i: -each[i])[: LARGEST_SET - 1]
     p = each.copy()
-    if alike and p[own] > ALIKE_PROBABILITY:
+    if same and p[own] > TOO_NEAR_PROBABILITY:
         # Their columns are the same in these poses; what separates the scores is only how many
         # parameters each would need.
-        spare = p[own] - ALIKE_PROBABILITY
-        p[own] = ALIKE_PROBABILITY
-        p[alike] += spare / len(alike)
-    chosen = [own, *alike]
+        spare = p[own] - TOO_NEAR_PROBABILITY
+        p[own] = TOO_NEAR_PROBABILITY
+        p[same] += spare / len(same)
+    chosen = [own, *same]
     if p[own] < NAMED:
         # Of the blocks only the likeliest: they all say "something else, about there".
         blocks = [i for i in range(len(p)) if not slot.items[i].known]
@@ -113,13 +121,88 @@ def _of_item(
     return float(p[own]), tuple((slot.items[i], float(p[i])) for i in chosen)
 
 
+# Where the gap lies: stage, place, and what the residual depends on, whatever the effect.
+
+
+def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
+    """One test per covariate, most telling first; none names an effect.
+
+    The statistic is the largest evidence among the covariate's blocks; its distribution without
+    structure comes from flipping the signs of whole configurations.
+    """
+    if not observed.covariate_flips:
+        return ()
+    largest = np.max(list(observed.covariate_flips.values()), axis=0)
+    odds, flips = observed.covariate_odds, observed.covariate_flips
+    tests = [
+        StructureTest(c, exceedance(flips[c], odds[c]), exceedance(largest, odds[c])) for c in odds
+    ]
+    return tuple(sorted(tests, key=lambda t: (t.p_family, t.p_value, -odds[t.driver])))
+
+
+def location(found: SelectedEffects, tests: tuple[StructureTest, ...]) -> Location | None:
+    """Probabilities of stage and place, from all that could stand in the place of the unknown
+    effect, or of the first one found."""
+    items = found.chosen.items
+    if not items:
+        return None
+    own = next((k for k, item in enumerate(items) if not item.known), 0)
+    slot = found.slots[own]
+    each, _ = slot.probabilities()
+    stages: dict[str, float] = defaultdict(float)
+    places: dict[str, float] = defaultdict(float)
+    for item, p in zip(slot.items, each / max(float(each.sum()), 1e-300), strict=True):
+        stages[item.what.stage] += float(p)
+        places[item.what.where] += float(p)
+    what = items[own].what
+    shown = {t.driver: t.p_value for t in tests}
+    return Location(
+        what.stage, what.where, places.get(what.where, 0.0), _sorted(stages), _sorted(places), shown
+    )
+
+
+def _sorted(shares: dict[str, float]) -> dict[str, float]:
+    return {k: v for k, v in sorted(shares.items(), key=lambda kv: -kv[1]) if v > 1e-6}
+
+
+# The shape of a dependence that has no name: the motion as a function of the covariate.
+
+MOST_CURVES = 3
+TRANSLATIONS = ((" x", "m"), (" y", "m"), (" z", "m"))
+TURNS = ((" rx", "rad"), (" ry", "rad"), (" rz", "rad"))
+COMPONENTS = {1: (("", "rad"),), 3: TRANSLATIONS, 6: TRANSLATIONS + TURNS}  # name and unit
+
+
+def curves_of(dataset: DiagnosisData, chosen: ModelSet) -> tuple[Curve, ...]:
+    """Curves of the unknown blocks that depend on one number, the largest components first."""
+    at = chosen.at
+    out: list[Curve] = []
+    for item, span in zip(chosen.items, chosen.spans, strict=True):
+        block = item.what
+        if isinstance(block, Hypothesis) or block.source is None or block.source.values is None:
+            continue
+        assert block.direction is not None
+        x, direction = block.source.values[dataset.present], block.direction[dataset.present]
+        motion = direction @ at.beta[span]  # (visits, d)
+        deviation = np.linalg.norm(direction @ at.beta_deviation.T[span], axis=2)
+        _, order = np.unique(x, return_index=True)
+        largest = np.argsort(-(motion.std(axis=0) / deviation.mean(axis=0)))
+        for k in largest[:MOST_CURVES]:
+            name, unit = COMPONENTS[motion.shape[1]][k]
+            y = motion[order, k]
+            xyd = (tuple(v.tolist()) for v in (x[order], y - y.mean(), deviation[order, k]))
+            entry = f"{block.where}{name}"
+            out.append(Curve(block.covariate, block.source.unit, entry, unit, *xyd))
+    return tuple(out)
+
+
 # Everything that was tried, best first; what could not be tested; what to beware of.
 
 DETECTABLE = 1.0  # standard deviations: below, a typical size does not move the data
 STATED_LOW, STATED_HIGH = 0.67, 1.5
 FAULTY_SHARE = 0.02
 SUSPECT_SHARE = 0.05
-OPEN_LAW = 0.2  # probability of the other law of play from which the reader is told
+OPEN_BACKLASH = 0.2  # probability of the other backlash model from which the reader is told
 
 
 def candidates(
@@ -128,8 +211,7 @@ def candidates(
     """Every hypothesis with its probability: in the slot where it is likeliest."""
     best: dict[tuple[str, str], Candidate] = {}
     distance = {
-        (h.name, h.where): s.distance
-        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+        h.key: s.distance for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
     }
     for k, slot in enumerate(found.slots):
         rivals = answer.rivals[k] if k < len(answer.rivals) else ()
@@ -139,13 +221,10 @@ def candidates(
             what = item.what
             if not isinstance(what, Hypothesis):
                 continue
-            settings = {s.key: float(v) for s, v in zip(what.settings, item.settings, strict=True)}
-            probability = named.get(id(what), float(p))
-            key = what.name, what.where
+            probability, key = named.get(id(what), float(p)), what.key
             row = Candidate(
-                what.name, what.where, what.stage, probability, float(score),
-                distance[key], settings,
-            )  # fmt: skip
+                *key, what.stage, probability, float(score), distance[key], settings_of(item)
+            )
             if key not in best or row.probability > best[key].probability:
                 best[key] = row
     return tuple(sorted(best.values(), key=lambda c: (-c.probability, -c.score)))
@@ -154,19 +233,16 @@ def candidates(
 def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested, ...]:
     """Hypotheses whose typical size these poses would not show."""
     chosen = {id(item.what) for item in found.chosen.items}
-    rows = []
-    for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True):
-        if s.distance < DETECTABLE and id(h) not in chosen:
-            rows.append(
-                Untested(
-                    h.name,
-                    h.where,
-                    "at its typical size it does not show in these poses: the fitted parameters "
-                    "follow it, or it is smaller than the noise",
-                    "spread the poses over more of the work space, or raise the load",
-                )
-            )
-    return tuple(rows)
+    reason = (
+        "at its typical size it does not show in these poses: the fitted parameters follow it, or "
+        "it is smaller than the noise"
+    )
+    advice = "spread the poses over more of the work space, or raise the load"
+    return tuple(
+        Untested(*h.key, reason, advice)
+        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+        if s.distance < DETECTABLE and id(h) not in chosen
+    )
 
 
 def warnings(
@@ -188,24 +264,24 @@ def warnings(
         )
     kept = np.flatnonzero(screened.suspects)
     if len(kept) > SUSPECT_SHARE * len(screened.suspects):
-        lines = dataset.base.observed.table.row[dataset.base.observed.lead[kept]]
+        lines = dataset.table.row[dataset.lead[kept]]
         out.append(
             f"{len(kept)} of {len(screened.suspects)} readings (lines {lines.min()} to "
             f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
             "other to be accidents; they were kept: look at them with `elastocal identify` first"
         )
-    if text := _undecided_play(found):
+    if text := _undecided_backlash(found):
         out.append(text)
-    if dataset.base.observed.table.time is None:
+    if dataset.table.time is None:
         out.append("without times neither drifts nor jumps can be seen: record time_s")
     return tuple(out)
 
 
-def _undecided_play(found: SelectedEffects) -> str:
-    """That the law of the play that was found is not known, where it is not."""
+def _undecided_backlash(found: SelectedEffects) -> str:
+    """That the model of the backlash that was found is not known, where it is not."""
     named = [i.what.where for i in found.chosen.items if isinstance(i.what, Hypothesis)
              and i.what.name == EFFECT]  # fmt: skip
-    if not named or found.dataset.other_play <= OPEN_LAW:
+    if not named or found.dataset.other_backlash <= OPEN_BACKLASH:
         return ""
     places = " and ".join(named)
     return (

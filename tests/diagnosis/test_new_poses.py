@@ -1,4 +1,4 @@
-"""Fresh poses are such as the campaign might have had, and none that it had."""
+"""New poses are such as the campaign might have had, and none that it had."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def drawn(observe: str = "position") -> tuple[Model, Measurements, Measurements]
 
 
 def test_there_are_as_many_as_asked_each_like_a_measured_one() -> None:
-    _, table, fresh = drawn()
-    assert len(np.unique(fresh.configuration)) == N
-    for c in np.unique(fresh.configuration):
-        own = fresh.take(fresh.configuration == c)
+    _, table, new = drawn()
+    assert len(np.unique(new.configuration)) == N
+    for c in np.unique(new.configuration):
+        own = new.take(new.configuration == c)
         assert sorted(own.marker) == sorted(table.marker[table.configuration == 0])
         assert len(np.unique(own.force, axis=0)) == 2
         assert len(np.unique(own.q, axis=0)) == 1
@@ -36,18 +36,18 @@ def test_there_are_as_many_as_asked_each_like_a_measured_one() -> None:
 
 def test_every_joint_has_been_at_its_angle_and_no_arm_in_its_pose() -> None:
     """The side of approach comes with the angle of its joint."""
-    _, table, fresh = drawn()
+    _, table, new = drawn()
     for j in range(table.q.shape[1]):
         pairs = {(a, s) for a, s in zip(table.q[:, j], table.approach[:, j], strict=True)}
-        found = {(a, s) for a, s in zip(fresh.q[:, j], fresh.approach[:, j], strict=True)}
+        found = {(a, s) for a, s in zip(new.q[:, j], new.approach[:, j], strict=True)}
         assert found <= pairs and len(found) > 10
-    assert not {tuple(q) for q in fresh.q} & {tuple(q) for q in table.q}
+    assert not {tuple(q) for q in new.q} & {tuple(q) for q in table.q}
 
 
 def test_markers_stay_about_where_they_were_measured() -> None:
     """Beyond the outermost configuration by no more than it is from the one before it."""
-    model, table, fresh = drawn()
-    was, now = (model.target_poses(t)[1] for t in (table, fresh))
+    model, table, new = drawn()
+    was, now = (model.target_poses(t)[1] for t in (table, new))
     codes = np.unique(table.configuration)
     second, last = np.sort([was[table.configuration == c].max(axis=0) for c in codes], axis=0)[-2:]
     assert (now <= last + (last - second)).all()
@@ -64,8 +64,8 @@ def test_as_much_of_the_room_is_beyond_the_ends_as_draws_leave_on_average() -> N
 def test_no_joint_is_drawn_to_its_middle_by_the_ends_of_the_room() -> None:
     """Poses with an outstretched arm leave the box most often, and would be missing."""
     model, table, _ = drawn()
-    fresh = new_pose_table(model, table, 400, np.random.default_rng(6))
-    was, now = (t.q[np.unique(t.configuration, return_index=True)[1]] for t in (table, fresh))
+    new = new_pose_table(model, table, 400, np.random.default_rng(6))
+    was, now = (t.q[np.unique(t.configuration, return_index=True)[1]] for t in (table, new))
     np.testing.assert_allclose(now.std(axis=0), was.std(axis=0), rtol=0.08)
 
 
@@ -80,34 +80,34 @@ def test_raked_poses_have_every_donor_as_often() -> None:
 
 
 def test_times_are_the_campaigns_and_one_per_visit() -> None:
-    _, table, fresh = drawn()
-    assert fresh.time.min() >= table.time.min() and fresh.time.max() <= table.time.max()
-    assert np.ptp(fresh.time) > 0.9 * np.ptp(table.time)
-    visits = np.column_stack([fresh.configuration, fresh.force[:, 2]])
-    assert len(np.unique(np.column_stack([visits, fresh.time]), axis=0)) == 2 * N
-    np.testing.assert_allclose(fresh.temperature, 20 + 1e-3 * fresh.time)
+    _, table, new = drawn()
+    assert new.time.min() >= table.time.min() and new.time.max() <= table.time.max()
+    assert np.ptp(new.time) > 0.9 * np.ptp(table.time)
+    visits = np.column_stack([new.configuration, new.force[:, 2]])
+    assert len(np.unique(np.column_stack([visits, new.time]), axis=0)) == 2 * N
+    np.testing.assert_allclose(new.temperature, 20 + 1e-3 * new.time)
 
 
 def test_loaded_and_unloaded_readings_still_pair() -> None:
-    model, _, fresh = drawn("deflection")
-    observed = observe(fresh, "deflection")
-    assert len(observed.lead) == len(fresh) // 2
-    assert np.isfinite(model.predict(fresh, None, observed)).all()
+    model, _, new = drawn("deflection")
+    observed = observe(new, "deflection")
+    assert len(observed.lead) == len(new) // 2
+    assert np.isfinite(model.predict(new, None, observed)).all()
 
 
 def test_the_same_seed_draws_the_same_poses() -> None:
-    model, table, fresh = drawn()
+    model, table, new = drawn()
     again = new_pose_table(model, table, N, np.random.default_rng(5))
     other = new_pose_table(model, table, N, np.random.default_rng(6))
-    np.testing.assert_array_equal(again.q, fresh.q)
-    assert not np.array_equal(other.q, fresh.q)
+    np.testing.assert_array_equal(again.q, new.q)
+    assert not np.array_equal(other.q, new.q)
 
 
 def test_where_nothing_recorded_is_there_nothing_is_invented() -> None:
     model, table, _ = drawn()
     bare = replace(table, time=None, approach=None, temperature=None)
-    fresh = new_pose_table(model, bare, N, np.random.default_rng(5))
-    assert fresh.time is None and fresh.approach is None and fresh.temperature is None
+    new = new_pose_table(model, bare, N, np.random.default_rng(5))
+    assert new.time is None and new.approach is None and new.temperature is None
 
 
 @pytest.mark.parametrize("n", [8, 9])
@@ -120,6 +120,6 @@ def test_repeats_keep_their_own_side_of_approach(n: int) -> None:
     repeat = (np.arange(len(both)) >= len(few)).astype(np.int64)
     sides = np.where(repeat[:, None] == 1, -1.0, 1.0) * np.ones_like(repeated.q)
     repeated = replace(repeated, repeat=repeat, approach=sides)
-    fresh = new_pose_table(model, repeated, N, np.random.default_rng(1))
-    np.testing.assert_array_equal(fresh.approach[fresh.repeat == 0], 1.0)
-    np.testing.assert_array_equal(fresh.approach[fresh.repeat == 1], -1.0)
+    new = new_pose_table(model, repeated, N, np.random.default_rng(1))
+    np.testing.assert_array_equal(new.approach[new.repeat == 0], 1.0)
+    np.testing.assert_array_equal(new.approach[new.repeat == 1], -1.0)

@@ -32,7 +32,7 @@ NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
 
 
 @lru_cache
-def scene_without(*columns: str) -> DiagnosisData:
+def data_without(*columns: str) -> DiagnosisData:
     model, table = campaign(n=N)
     table = replace(table, **dict.fromkeys(columns))
     return diagnosis_data_of(fit_baseline(model, table), [])
@@ -40,7 +40,7 @@ def scene_without(*columns: str) -> DiagnosisData:
 
 @lru_cache
 def blocks() -> tuple[Generic, ...]:
-    return tuple(generic_blocks(scene_without()))
+    return tuple(generic_blocks(data_without()))
 
 
 def test_every_joint_angle_may_move_every_joint_and_link() -> None:
@@ -52,9 +52,9 @@ def test_every_joint_angle_may_move_every_joint_and_link() -> None:
 def test_drivers_that_were_not_recorded_are_not_asked() -> None:
     covariates = {g.covariate for g in blocks()}
     assert "time" in covariates and "load" in covariates and "approach of joint2" in covariates
-    rest = {g.covariate for g in generic_blocks(scene_without("time"))}
+    rest = {g.covariate for g in generic_blocks(data_without("time"))}
     assert rest == {d for d in covariates if "time" not in d}
-    rest = {g.covariate for g in generic_blocks(scene_without("approach"))}
+    rest = {g.covariate for g in generic_blocks(data_without("approach"))}
     assert rest == {d for d in covariates if "approach" not in d}
 
 
@@ -70,11 +70,11 @@ def test_a_block_says_where_and_at_which_stage_it_acts() -> None:
     }
     for g in blocks():
         assert g.stage in stages[g.where.partition(":")[0].rstrip("0123456789")]
-        assert (g.drive is None) != (g.columns is None)
+        assert (g.direction is None) != (g.columns is None)
 
 
 def test_a_block_scores_as_the_columns_it_stands_for() -> None:
-    dataset = scene_without()
+    dataset = data_without()
     grams = Grams(dataset, dataset.data, project(dataset.data, NOISE))
     for g in blocks()[::17]:
         C = packed_columns(dataset, Item(g, np.zeros(0), 0.0))
@@ -83,12 +83,12 @@ def test_a_block_scores_as_the_columns_it_stands_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("driver", "where"),
+    ("covariate", "where"),
     [("joint2 angle", "joint5"), ("time", "link3"), ("load × joint3 angle", "joint4")],
 )
 def test_a_planted_dependence_is_told_from_every_other(covariate: str, where: str) -> None:
     """A smooth motion that no block holds as such: the right block scores highest."""
-    dataset = scene_without()
+    dataset = data_without()
     table = dataset.base.observed.table
     along = {
         "joint2 angle": np.sin(3 * table.q[:, 1]),
@@ -129,7 +129,7 @@ def test_monomials_are_every_product_up_to_the_second_degree() -> None:
 
 def test_the_wrench_at_a_link_is_the_load_in_that_links_axes() -> None:
     """R_flangeᵀ F at the last link, largest component one; the load turns the flange a little."""
-    dataset = scene_without()
+    dataset = data_without()
     model, table = dataset.base.model, dataset.base.observed.table
     force, _ = list(Covariates.of(dataset).wrenches())[-1]
     R = model.flange_poses(table, dataset.base.x)[:, :3, :3]

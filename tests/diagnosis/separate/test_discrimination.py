@@ -18,21 +18,21 @@ from elastocal.diagnosis import (
     NoiseValues,
     RivalSet,
     VisitPool,
+    alternatives,
     campaign_of,
     expected,
     expected_of_random,
     fewest,
     fit_baseline,
-    imitations,
     joined,
     possible,
+    prior_deviations,
     rows_of,
     visit_pool_of,
-    widths,
 )
 from elastocal.diagnosis.discrimination import DRAWS
 from elastocal.diagnosis.rivals import SETTINGS
-from elastocal.diagnosis.verdict import ALIKE, ALIKE_PROBABILITY
+from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.measurements import Measurements
 from elastocal.model import Model
 from elastocal.simulation import values_from
@@ -100,7 +100,7 @@ def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Ar
     x = np.array([fitted.get(p.name, 0.0) for p in whole.parameters])
     B = whole.regressor(table, x).B
     of = {key: [i for i, p in enumerate(whole.parameters) if p.effect == key[0]] for key in RIVALS}
-    X = B[:, [whole.names.index(name) for name in model.names]] * widths(base)
+    X = B[:, [whole.names.index(name) for name in model.names]] * prior_deviations(base)
     # Five times the widest of the size prior, as large as the verdict lets a rival be.
     widest = np.array([15 * whole.parameters[i].typical for i in of[RIVALS[b]]])
     Z = np.hstack([X, B[:, of[RIVALS[b]]] * widest])
@@ -149,7 +149,7 @@ def test_more_visits_never_bring_rivals_nearer(discrimination) -> None:
 
 
 def test_draws_have_the_mean_of_the_ridge_estimate(base, discrimination) -> None:
-    """Antithetic draws average to the estimate, which is nearer the truth than nothing is."""
+    """Antithetic draws average to the estimate, which is nearer what is true than nothing is."""
     posterior_draw = np.array([2e-4, -1e-4]) / 1e-4
     estimate = discrimination.draws[0].mean(axis=0)
     spread = discrimination.draws[0].std(axis=0)
@@ -198,8 +198,8 @@ def test_what_the_verdict_calls_alike_is_named_with_no_more_than_it_allows(discr
         draws=discrimination.draws[:2], before=np.full((2, 2, 1), -40.0), classes=np.arange(2),
     )  # fmt: skip
     apart = 1 - np.eye(2)[:, :, None]
-    assert two.probability(0.99 * ALIKE**2 * apart) == pytest.approx(ALIKE_PROBABILITY)
-    assert two.probability(1.01 * ALIKE**2 * apart) > 0.99
+    assert two.probability(0.99 * TOO_NEAR**2 * apart) == pytest.approx(TOO_NEAR_PROBABILITY)
+    assert two.probability(1.01 * TOO_NEAR**2 * apart) > 0.99
 
 
 def test_the_search_finds_the_best_pair_of_visits(discrimination) -> None:
@@ -229,7 +229,7 @@ def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, discriminat
     found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
     whole = campaign_of(base, pool, [drift.what], type("Found", (), {"noise": found}))
     rivals = RivalSet.of([drift, quick], [0.5, 0.5], [])
-    drifts = imitations(whole.so_far, NOISE, rivals)[1]
+    drifts = alternatives(whole.so_far, NOISE, rivals)[1]
     assert drifts[0].settings[0] == pytest.approx(TIME_CONSTANT)
     assert 1 < len({float(item.settings[0]) for item in drifts}) == len(drifts) <= SETTINGS
     d = Discrimination.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))

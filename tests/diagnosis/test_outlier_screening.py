@@ -25,17 +25,17 @@ from elastocal.measurements import Measurements
 POSES = 60  # × 2 loads × 3 markers
 
 
-def scene_with(table: Measurements) -> DiagnosisData:
+def data_with(table: Measurements) -> DiagnosisData:
     return diagnosis_data_of(fit_baseline(campaign(n=POSES)[0], table), [])
 
 
 @lru_cache
 def clean() -> DiagnosisData:
-    return scene_with(campaign(n=POSES)[1])
+    return data_with(campaign(n=POSES)[1])
 
 
 def screened(dataset: DiagnosisData) -> tuple[np.ndarray, DiagnosisData, NoiseValues]:
-    """Rows of the faulty readings, the scene without them, and the noise of the others."""
+    """Rows of the faulty readings, the data without them, and the noise of the others."""
     faulty = screen_outliers(dataset, dataset.data).faulty
     kept = dataset.without(faulty)
     return np.flatnonzero(faulty), kept, fit_noise(kept.data)
@@ -61,7 +61,7 @@ def test_one_reading_in_a_hundred_that_is_a_millimetre_off_is_found_and_no_other
 ) -> None:
     rows = np.sort(np.random.default_rng(seed).choice(6 * POSES, 4, replace=False))
     table = spoiled(rows, 1e-3, seed)
-    faulty, dataset, noise = screened(scene_with(table))
+    faulty, dataset, noise = screened(data_with(table))
     np.testing.assert_array_equal(faulty, rows)
     assert noise.factor == pytest.approx(1.0, abs=0.15)
     told = describe_faulty(dataset, dataset.data, noise)
@@ -77,7 +77,7 @@ def test_heavy_tails_are_not_faults() -> None:
     """t with 4 degrees of freedom, of the stated size: all but a handful stay."""
     table = campaign(n=POSES)[1]
     shake = np.random.default_rng(3).standard_t(4, size=table.position.shape) / np.sqrt(2)
-    faulty, _, _ = screened(scene_with(replace(table, position=table.position + SIGMA * shake)))
+    faulty, _, _ = screened(data_with(replace(table, position=table.position + SIGMA * shake)))
     assert len(faulty) <= 0.02 * 6 * POSES
 
 
@@ -85,7 +85,7 @@ def test_a_slipped_marker_is_not_a_row_of_faults() -> None:
     table = campaign(n=POSES)[1]
     late = (table.marker == 1) & (table.time > 0.9 * table.time.max())
     position = table.position + 1e-3 * late[:, None]
-    dataset = scene_with(replace(table, position=position))
+    dataset = data_with(replace(table, position=position))
     found = screen_outliers(dataset, dataset.data)
     assert late.sum() > 8
     assert not (found.faulty & late).any()

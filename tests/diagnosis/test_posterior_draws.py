@@ -1,4 +1,4 @@
-"""Errors that are expected at fresh poses against those that a campaign made there has."""
+"""Errors that are expected at new poses against those that a campaign made there has."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ def test_the_errors_expected_are_those_of_fresh_readings(
 ) -> None:
     """Before: the effect that the plain fit could not absorb.  After: what noise left."""
     found, item = confirmation(name)
-    monkeypatch.setattr(diagnosis_data, "REPEATABILITY", 0.0)  # of the fresh readings
+    monkeypatch.setattr(diagnosis_data, "REPEATABILITY", 0.0)  # of the new readings
     posterior_draw = of_one(found, item)
-    fresh = found.observed.table
+    new = found.observed.table
     plain = cell(sigma=SILENT)
-    readings = measured(kr270_chain(), plain, [FAULTS[name]], fresh, 1).position.ravel()
+    readings = measured(kr270_chain(), plain, [FAULTS[name]], new, 1).position.ravel()
     before, after = (
-        rms((fit.model.predict(fresh, fit.x) - readings).reshape(-1, 3))
+        rms((fit.model.predict(new, fit.x) - readings).reshape(-1, 3))
         for fit in (found.plain, found.fitted)
     )
     spread = float(np.sqrt((posterior_draw.spread**2).sum(axis=(1, 2)).mean()))
@@ -143,7 +143,7 @@ def test_readings_are_numbered_by_fresh_pose() -> None:
 
 
 def test_a_rival_is_held_for_true_as_often_as_it_is_probable() -> None:
-    """Unlikely ones and blocks without a name are no truth; the settings share the item's."""
+    """Unlikely ones and blocks without a name never are; the settings share the item's."""
     found, item = confirmation("encoder_scale:joint3")
     others = {(h.name, h.where): h for h in found.dataset.hypotheses}
     rival = Item(others["gear_eccentricity", "joint4"], np.zeros(0), 0.0)

@@ -1,4 +1,4 @@
-"""The law of play that an arm was simulated with is the one that its readings tell."""
+"""The backlash model that an arm was simulated with is the one that its readings tell."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from elastocal.diagnosis import (
     fit_baseline,
     fit_set,
     possible,
-    under_other_law,
+    under_other_backlash_model,
     warnings,
     with_likelier_backlash_model,
     with_recorded_drivers,
@@ -35,23 +35,23 @@ PLAY = Fault("backlash", "joint3", {"backlash": 3e-4})
 
 
 @lru_cache
-def dataset(law: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> DiagnosisData:
-    """Readings of an arm with play under `law`, looked at as the diagnosis would at first."""
+def dataset(side: str, fitted: tuple[str, ...] = FITTED, sides: bool = True) -> DiagnosisData:
+    """Readings of an arm whose play rests by `side`, looked at as the diagnosis would at first."""
     chain = kr270_chain()
     table = plan(chain, 40, 3)
-    table = measured(chain, cell(play_side=law), [PLAY], table, 3)
+    table = measured(chain, cell(play_side=side), [PLAY], table, 3)
     if not sides:
         table = replace(table, approach=None)
     model = with_recorded_drivers(Model.assembled(chain, cell(fitted)), table)
     return diagnosis_data_of(fit_baseline(model, table), possible(model, table)[0])
 
 
-@pytest.mark.parametrize("law", ["load", "load_and_approach"])
-def test_the_readings_tell_the_law(law: str) -> None:
-    first = dataset(law)
+@pytest.mark.parametrize("side", ["load", "load_and_approach"])
+def test_the_readings_tell_the_backlash_model(side: str) -> None:
+    first = dataset(side)
     assert first.base.model.cell.model.play_side == "load_and_approach"
     told = with_likelier_backlash_model(first)
-    assert told.base.model.cell.model.play_side == law
+    assert told.base.model.cell.model.play_side == side
     assert [h.label for h in told.hypotheses] == [h.label for h in first.hypotheses]
 
 
@@ -74,17 +74,17 @@ def test_play_in_the_cell_keeps_its_law() -> None:
     assert with_likelier_backlash_model(first) is first
 
 
-def set_of(law: str, told: DiagnosisData) -> ModelSet:
+def set_of(side: str, told: DiagnosisData) -> ModelSet:
     model = told.base.model
-    if model.cell.model.play_side != law:
-        model = under_other_law(model)
+    if model.cell.model.play_side != side:
+        model = under_other_backlash_model(model)
     under = diagnosis_data_of(replace(told.base, model=model), list(told.hypotheses))
     (play,) = [h for h in under.hypotheses if (h.name, h.where) == PLAY.key]
     return fit_set(under, (Item(play, np.zeros(0), 0.0),), told.noise)
 
 
 def test_a_few_readings_in_the_dead_zone_leave_less_doubt_of_the_law() -> None:
-    assert with_likelier_backlash_model(dataset("load_and_approach")).other_play < 0.25
+    assert with_likelier_backlash_model(dataset("load_and_approach")).other_backlash < 0.25
 
 
 def test_laws_that_say_the_same_are_as_likely() -> None:
@@ -94,7 +94,7 @@ def test_laws_that_say_the_same_are_as_likely() -> None:
 
 
 def test_one_configuration_alone_does_not_settle_the_law() -> None:
-    """However far off the other law is there: it may be off for a reason of its own."""
+    """However far off the other model is there: it may be off for a reason of its own."""
     told = with_likelier_backlash_model(dataset("load"))
     right = set_of("load", told)
     r = right.data.r.copy()
@@ -104,7 +104,7 @@ def test_one_configuration_alone_does_not_settle_the_law() -> None:
 
 @pytest.mark.parametrize(("doubt_of_it", "told"), [(0.05, False), (0.5, True)])
 def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool) -> None:
-    one = replace(with_likelier_backlash_model(dataset("load")), other_play=doubt_of_it)
+    one = replace(with_likelier_backlash_model(dataset("load")), other_backlash=doubt_of_it)
     (play,) = [h for h in one.hypotheses if (h.name, h.where) == PLAY.key]
     plain = fit_set(one, ())
     nothing: Scan = None  # type: ignore[assignment]
@@ -116,8 +116,8 @@ def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool)
 
 
 def test_play_by_either_law_may_be_true_at_fresh_poses() -> None:
-    """As probable as each law is; nothing else is drawn under another law."""
-    told = replace(with_likelier_backlash_model(dataset("load")), other_play=0.3)
+    """As probable as each model is; nothing else is drawn under another."""
+    told = replace(with_likelier_backlash_model(dataset("load")), other_backlash=0.3)
     (play,) = [h for h in told.hypotheses if (h.name, h.where) == PLAY.key]
     item = Item(play, np.zeros(0), 0.0)
     plain, chosen = fit_set(told, ()), fit_set(told, (item,))
