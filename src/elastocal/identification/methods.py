@@ -39,45 +39,35 @@ ROUNDS = 6
 RESTARTS = 3
 SETTLED = 0.01  # of a standard deviation: what relinearising may still move an estimate by
 
-
-@dataclass(frozen=True)
-class Adapted:
-    """The fit to the `good` observations (N,) under the noise found from them."""
-
-    solution: Solution
-    noise: NoiseFit
-    good: BoolArray
+# A fit to the good observations (N,), the noise found from them, and which they are.
+Adapted = tuple[Solution, NoiseFit, BoolArray]
 
 
-def adapt(
+def _adapted(
     whole: Solution, clean: Solution, faulty: BoolArray, refit: Refit, kind: str, progress: Progress
 ) -> Adapted:
     """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
 
     `whole` holds all observations, `clean` the fit to those that are not `faulty` (N,) at equal or
     stated weights.  At its values readings are screened, noise model and faulty readings settled
-    (variance.search) and the kept parameters fitted anew with the weights found, until neither
-    changes.  Where other readings turn out good than `clean` was fitted to, its parameters are
-    chosen again for these.
+    (`noise_choice.settle`) and the kept parameters fitted anew with the weights found, until
+    neither changes.  Where other readings turn out good than `clean` was fitted to, its parameters
+    are chosen again for these.
     """
     start, good = clean, ~faulty
     for _ in range(RESTARTS):
-        found = _settled(whole, start, good, kind, progress)
-        if np.array_equal(found.good, good):
+        solution, noise, judged = _settled(whole, start, good, kind, progress)
+        if np.array_equal(judged, good):
             break
-        good = found.good
+        good = judged
         start = whole if good.all() else refit(good, True)
-    return found
-
-
-def adapt_all(whole: Solution, kind: str, progress: Progress) -> Adapted:
-    """As `adapt`, with all observations, whatever they are."""
-    return _settled(whole, whole, None, kind, progress)
+    return solution, noise, judged
 
 
 def _settled(
     whole: Solution, start: Solution, good: BoolArray | None, kind: str, progress: Progress
 ) -> Adapted:
+    """The noise and the fit in turn, from `start`; all observations where `good` is None."""
     problem, kept = whole.problem, start.reduction.kept
     model, observed = problem.model, problem.observations
     solution, every = start, np.ones(len(observed.lead), dtype=bool)
@@ -88,8 +78,7 @@ def _settled(
         if good is None:
             noise = estimate_noise(readings, kind)
         else:
-            verdict = settle(readings, kind, now)
-            noise, now = verdict.noise, verdict.good
+            noise, now = settle(readings, kind, now)
         progress(f"fitting with the noise found ({noise.kind})")
         expected = solution.fit.x[kept] + noise.x
         solution = refined(whole, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
@@ -101,7 +90,7 @@ def _settled(
     fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
     final = estimate_noise(fitted, noise.kind, noise)
     final = replace(final, trials=noise.trials, reason=noise.reason)
-    return Adapted(solution, final, now)
+    return solution, final, now
 
 
 def refined(
@@ -119,7 +108,7 @@ def refined(
     return replace(start, problem=problem, fit=found, reduction=reduction, heldout=heldout)
 
 
-# The methods: from a first fit to the final one, its noise and its intervals.
+# The methods by name.
 
 # A larger share of readings beyond the noise is no accident of measuring: an effect that the model
 # lacks looks like that.  Setting them apart would hide it.
@@ -168,28 +157,11 @@ def run_method(
     `clean` is the fit to the observations that are not `faulty` (N,), `refit` makes another such.
     Constraints and prior come last, on the weights and the readings that the method ends with.
     """
-    if not options.knows:
-        return _by_readings(whole, clean, faulty, refit, options, progress)
-    alone = replace(options, constraints=None, prior=None, intervals="auto")
-    found = _by_readings(whole, clean, faulty, refit, alone, progress)
-    known = fit_with_knowledge(found.solution, found.intervals, options, progress)
-    return MethodResult(
-        "constrained", known.solution, known.intervals, found.noise, found.good,
-        known.active, known.prior_share, known.effective, known.leverage, known.warnings,
-    )  # fmt: skip
-
-
-def _by_readings(
-    whole: Solution,
-    clean: Solution,
-    faulty: BoolArray,
-    refit: Refit,
-    options: Options,
-    progress: Progress,
-) -> MethodResult:
-    """What the method makes of the readings alone."""
-    method = options.resolved
-    exact = is_exact(clean)
+    if options.knows:
+        alone = replace(options, constraints=None, prior=None, intervals="auto")
+        found = run_method(whole, clean, faulty, refit, alone, progress)
+        return _with_knowledge(found, options, progress)
+    method, exact = options.resolved, is_exact(clean)
     if method == "reml" and not whole.problem.large and not exact:
         return _reml(whole, clean, faulty, refit, options, progress)
     if method in ROBUST:
@@ -203,6 +175,14 @@ def _by_readings(
     intervals = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
     warnings = (COMPUTED,) if exact else ()
     return MethodResult(kind, solution, intervals, None, good, warnings=warnings)
+
+
+def _with_knowledge(found: MethodResult, options: Options, progress: Progress) -> MethodResult:
+    known = fit_with_knowledge(found.solution, found.intervals, options, progress)
+    return MethodResult(
+        "constrained", known.solution, known.intervals, found.noise, found.good,
+        known.active, known.prior_share, known.effective, known.leverage, known.warnings,
+    )  # fmt: skip
 
 
 def is_exact(solution: Solution) -> bool:
@@ -224,13 +204,11 @@ def _reml(
     options: Options,
     progress: Progress,
 ) -> MethodResult:
-    found = adapt(whole, clean, faulty, refit, options.noise, progress)
-    if not found.good.all() and not _set_aside(~found.good, options):
-        found = replace(adapt_all(whole, options.noise, progress), good=found.good)
-    intervals = intervals_of(
-        found.solution, options.intervals, found.noise, options.seed, options.jobs
-    )
-    return MethodResult("reml", found.solution, intervals, found.noise, found.good)
+    solution, noise, good = _adapted(whole, clean, faulty, refit, options.noise, progress)
+    if not good.all() and not _set_aside(~good, options):
+        solution, noise, _ = _settled(whole, whole, None, options.noise, progress)
+    intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
+    return MethodResult("reml", solution, intervals, noise, good)
 
 
 def _published(
@@ -297,12 +275,9 @@ def _robust(
     whiten = sparse.csr_array(sparse.diags_array(share))
     if problem.weights.whiten is not None:
         whiten = sparse.csr_array(whiten @ problem.weights.whiten)
+    weights = replace(problem.weights, whiten=whiten)
     heldout = held_out_residual(
-        fit.B,
-        found.residual,
-        replace(problem.weights, whiten=whiten),
-        observed.configuration,
-        observed.size,
+        fit.B, found.residual, weights, observed.configuration, observed.size
     )
     solution = replace(
         clean, problem=replace(problem, x0=clean.problem.x0), fit=fit, heldout=heldout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +123,9 @@ def estimate_noise(
         if shared and not (fit.common > 0).any():
             shared = False  # none was found: the same model without
         label = name + (SHARED if shared else "")
-        own, common = _n_variances(fit)
+        own, common = len(fit.structure.names), int((fit.common > 0).sum())
+        if fit.structure.shrunk:
+            own = readings.size + 2  # means of log θ and its two variances
         criterion = own * price + 2 * common - 2 * fit.log_likelihood
         trials.append(Trial(label, own + common, float(criterion)))
         if best is None or criterion < best[0]:
@@ -187,14 +190,6 @@ def _prior(structure: Structure) -> LogPrior:
     weight = np.repeat(np.sqrt(cells.repeats), cells.e.shape[1])
     x = linalg.lstsq(B * weight[:, None], e * weight)[0]
     return prior_of_groups(structure, (e - B @ x).reshape(cells.e.shape))
-
-
-def _n_variances(fit: Reml) -> tuple[int, int]:
-    """How many own and shared variances the readings chose."""
-    own = len(fit.structure.names)
-    if fit.structure.shrunk:
-        own = fit.structure.cells.e.shape[1] + 2  # means of log θ and its two variances
-    return own, int((fit.common > 0).sum())
 
 
 def _reason(label: str, trials: list[Trial]) -> str:
@@ -415,9 +410,8 @@ ROUNDS = 12
 FEWEST_GOOD = 0.5
 
 
-@dataclass(frozen=True)
-class NoiseAndOutliers:
-    """The noise found from the `good` readings (N,); the others lie beyond it."""
+class NoiseAndOutliers(NamedTuple):
+    """The noise found from the `good` readings (N,); the noise does not explain the others."""
 
     noise: NoiseFit
     good: BoolArray

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
@@ -187,14 +186,25 @@ class Structure:
     shrunk: bool = False
 
 
+def _plain(
+    name: str, description: str, names: Sequence[str], cells: Cells, index: IntArray, matrix: Array
+) -> Structure:
+    """Where the mean of a cell is the plain one; `index` (C, L), or (L,) the same in all cells."""
+    index = np.broadcast_to(index, (len(cells), index.shape[-1])).copy()
+    matrix = np.broadcast_to(matrix, (len(cells), *matrix.shape[-3:])).copy()
+    mean = matrix / cells.repeats[:, None, None, None]
+    return Structure(name, description, tuple(names), cells, index, matrix, mean)
+
+
 def independent(readings: Readings) -> Structure:
     """One variance for all readings (positions, and one for rotations)."""
     size = readings.size
     kinds = [range(3), range(3, 6)] if size == 6 else [range(size)]
     names = ("position", "rotation")[: len(kinds)] if size > 1 else ("distance",)
-    return _diagonal(
-        readings, "independent", "one variance for all readings", names,
-        [np.isin(np.arange(size), kind) for kind in kinds],
+    parts = np.array([np.diag(np.isin(np.arange(size), kind).astype(float)) for kind in kinds])
+    return _plain(
+        "independent", "one variance for all readings", names, readings.cells,
+        np.arange(len(kinds)), parts,
     )  # fmt: skip
 
 
@@ -202,9 +212,8 @@ def by_axis(readings: Readings) -> Structure:
     """One variance for each component of a reading."""
     size = readings.size
     names = ("x", "y", "z", "rx", "ry", "rz")[:size] if size > 1 else ("distance",)
-    return _diagonal(
-        readings, "axis", "one variance per axis", names, [row == 1 for row in np.eye(size)]
-    )
+    parts = np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
+    return _plain("axis", "one variance per axis", names, readings.cells, np.arange(size), parts)
 
 
 def by_marker(readings: Readings) -> Structure:
@@ -212,11 +221,10 @@ def by_marker(readings: Readings) -> Structure:
     require(readings.size == 3, "variances per marker are for positions and deflections")
     cells = readings.cells
     labels, index = np.unique(cells.marker, return_inverse=True)
-    matrix = np.tile(np.eye(3), (len(cells), 1, 1, 1))
-    return Structure(
-        "marker", "one variance per marker", tuple(f"marker {m}" for m in labels), cells,
-        index.reshape(-1, 1), matrix, matrix / cells.repeats[:, None, None, None],
-    )  # fmt: skip
+    names = [f"marker {m}" for m in labels]
+    return _plain(
+        "marker", "one variance per marker", names, cells, index.reshape(-1, 1), np.eye(3)[None]
+    )
 
 
 def by_group(readings: Readings) -> Structure:
@@ -230,14 +238,11 @@ def by_group(readings: Readings) -> Structure:
     groups, number = np.unique(key, axis=0, return_inverse=True)
     index = number.ravel()[:, None] * size + np.arange(size)
     parts = np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
-    matrix = np.tile(parts, (len(cells), 1, 1, 1))
-    names = tuple(
+    names = [
         f"configuration {c}, load {load}, component {a}" for c, load in groups for a in range(size)
-    )
-    return Structure(
-        "groups", "a variance per configuration and direction, shrunk towards the others", names,
-        cells, index, matrix, matrix / cells.repeats[:, None, None, None], shrunk=True,
-    )  # fmt: skip
+    ]
+    text = "a variance per configuration and direction, shrunk towards the others"
+    return replace(_plain("groups", text, names, cells, index, parts), shrunk=True)
 
 
 def polar(readings: Readings, angular: bool | None = None) -> Structure:
@@ -262,11 +267,8 @@ def polar(readings: Readings, angular: bool | None = None) -> Structure:
     if angular:
         matrix = np.concatenate([matrix, (across * d[:, None, None] ** 2)[:, None]], axis=1)
         names = (*names, "angular")
-    index = np.tile(np.arange(len(names)), (len(cells), 1))
-    return Structure(
-        "polar", "range and transverse variances of the tracker", names, cells, index, matrix,
-        matrix / cells.repeats[:, None, None, None],
-    )  # fmt: skip
+    text = "range and transverse variances of the tracker"
+    return _plain("polar", text, names, cells, np.arange(len(names)), matrix)
 
 
 def as_stated(readings: Readings) -> Structure:
@@ -277,18 +279,6 @@ def as_stated(readings: Readings) -> Structure:
         "stated", "the stated noise times one factor", ("factor",), cells,
         np.zeros((len(cells), 1), dtype=np.int64), matrix, cells.unit[:, None],
     )  # fmt: skip
-
-
-def _diagonal(
-    readings: Readings, name: str, text: str, names: tuple[str, ...], parts: list[NDArray[np.bool_]]
-) -> Structure:
-    cells = readings.cells
-    each = np.array([np.diag(part.astype(float)) for part in parts])
-    matrix = np.tile(each, (len(cells), 1, 1, 1))
-    index = np.tile(np.arange(len(parts)), (len(cells), 1))
-    return Structure(
-        name, text, names, cells, index, matrix, matrix / cells.repeats[:, None, None, None]
-    )
 
 
 STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
@@ -342,11 +332,9 @@ class NoiseModel:
             f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
             "components add up to a singular matrix",
         )
-        index = np.tile(np.arange(len(found)), (len(cells), 1))
-        return Structure(
-            self.name, self.description, tuple(found), cells, index, matrix,
-            matrix / cells.repeats[:, None, None, None],
-        )  # fmt: skip
+        return _plain(
+            self.name, self.description, list(found), cells, np.arange(len(found)), matrix
+        )
 
     def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
         """S (N, size, size) of one component, checked."""

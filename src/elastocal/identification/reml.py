@@ -339,42 +339,38 @@ def reml(
     Own variances are stepped in log θ, shared ones in θ, each with a bound (zero for shared ones,
     next to nothing for own ones): one that the likelihood pushes below it stays there.
     """
-    stacked = stacks(structure, shared)
-    own = len(structure.names)
     theta = usual_start(structure, shared) if start is None else start.copy()
-    bound = np.zeros(len(theta))
-    bound[:own] = SMALLEST * float(theta[:own].max())
-    state = evaluate(structure, stacked, theta)
+    search = _Search(structure, stacks(structure, shared), prior, theta)
+    own, bound = search.own, search.bound
+    state = search.state(theta)
     at = slope(structure, state)
     if not at.told[own:].all():  # shared, and the parameters could explain all of it
         theta[own:] *= at.told[own:]
-        state = evaluate(structure, stacked, theta)
+        state = search.state(theta)
         at = slope(structure, state)
-    value, converged, last = _objective(state, prior, own), False, np.inf
+    value, converged, last = search.value(state), False, np.inf
     for _ in range(STEPS):
-        score, step = _step(at, state.theta, prior, own, bound)
+        score, step = search.step(at, state.theta)
         gain = float(score @ step)
         if gain < DECREMENT or VISIBLE > gain >= last:
             converged = True
             break
         if gain < VISIBLE:
-            state, last = evaluate(structure, stacked, _moved(state.theta, step, own, bound)), gain
+            state, last = search.state(search.moved(state.theta, step)), gain
         else:
-            moved = _vanished(structure, stacked, state, value, gain, step, prior, own, bound)
-            if moved is None:
-                moved = _line_search(structure, stacked, state, value, step, prior, own, bound)
-            if moved is None:
+            found = search.vanished(state, value, gain, step) or search.along(state, value, step)
+            if found is None:
                 converged = gain < 1e-4  # as good as rounding allows
                 break
-            state, value = moved
+            state, value = found
         at = slope(structure, state)
-    _, H, chain = _working(at, state.theta, prior, own)
+    _, H, chain = search.working(at, state.theta)
     covariance = np.zeros_like(H)
-    kept = np.flatnonzero((state.theta > bound) & at.told)
+    free = np.flatnonzero((state.theta > bound) & at.told)
     # A variance at its bound is taken for zero, not for uncertain (the convention of mixed-model
     # software): counting it widens intervals that are wide enough already.
-    if kept.size:
-        covariance[np.ix_(kept, kept)] = _inverse(H[np.ix_(kept, kept)])
+    if free.size:
+        covariance[np.ix_(free, free)] = _inverse(H[np.ix_(free, free)])
     covariance = chain[:, None] * covariance * chain
     likelihood = state.log_likelihood
     if prior is not None:
@@ -383,43 +379,93 @@ def reml(
     return Reml(structure, shared, state, at, covariance, likelihood, converged)
 
 
-def _objective(state: State, prior: LogPrior | None, own: int) -> float:
-    return state.log_likelihood + (0.0 if prior is None else prior.value(state.theta[:own]))
+class _Search:
+    """The objective, its derivatives and the steps that raise it; from θ = `start` (K,)."""
 
+    def __init__(
+        self, structure: Structure, stacked: list[Stack], prior: LogPrior | None, start: Array
+    ) -> None:
+        self.structure, self.stacked, self.prior = structure, stacked, prior
+        self.own = own = len(structure.names)
+        self.bound = np.zeros(len(start))
+        self.bound[:own] = SMALLEST * float(start[:own].max())
 
-def _working(
-    at: Slope, theta: Array, prior: LogPrior | None, own: int
-) -> tuple[Array, Array, Array]:
-    """Score and expected information in the stepping variables, and dθ/d(variable)."""
-    chain = np.ones(len(theta))
-    chain[:own] = theta[:own]
-    score, H = chain * at.score, chain[:, None] * at.information * chain
-    if prior is not None:
-        score[:own] -= prior.precision @ (np.log(theta[:own]) - prior.mean)
-        H[:own, :own] += prior.precision
-    return score, H, chain
+    def state(self, theta: Array) -> State:
+        return evaluate(self.structure, self.stacked, theta)
 
+    def value(self, state: State) -> float:
+        own = state.theta[: self.own]
+        return state.log_likelihood + (0.0 if self.prior is None else self.prior.value(own))
 
-def _step(
-    at: Slope, theta: Array, prior: LogPrior | None, own: int, bound: Array
-) -> tuple[Array, Array]:
-    """Score and step in the stepping variables.
+    def working(self, at: Slope, theta: Array) -> tuple[Array, Array, Array]:
+        """Score and expected information in the stepping variables, and dθ/d(variable)."""
+        own, prior = self.own, self.prior
+        chain = np.ones(len(theta))
+        chain[:own] = theta[:own]
+        score, H = chain * at.score, chain[:, None] * at.information * chain
+        if prior is not None:
+            score[:own] -= prior.precision @ (np.log(theta[:own]) - prior.mean)
+            H[:own, :own] += prior.precision
+        return score, H, chain
 
-    Newton's step where the objective is concave, else Fisher's.
-    """
-    score, expected, chain = _working(at, theta, prior, own)
-    free = ((theta > bound) | (score > 0)) & at.told
-    curvature = chain[:, None] * (at.observed - at.information) * chain
-    curvature[np.arange(own), np.arange(own)] -= (chain * at.score)[:own]
-    step = np.zeros(len(theta))
-    if not free.any():
+    def step(self, at: Slope, theta: Array) -> tuple[Array, Array]:
+        """Score and step in the stepping variables.
+
+        Newton's step where the objective is concave, else Fisher's.
+        """
+        score, expected, chain = self.working(at, theta)
+        free = ((theta > self.bound) | (score > 0)) & at.told
+        curvature = chain[:, None] * (at.observed - at.information) * chain
+        i = np.arange(self.own)
+        curvature[i, i] -= (chain * at.score)[: self.own]
+        step = np.zeros(len(theta))
+        if not free.any():
+            return score, step
+        inside = np.ix_(free, free)
+        try:
+            step[free] = _solve((expected + curvature)[inside], score[free])
+        except np.linalg.LinAlgError:
+            step[free] = _solve(expected[inside], score[free])
         return score, step
-    inside = np.ix_(free, free)
-    try:
-        step[free] = _solve((expected + curvature)[inside], score[free])
-    except np.linalg.LinAlgError:
-        step[free] = _solve(expected[inside], score[free])
-    return score, step
+
+    def moved(self, theta: Array, step: Array) -> Array:
+        """θ after a step, own variances in their logarithm, none below its bound."""
+        moved = theta + step
+        moved[: self.own] = theta[: self.own] * np.exp(step[: self.own])
+        return np.maximum(moved, self.bound)
+
+    def better(self, theta: Array, value: float) -> tuple[State, float] | None:
+        """State and objective at θ; None where that is not above `value`, or there is none."""
+        try:
+            trial = self.state(theta)
+        except np.linalg.LinAlgError:
+            return None
+        found = self.value(trial)
+        return (trial, found) if found > value else None
+
+    def vanished(
+        self, state: State, value: float, gain: float, step: Array
+    ) -> tuple[State, float] | None:
+        """The step that takes variances on their way to zero to their bound; None where there are
+        none or that costs."""
+        falling = np.zeros(len(step), dtype=bool)
+        falling[: self.own] = np.abs(step[: self.own] + 1.0) < 0.1
+        if gain > LITTLE or not falling.any():
+            return None
+        theta = self.moved(state.theta, step)
+        theta[falling] = self.bound[falling]
+        return self.better(theta, value)
+
+    def along(self, state: State, value: float, step: Array) -> tuple[State, float] | None:
+        """The first of ever shorter steps that raises the objective; None where none does."""
+        largest = float(np.abs(step[: self.own]).max(initial=0.0))
+        length = min(1.0, 2.0 / largest) if largest > 0 else 1.0
+        for _ in range(30):
+            found = self.better(self.moved(state.theta, length * step), value)
+            if found is not None:
+                return found
+            length /= 2
+        return None
 
 
 def _solve(H: Array, score: Array) -> Array:
@@ -443,66 +489,6 @@ def _inverse(H: Array) -> Array:
     else:
         inverse = linalg.cho_solve((factor, True), np.eye(len(H)))
     return np.asarray(inverse / np.outer(scale, scale))
-
-
-def _moved(theta: Array, step: Array, own: int, bound: Array) -> Array:
-    """θ after a step, own variances in their logarithm, none below its bound."""
-    moved = theta + step
-    moved[:own] = theta[:own] * np.exp(step[:own])
-    return np.maximum(moved, bound)
-
-
-def _vanished(
-    structure: Structure,
-    stacked: list[Stack],
-    state: State,
-    value: float,
-    gain: float,
-    step: Array,
-    prior: LogPrior | None,
-    own: int,
-    bound: Array,
-) -> tuple[State, float] | None:
-    """The step that takes variances on their way to zero to their bound; None where there are
-    none or that costs."""
-    falling = np.zeros(len(step), dtype=bool)
-    falling[:own] = np.abs(step[:own] + 1.0) < 0.1
-    if gain > LITTLE or not falling.any():
-        return None
-    theta = _moved(state.theta, step, own, bound)
-    theta[falling] = bound[falling]
-    try:
-        trial = evaluate(structure, stacked, theta)
-    except np.linalg.LinAlgError:
-        return None
-    found = _objective(trial, prior, own)
-    return (trial, found) if found > value else None
-
-
-def _line_search(
-    structure: Structure,
-    stacked: list[Stack],
-    state: State,
-    value: float,
-    step: Array,
-    prior: LogPrior | None,
-    own: int,
-    bound: Array,
-) -> tuple[State, float] | None:
-    """The first of ever shorter steps that raises the objective; None where none does."""
-    largest = float(np.abs(step[:own]).max(initial=0.0))
-    length = min(1.0, 2.0 / largest) if largest > 0 else 1.0
-    for _ in range(30):
-        try:
-            trial = evaluate(structure, stacked, _moved(state.theta, length * step, own, bound))
-        except np.linalg.LinAlgError:
-            length /= 2
-            continue
-        found = _objective(trial, prior, own)
-        if found > value:
-            return trial, found
-        length /= 2
-    return None
 
 
 def usual_start(structure: Structure, shared: tuple[SharedEffect, ...]) -> Array:
