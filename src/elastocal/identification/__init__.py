@@ -9,7 +9,7 @@ ROOMS = {
         "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_intervals"
     ),
     "constrained_solver": "ConstrainedObjective ResidualLoss",
-    "covariance": "Covariance classical cluster_robust hc t_quantile",
+    "covariance": "Covariance cluster_robust hc t_quantile",
     "error_budget": "BudgetStep gap_budget",
     "faulty_readings": "FaultyGroup OutlierReport influence outlier_report",
     "findings": "judged next_steps standings warning_sentences",
