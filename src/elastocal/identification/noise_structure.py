@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,8 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from elastocal.errors import InputError, require
+from elastocal.errors import require
 from elastocal.measurements import Measurements
+from elastocal.plugin_loader import check_registered, same_class
 from elastocal.units import Array, BoolArray, IntArray
 
 # Residuals and B per reading, with the labels that say what readings have in common.
@@ -366,28 +366,13 @@ def register(model: NoiseModel) -> None:
     Raises InputError where it is none, says too little, or has the name of another one; the same
     class takes the place of its former self.
     """
-    if isinstance(model, type) and issubclass(model, NoiseModel):
-        raise InputError(f"register a noise model, {model.__name__}(), not its class")
-    if not isinstance(model, NoiseModel):
-        raise InputError(
-            "a noise model is an object of a class derived from NoiseModel; "
-            f"found {type(model).__name__}"
-        )
-    kind = type(model)
-    name, text = getattr(model, "name", None), getattr(model, "description", None)
-    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise InputError(
-            f"{kind.__name__}.name takes lower-case letters, digits and underscores, as in "
-            f'"by_day"; found {name!r}'
-        )
+    check_registered(model, NoiseModel, "a noise model", "by_day")
+    kind, name, text = type(model), model.name, getattr(model, "description", None)
     require(isinstance(text, str) and bool(text), f"{kind.__name__}.description takes a short text")
     require(kind.components is not NoiseModel.components, f"{kind.__name__} lacks components")
     known = REGISTERED.get(name)
-    same = known is not None and (type(known).__module__, type(known).__qualname__) == (
-        kind.__module__, kind.__qualname__,
-    )  # fmt: skip
     require(
-        same or name not in (*STRUCTURES, "auto"),
+        (known is not None and same_class(known, model)) or name not in (*STRUCTURES, "auto"),
         f"there is a noise model '{name}' already; choose another name",
     )
     REGISTERED[name] = model
