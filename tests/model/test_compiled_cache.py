@@ -18,10 +18,10 @@ from elastocal.model import c_engine as compiled_build
 # Prints the values of sin(factor·x) + x, and whether the library came from the cache.
 PROGRAM = """
 import sys, casadi as ca, numpy as np
-from elastocal.model.evaluate import Tape
+from elastocal.model.evaluate import BatchFunction
 x = ca.SX.sym("x")
-tape = Tape([x], [ca.sin(float(sys.argv[1]) * x) + x], "compiled")
-print(tape(np.array([[0.5], [1.5]]))[0].ravel().tolist(), tape.report.cached)
+function = BatchFunction([x], [ca.sin(float(sys.argv[1]) * x) + x], "compiled")
+print(function(np.array([[0.5], [1.5]]))[0].ravel().tolist(), function.report.cached)
 """
 
 

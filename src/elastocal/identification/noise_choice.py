@@ -52,7 +52,7 @@ from elastocal.units import Array, BoolArray, IntArray
 # Akaike's (AIC): one that is left out wrongly makes intervals too narrow.
 
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
-SEEN = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
+LEAST_START = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
 
 
@@ -179,7 +179,7 @@ def _fitted(readings: Readings, name: str, shared: bool, like: Reml | None = Non
     if like is not None and len(like.common) == len(effects):
         start[own:] = np.where(like.common > 0, like.common, start[own:])
         if like.structure.names == structure.names:
-            start[:own] = np.where(like.own > SEEN * like.own.max(), like.own, start[:own])
+            start[:own] = np.where(like.own > LEAST_START * like.own.max(), like.own, start[:own])
     return reml(structure, effects, prior, start)
 
 

@@ -50,7 +50,7 @@ from elastocal.model.effects.play import Backlash, Hysteresis
 from elastocal.model.effects.tracker_distortion import TrackerDistortion
 from elastocal.plugin_loader import same_class
 
-# Hooks run in this order: what sets a frame or a marker stands before what moves it.
+# Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {
     effect.name: effect
     for effect in (

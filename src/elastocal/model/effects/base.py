@@ -47,7 +47,7 @@ class Effect:
     """One physical effect on the chain.  It knows nothing about estimation.
 
     A subclass states `name` and `stage`, the places where it can act, the
-    parameters it has at a place, and overrides the one hook its stage calls for:
+    parameters it has at a place, and overrides the one method its stage calls for:
 
     - `shape`: changes joint motion, link transforms, springs, markers, base frame;
       called before the chain is put together.
