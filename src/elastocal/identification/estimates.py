@@ -25,11 +25,11 @@ CORRELATED = 0.9
 
 
 def summarise(
-    model: Model, whole: Solution, clean: Solution, found: MethodResult, beyond: tuple[Outlier, ...]
+    model: Model, every: Solution, sound: Solution, found: MethodResult, faulty: tuple[Outlier, ...]
 ) -> Calibration:
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
-    `whole` holds all readings, `clean` the fit to those that agree.  `beyond` are the readings
+    `every` holds all readings, `sound` the fit to those that agree.  `faulty` are the readings
     beyond the noise: set apart where the method did so, else only listed.
     """
     solution, final = found.solution, found.solution.fit
@@ -39,7 +39,7 @@ def summarise(
     estimates, combinations = _estimates(model, solution, found.intervals)
     determined = tuple(model.names[c] for c in kept)
     observed = solution.problem.observations
-    set_apart = len(observed.lead) < len(whole.problem.observations.lead)
+    set_apart = len(observed.lead) < len(every.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
     result = Calibration(
         model=model,
@@ -61,13 +61,13 @@ def summarise(
         nominal_rms=solution.nominal_rms,
         converged=final.converged,
         reason=final.reason,
-        outliers=() if set_apart else beyond,
-        excluded=beyond if set_apart else (),
+        outliers=() if set_apart else faulty,
+        excluded=faulty if set_apart else (),
         warnings=(),
         residual_summary=_residual_summary(solution, found.leverage),
         faulty_report=None
-        if is_exact(whole)
-        else report_faulty(whole, found.solution if set_apart else clean, found.noise, found.good),
+        if is_exact(every)
+        else report_faulty(every, found.solution if set_apart else sound, found.noise, found.good),
         active=found.active,
         prior_share=found.prior_share,
     )

@@ -20,6 +20,7 @@ import numpy as np
 from elastocal.errors import InputError, require
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, LinkMass
 from elastocal.text import did_you_mean, listed
+from elastocal.units import Array
 
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -103,7 +104,7 @@ def _skeleton(tree: Tree, moving: Collection[str]) -> str:
     """URDF text with links, masses and joints only; joints not in `moving` are fixed."""
     robot = ET.Element("robot", name=tree.name)
 
-    def text(vector: Sequence[float]) -> str:
+    def text(vector: Sequence[float] | Array) -> str:
         return " ".join(repr(float(value)) for value in vector)
 
     for name, body in tree.links.items():
