@@ -22,7 +22,7 @@ ROOMS = {
     "knowledge_file": "Knowledge KnowledgeTable read_knowledge",
     "least_squares": "FitProblem SumOfSquares descend fit",
     "linear_solver": "solve_weighted",
-    "noise_choice": "Trial beyond_noise estimate_noise own_noise screen",
+    "noise_choice": "Trial estimate_noise outlier_screening own_noise unexplained_readings",
     "noise_structure": (
         "NoiseModel Readings by_axis by_group independent noise_models shared_effects"
     ),

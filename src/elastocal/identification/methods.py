@@ -19,7 +19,7 @@ from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
     linearised,
-    screen,
+    outlier_screening,
     settle,
     weights_of,
 )
@@ -72,7 +72,7 @@ def _settled(
     model, observed = problem.model, problem.observations
     solution, everything = start, np.ones(len(observed.lead), dtype=bool)
     readings = linearised(model, observed, start.fit.x, kept)
-    now = everything if good is None else screen(readings, readings.e, good)
+    now = everything if good is None else outlier_screening(readings, readings.e, good)
     for _ in range(ROUNDS):
         before = now
         if good is None:
