@@ -340,7 +340,7 @@ def reml(
     next to nothing for own ones): one that the likelihood pushes below it stays there.
     """
     theta = usual_start(structure, shared) if start is None else start.copy()
-    search = _Search(structure, stacks(structure, shared), prior, theta)
+    search = _VarianceSearch(structure, stacks(structure, shared), prior, theta)
     own, bound = search.own, search.bound
     state = search.state(theta)
     at = slope(structure, state)
@@ -379,7 +379,7 @@ def reml(
     return Reml(structure, shared, state, at, covariance, likelihood, converged)
 
 
-class _Search:
+class _VarianceSearch:
     """The objective, its derivatives and the steps that raise it; from θ = `start` (K,)."""
 
     def __init__(
