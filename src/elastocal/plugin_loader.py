@@ -148,3 +148,29 @@ def _send_by_value(module: ModuleType) -> None:
     except ImportError:  # joblib before 1.6 carries its own
         from joblib.externals.cloudpickle import register_pickle_by_value
     register_pickle_by_value(module)
+
+
+# What may be registered, whatever it is.
+
+
+def check_registered(thing: object, base: type, what: str, example: str) -> None:
+    """InputError unless `thing` is an object of a class derived from `base`, with a name."""
+    if isinstance(thing, type) and issubclass(thing, base):
+        raise InputError(f"register {what}, {thing.__name__}(), not its class")
+    kind = type(thing)
+    if not isinstance(thing, base):
+        raise InputError(
+            f"{what} is an object of a class derived from {base.__name__}; found {kind.__name__}"
+        )
+    name = getattr(thing, "name", None)
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise InputError(
+            f"{kind.__name__}.name takes lower-case letters, digits and underscores, as in "
+            f'"{example}"; found {name!r}'
+        )
+
+
+def same_class(known: object, new: object) -> bool:
+    """Whether one class, perhaps defined anew in a notebook, made both."""
+    a, b = type(known), type(new)
+    return (a.__module__, a.__qualname__) == (b.__module__, b.__qualname__)

@@ -35,7 +35,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"
 def result():
     """A clean, adequate identification with its noise stated."""
     tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
-    model = Model(planar_chain(), cell_of(GEOMETRY, tracker=tracker))
+    model = Model.assembled(planar_chain(), cell_of(GEOMETRY, tracker=tracker))
     rng = np.random.default_rng(0)
     plan = table_at(random_poses(model.chain, 40, 0), [[0, 0, 0]])
     return identify(model, measured(model, plan, true_values(model, rng), SIGMA, rng))

@@ -1,4 +1,4 @@
-"""Which engine evaluates a tape: asked for, chosen by rule, refused, and reported."""
+"""Which engine evaluates a function: asked for, chosen by rule, refused, and reported."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ def test_an_unknown_name_is_refused_with_the_nearest(monkeypatch: pytest.MonkeyP
 def test_numpy_never_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", str(counting_compiler(tmp_path)))
     impatient(monkeypatch)
-    replayed = function("numpy")
-    replayed(ROWS)
-    assert replayed.report.backend == "numpy"
+    plain = function("numpy")
+    plain(ROWS)
+    assert plain.report.backend == "numpy"
     assert compilations(tmp_path) == 0
 
 
@@ -127,7 +127,7 @@ def test_auto_compiles_once_replaying_has_cost_as_much(monkeypatch: pytest.Monke
 
 def test_the_call_itself_counts_before_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     system_compiler()
-    monkeypatch.setattr(backend_module, "REPLAY_ROW", 1.0)
+    monkeypatch.setattr(backend_module, "NUMPY_ROW", 1.0)
     large = function()
     large(ROWS)
     assert large.report.backend == "compiled"

@@ -1,4 +1,4 @@
-"""Compiled tapes compute what replayed tapes compute, to 1e-12."""
+"""Compiled functions compute what numpy computes, to 1e-12."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory):
 
 
 def both(inputs: list[ca.SX], outputs: list[ca.SX], *values: np.ndarray) -> list[tuple]:
-    """(compiled, replayed) of every output."""
+    """(compiled, by numpy) of every output."""
     with np.errstate(all="ignore"):
-        replayed = BatchFunction(inputs, outputs, "numpy")(*values)
-    return list(zip(BatchFunction(inputs, outputs, "compiled")(*values), replayed, strict=True))
+        plain = BatchFunction(inputs, outputs, "numpy")(*values)
+    return list(zip(BatchFunction(inputs, outputs, "compiled")(*values), plain, strict=True))
 
 
 def assert_alike(found: np.ndarray, expected: np.ndarray) -> None:
@@ -185,14 +185,14 @@ def test_integers_are_numbers() -> None:
     assert found.item() == 1.5
 
 
-def test_expressions_without_inputs_and_tapes_without_outputs() -> None:
+def test_expressions_without_inputs_and_functions_without_outputs() -> None:
     assert BatchFunction([X], [ca.SX([0.1, 3.0])], "compiled")(np.ones(1))[0].tolist() == [
         [[0.1], [3.0]]
     ]
     assert BatchFunction([X], [], "compiled")(np.ones(1)) == []
 
 
-def test_long_tapes_pass_through_many_c_functions() -> None:
+def test_long_functions_pass_through_many_c_functions() -> None:
     """Registers live across functions, and outputs stored by several of them."""
     x = ca.SX.sym("x", 5)
     values = [ca.sin(x[k % 5] * (k + 1)) for k in range(300)]
@@ -218,13 +218,13 @@ def table(poses: int) -> Measurements:
 
 @pytest.mark.parametrize("kind", ["explicit", "linear", "implicit"])
 def test_models_agree_for_every_choice_of_columns(kind: str) -> None:
-    compiled, replayed = model(kind, "compiled"), model(kind, "numpy")
-    rows, n = table(20), len(replayed.parameters)
+    compiled, plain = model(kind, "compiled"), model(kind, "numpy")
+    rows, n = table(20), len(plain.parameters)
     for columns in (None, np.array([], dtype=int), np.array([n - 1, 0, 7])):
-        found, expected = (m.regressor(rows, columns=columns) for m in (compiled, replayed))
+        found, expected = (m.regressor(rows, columns=columns) for m in (compiled, plain))
         assert_alike(found.B, expected.B)
         np.testing.assert_allclose(found.prediction, expected.prediction, rtol=RELATIVE)
-    np.testing.assert_allclose(compiled.predict(rows), replayed.predict(rows), rtol=RELATIVE)
+    np.testing.assert_allclose(compiled.predict(rows), plain.predict(rows), rtol=RELATIVE)
     assert compiled.backend_report().startswith("compiled (")
 
 

@@ -20,8 +20,8 @@ PROGRAM = """
 import sys, casadi as ca, numpy as np
 from elastocal.model.evaluate import BatchFunction
 x = ca.SX.sym("x")
-tape = BatchFunction([x], [ca.sin(float(sys.argv[1]) * x) + x], "compiled")
-print(tape(np.array([[0.5], [1.5]]))[0].ravel().tolist(), tape.report.cached)
+function = BatchFunction([x], [ca.sin(float(sys.argv[1]) * x) + x], "compiled")
+print(function(np.array([[0.5], [1.5]]))[0].ravel().tolist(), function.report.cached)
 """
 
 

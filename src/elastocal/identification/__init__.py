@@ -9,7 +9,7 @@ ROOMS = {
         "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_intervals"
     ),
     "constrained_solver": "ConstrainedObjective ResidualLoss",
-    "covariance": "Covariance classical cluster_robust hc t_quantile",
+    "covariance": "Covariance cluster_robust hc t_quantile",
     "error_budget": "BudgetStep gap_budget",
     "faulty_readings": "FaultyGroup OutlierReport influence outlier_report",
     "findings": "judged next_steps standings warning_sentences",
@@ -22,7 +22,7 @@ ROOMS = {
     "knowledge_file": "Knowledge KnowledgeTable read_knowledge",
     "least_squares": "FitProblem SumOfSquares descend fit",
     "linear_solver": "solve_weighted",
-    "noise_choice": "Trial beyond_noise estimate_noise own_noise screen",
+    "noise_choice": "Trial estimate_noise outlier_screening own_noise unexplained_readings",
     "noise_structure": (
         "NoiseModel Readings by_axis by_group independent noise_models shared_effects"
     ),

@@ -148,7 +148,7 @@ class SatterthwaiteSums:
         return np.where(told, self._trace**2 / np.where(told, square, 1.0), 0.0)
 
 
-# Covariance from independent rows: of common variance, or each of its own (HC0 to HC4).
+# Covariance from independent rows, each of its own variance (HC0 to HC4).
 
 HCKind = Literal["HC0", "HC1", "HC2", "HC3", "HC4"]
 
@@ -162,20 +162,6 @@ ROW_DESCRIPTION = {
     "HC3": "each row its own variance, e²/(1 − h)², nearly the jackknife",
     "HC4": "each row its own variance, e²/(1 − h)^min(4, nh/p)",
 }
-
-
-def classical(B: ArrayLike, e: ArrayLike) -> Covariance:
-    """s² (BᵀB)⁻¹ with s² = eᵀe/(n − p) and n − p degrees of freedom.
-
-    B (n, p) and e (n,) whitened, e = y − B x̂ the least-squares residual.  Right where whitened
-    rows are independent with a common variance: Klimchik et al. 2013, eq. (7), and (13) with
-    weights known up to a factor.  Raises InputError and InsufficientDataError as `orthogonal`.
-    """
-    factors, e = orthogonal(B, e)
-    n, p = factors.Q.shape
-    matrix = factors.sandwich(np.eye(p) * float(e @ e) / (n - p))
-    text = "rows independent, of common variance"
-    return Covariance("classical", matrix, np.full(p, float(n - p)), text)
 
 
 def hc(B: ArrayLike, e: ArrayLike, kind: HCKind = "HC3") -> Covariance:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -24,11 +25,11 @@ CORRELATED = 0.9
 
 
 def summarise(
-    model: Model, whole: Solution, clean: Solution, found: MethodResult, beyond: tuple[Outlier, ...]
+    model: Model, every: Solution, sound: Solution, found: MethodResult, faulty: tuple[Outlier, ...]
 ) -> Calibration:
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
-    `whole` holds all readings, `clean` the fit to those that agree.  `beyond` are the readings
+    `every` holds all readings, `sound` the fit to those that agree.  `faulty` are the readings
     beyond the noise: set apart where the method did so, else only listed.
     """
     solution, final = found.solution, found.solution.fit
@@ -38,7 +39,7 @@ def summarise(
     estimates, combinations = _estimates(model, solution, found.intervals)
     determined = tuple(model.names[c] for c in kept)
     observed = solution.problem.observations
-    set_apart = len(observed.lead) < len(whole.problem.observations.lead)
+    set_apart = len(observed.lead) < len(every.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
     result = Calibration(
         model=model,
@@ -60,13 +61,13 @@ def summarise(
         nominal_rms=solution.nominal_rms,
         converged=final.converged,
         reason=final.reason,
-        outliers=() if set_apart else beyond,
-        excluded=beyond if set_apart else (),
+        outliers=() if set_apart else faulty,
+        excluded=faulty if set_apart else (),
         warnings=(),
         residual_summary=_residual_summary(solution, found.leverage),
         faulty_report=None
-        if is_exact(whole)
-        else report_faulty(whole, found.solution if set_apart else clean, found.noise, found.good),
+        if is_exact(every)
+        else report_faulty(every, found.solution if set_apart else sound, found.noise, found.good),
         active=found.active,
         prior_share=found.prior_share,
     )
@@ -98,43 +99,37 @@ def _estimates(
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []
+
+    def estimate(i: int, **known: Any) -> Estimate:
+        p = model.parameters[i]
+        return Estimate(p.name, p.unit, p.nominal, float(x[i]), **known)
+
     for k, c in enumerate(reduction.kept):
         parameter = model.parameters[c]
         terms = reduction.terms(k, solution.sizes, std[k])
         value, ci = float(x[c]), (float(intervals.ci95[k, 0]), float(intervals.ci95[k, 1]))
         for d in terms:
             partners[d].append(parameter.name)
-        names = tuple(model.names[d] for d in terms)
         if terms:
             shares = {parameter.name: 1.0} | {model.names[d]: f for d, f in terms.items()}
             held = {model.names[d]: float(x[d]) for d in terms}
             combination = Combination(shares, parameter.unit, value, float(std[k]), ci, held)
             combinations.append(combination)
-            found[int(c)] = Estimate(
-                parameter.name, parameter.unit, parameter.nominal, value,
-                combined_with=names, note=f"only as {combination.expression}",
-            )  # fmt: skip
+            note = f"only as {combination.expression}"
+            found[int(c)] = estimate(c, combined_with=tuple(held), note=note)
         else:
-            found[int(c)] = Estimate(
-                parameter.name, parameter.unit, parameter.nominal, value, value,
-                float(std[k]), ci, float(dof[k]),
-            )  # fmt: skip
+            found[int(c)] = estimate(c, value=value, std=float(std[k]), ci95=ci, dof=float(dof[k]))
     invisible = set(reduction.invisible.tolist())
     for d in reduction.dropped:
-        p = model.parameters[d]
         note = "held: no reading depends on it enough to determine it"
         if int(d) not in invisible and partners[int(d)]:
             note = "held: known only together with " + ", ".join(partners[int(d)])
-        found[int(d)] = Estimate(
-            p.name, p.unit, p.nominal, float(x[d]), combined_with=tuple(partners[int(d)]), note=note
-        )
+        found[int(d)] = estimate(d, combined_with=tuple(partners[int(d)]), note=note)
     for c in reduction.at_bound:
-        p = model.parameters[c]
-        note = f"held at its bound {x[c]:g}: the data want it beyond"
-        found[int(c)] = Estimate(p.name, p.unit, p.nominal, float(x[c]), note=note)
-    for i, p in enumerate(model.parameters):
+        found[int(c)] = estimate(c, note=f"held at its bound {x[c]:g}: the data want it beyond")
+    for i in range(len(model.parameters)):
         if i not in found:
-            found[i] = Estimate(p.name, p.unit, p.nominal, float(x[i]), note="fixed by the user")
+            found[i] = estimate(i, note="fixed by the user")
     return tuple(found[i] for i in range(len(model.parameters))), tuple(combinations)
 
 

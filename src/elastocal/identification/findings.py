@@ -7,7 +7,7 @@ stands here or nowhere.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -330,76 +330,64 @@ def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
 
 # Sentences.
 
+# What a warning says of a finding: its numbers and its remedy by name.
+SENTENCES = {
+    "not_converged": "The fit did not converge: {reason}. {remedy}",
+    "few_degrees_of_freedom": (
+        "Only {dof} degrees of freedom for {parameters} determined parameters: intervals are wide "
+        "and the residual flatters the model. {remedy}"
+    ),
+    "not_held_out": (
+        "Some configuration alone determines a parameter, so there is no held-out error for "
+        "it. Measure more configurations."
+    ),
+    "ill_conditioned": (
+        "Ill-conditioned (condition number {condition_number:.1e} after scaling): the data barely "
+        "separate {parameters}. {remedy}"
+    ),
+    "residual_above_stated_noise": (
+        "The residual is {ratio:.1f} times the stated noise: something is unmodelled or the stated "
+        "noise is too small. The intervals use the residual, not the stated noise; look for "
+        "effects that the model lacks."
+    ),
+    "lack_of_fit": (
+        "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
+        "and {dof_pure} degrees of freedom, p = {p:.1g}): the arm does not come back to the same "
+        "place, or an effect is missing. The intervals take all readings for independent and are "
+        "too narrow: use the default method, whose noise model has this scatter, or intervals by "
+        "cr2; measure more configurations rather than more repeats."
+    ),
+    "at_bound": (
+        "{parameter} stands at its bound {bound:g} {unit}; it is held there and has no interval. "
+        "{remedy}"
+    ),
+    "beyond_bound": (
+        "{parameter} = {value:.3g} ± {std:.2g} {unit} lies beyond its physical bound {bound:g}: "
+        "{remedy}"
+    ),
+    "many_faulty_readings": (
+        "That is too large a share for reading errors: a shifted block of readings, or an effect "
+        "that the model lacks in some load state, marker or region. {remedy}"
+    ),
+}
+
 
 def warning_sentences(result: Calibration) -> tuple[str, ...]:
     """The findings that call for attention as sentences that name the remedy."""
-    found = [text for f in result.findings if f.kind in _TOLD for text in _TOLD[f.kind](result, f)]
-    return tuple(found)
+    told: list[str] = []
+    for f in result.findings:
+        if f.kind == "faulty_readings":
+            told += _faulty_readings(result)
+        elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
+            words = {k: ", ".join(map(str, v)) if isinstance(v, tuple) else v
+                     for k, v in f.numbers.items()}  # fmt: skip
+            within = f.kind == "beyond_bound"  # there the remedy ends a sentence
+            remedy = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
+            told.append(SENTENCES[f.kind].format(**words, remedy=remedy))
+    return tuple(told)
 
 
-def _not_converged(_: Calibration, f: Finding) -> list[str]:
-    return [f"The fit did not converge: {f.numbers['reason']}. {f.remedy}"]
-
-
-def _few_degrees(_: Calibration, f: Finding) -> list[str]:
-    return [
-        f"Only {f.numbers['dof']} degrees of freedom for {f.numbers['parameters']} determined "
-        f"parameters: intervals are wide and the residual flatters the model. {f.remedy}"
-    ]
-
-
-def _not_held_out(_: Calibration, f: Finding) -> list[str]:
-    return [
-        "Some configuration alone determines a parameter, so there is no held-out error for "
-        "it. Measure more configurations."
-    ]
-
-
-def _ill_conditioned(_: Calibration, f: Finding) -> list[str]:
-    names = ", ".join(map(str, f.listed("parameters")))
-    return [
-        f"Ill-conditioned (condition number {f.number('condition_number'):.1e} after scaling): "
-        f"the data barely separate {names}. {f.remedy}"
-    ]
-
-
-def _above_stated(_: Calibration, f: Finding) -> list[str]:
-    return [
-        f"The residual is {f.number('ratio'):.1f} times the stated noise: something is unmodelled "
-        "or the stated noise is too small. The intervals use the residual, not the stated noise; "
-        "look for effects that the model lacks."
-    ]
-
-
-def _not_fitting(_: Calibration, f: Finding) -> list[str]:
-    if f.numbers["counted_by"] != "nothing":
-        return []
-    return [
-        f"Configurations scatter more than their repeats (lack of fit: F = {f.number('F'):.2f} on "
-        f"{f.numbers['dof_between']} and {f.numbers['dof_pure']} degrees of freedom, p = "
-        f"{f.number('p'):.1g}): the arm does not come back to the same place, or an effect is "
-        "missing. The intervals take all readings for independent and are too narrow: use the "
-        "default method, whose noise model has this scatter, or intervals by cr2; measure more "
-        "configurations rather than more repeats."
-    ]
-
-
-def _at_bound(_: Calibration, f: Finding) -> list[str]:
-    return [
-        f"{f.numbers['parameter']} stands at its bound {f.number('bound'):g} {f.numbers['unit']}; "
-        f"it is held there and has no interval. {f.remedy}"
-    ]
-
-
-def _beyond_bound(_: Calibration, f: Finding) -> list[str]:
-    return [
-        f"{f.numbers['parameter']} = {f.number('value'):.3g} ± {f.number('std'):.2g} "
-        f"{f.numbers['unit']} lies beyond its physical bound {f.number('bound'):g}: "
-        f"{f.remedy[:1].lower()}{f.remedy[1:]}"
-    ]
-
-
-def _faulty_readings(result: Calibration, _: Finding) -> list[str]:
+def _faulty_readings(result: Calibration) -> list[str]:
     found = []
     if result.outliers:
         found.append(
@@ -416,13 +404,6 @@ def _faulty_readings(result: Calibration, _: Finding) -> list[str]:
     return found
 
 
-def _many_faulty(_: Calibration, f: Finding) -> list[str]:
-    return [
-        "That is too large a share for reading errors: a shifted block of readings, or an effect "
-        f"that the model lacks in some load state, marker or region. {f.remedy}"
-    ]
-
-
 def _lines(readings: tuple[Outlier, ...]) -> str:
     """ "lines 142–507, 610 …": runs of lines, the first eight."""
     runs = blocks([o.line for o in readings])
@@ -435,18 +416,6 @@ def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
     return f"1 reading {one}" if n == 1 else f"{n} readings {many}"
 
 
-_TOLD: dict[str, Callable[[Calibration, Finding], list[str]]] = {
-    "not_converged": _not_converged,
-    "few_degrees_of_freedom": _few_degrees,
-    "not_held_out": _not_held_out,
-    "ill_conditioned": _ill_conditioned,
-    "residual_above_stated_noise": _above_stated,
-    "lack_of_fit": _not_fitting,
-    "at_bound": _at_bound,
-    "beyond_bound": _beyond_bound,
-    "faulty_readings": _faulty_readings,
-    "many_faulty_readings": _many_faulty,
-}
 # Of these the warning, or the line on the prior, says what to do.
 TOLD_ELSEWHERE = (
     "not_converged", "few_degrees_of_freedom", "ill_conditioned", "at_bound", "beyond_bound",

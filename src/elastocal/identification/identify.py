@@ -56,7 +56,7 @@ def identify(
     progress("finding the start")
     free = fixed_and_free(model, options.fixed)
     x0 = start_values(model, table, options.seed, free)
-    whole = _solution(model, observed, x0, free, options, progress)
+    every = _solution(model, observed, x0, free, options, progress)
 
     def refit(good: NDArray[np.bool_], final: bool = False) -> Solution:
         chosen = options
@@ -67,15 +67,15 @@ def identify(
         return _solution(model, subset(observed, good), x0, free, chosen, silent, final)
 
     progress("looking for faulty readings")
-    faulty, clean = np.zeros(len(observed.lead), dtype=bool), whole
-    if not is_exact(whole):
-        faulty, clean = find_faulty(whole, refit)
+    faulty, sound = np.zeros(len(observed.lead), dtype=bool), every
+    if not is_exact(every):
+        faulty, sound = find_faulty(every, refit)
     if 0 < faulty.mean() < 1:
-        clean = refit(~faulty, final=True)
-    found = run_method(whole, clean, faulty, refit, options, progress)
+        sound = refit(~faulty, final=True)
+    found = run_method(every, sound, faulty, refit, options, progress)
     progress("intervals and held-out residuals")
-    beyond = describe(whole, found.solution, ~found.good)
-    result = summarise(model, whole, clean, found, beyond)
+    outliers = describe(every, found.solution, ~found.good)
+    result = summarise(model, every, sound, found, outliers)
     if test is None:
         return result
     return judged(replace(result, test=_test_errors(model, result.x, test)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -53,16 +54,14 @@ def cluster_by_parts(fit: Fit, parts: Partition) -> Covariance:
         return dict(zip(codes.tolist(), sums, strict=True))
 
     def meat(spans: tuple[Span, ...]) -> Array:
-        total: dict[int, Array] = {}
+        total: dict[int, Array] = defaultdict(lambda: np.zeros(p))
         for span in spans:
             for code, score in scores(span).items():
-                total[code] = total.get(code, np.zeros(p)) + score
+                total[code] += score
         S = np.array(list(total.values()))
         return np.asarray(S.T @ S)
 
-    middle = np.zeros((p, p))
-    for part in in_order(parts.groups, meat):
-        middle += part
+    middle = sum(in_order(parts.groups, meat), np.zeros((p, p)))
     n, G = len(parts.observed.value), len(np.unique(parts.observed.configuration))
     factor = G / (G - 1) * (n - 1) / (n - p)
     cofactor = fit.cofactor() / np.outer(size, size)
@@ -91,13 +90,6 @@ JUMP = 0.01  # of τ over a step of 10 PRECISION that no continuous profile make
 PRECISION = 1e-6  # of an end, in units of t·std
 LOWER_BY = 1e-3  # (Ŝ − S)/s² above which the fit was not at its minimum
 
-SAID: dict[str, str] = {
-    "crossing": "",
-    "bound": "ends at the bound of the parameter",
-    "unbounded": "unbounded: the sum of squares stays flat on this side",
-    "no_fit": "ends where the model has no fit any more",
-}
-
 
 @dataclass(frozen=True)
 class ProfileInterval:
@@ -109,15 +101,6 @@ class ProfileInterval:
     lower: float
     upper: float
     ends: tuple[End, End]
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What to say of sides that do not end in a crossing."""
-        return tuple(
-            f"{side} end {SAID[end]}"
-            for side, end in zip(("lower", "upper"), self.ends, strict=True)
-            if end != "crossing"
-        )
 
 
 def profile_interval(
@@ -262,15 +245,19 @@ def intervals_of(
     """
     fit, observed = solution.fit, solution.problem.observations
     x = fit.x[fit.columns]
+
+    def by_t(covariance: Covariance) -> Intervals:
+        return Intervals(covariance, covariance.interval(x, LEVEL))
+
     if kind == "auto" and noise is not None:
-        return _by_t(noise.covariance, x)
+        return by_t(noise.covariance)
     problem = solution.problem
     clustered = problem.large and worth_clustering(problem.parts, len(x))
     if (kind == "cr1" and problem.large) or (kind == "auto" and clustered):
-        return _by_t(cluster_by_parts(fit, problem.parts), x)
+        return by_t(cluster_by_parts(fit, problem.parts))
     classical = _classical(solution)
     if kind in ("auto", "classical"):
-        return _by_t(classical, x)
+        return by_t(classical)
     if problem.large:
         raise InputError(
             f"{option('intervals', kind)} needs B as a whole, which a table of this size does not "
@@ -280,22 +267,17 @@ def intervals_of(
     B, e = solution.problem.weights.apply(fit.B * size), fit.whitened
     cluster = np.repeat(observed.configuration, observed.size)
     if kind.startswith("hc"):
-        return _by_t(_scaled(hc(B, e, kind.upper()), size), x)  # type: ignore[arg-type]
+        return by_t(_scaled(hc(B, e, kind.upper()), size))  # type: ignore[arg-type]
     if kind.startswith("cr"):
-        found = cluster_robust(B, e, cluster, kind.upper())  # type: ignore[arg-type]
-        return _by_t(_scaled(found, size), x)
+        return by_t(_scaled(cluster_robust(B, e, cluster, kind.upper()), size))  # type: ignore[arg-type]
     if kind == "wild":
         wild = wild_cluster_bootstrap(B, e, cluster, draws=DRAWS, seed=seed)
         spread = _scaled(cluster_robust(B, e, cluster, "CR2"), size)
         ci95 = x[:, None] + size[:, None] * wild.interval(LEVEL)
-        return Intervals(Covariance("wild", spread.matrix, spread.dof, wild.description), ci95)
+        return Intervals(replace(spread, kind="wild", description=wild.description), ci95)
     if kind == "bootstrap":
         return _bootstrapped(solution, noise, classical, seed, jobs)
     return _profiled(solution, classical)
-
-
-def _by_t(covariance: Covariance, x: Array) -> Intervals:
-    return Intervals(covariance, covariance.interval(x, LEVEL))
 
 
 def _classical(solution: Solution) -> Covariance:
@@ -310,7 +292,7 @@ def _classical(solution: Solution) -> Covariance:
 
 def _scaled(found: Covariance, size: Array) -> Covariance:
     """From parameters in typical sizes to their own units."""
-    return Covariance(found.kind, found.matrix * np.outer(size, size), found.dof, found.description)
+    return replace(found, matrix=found.matrix * np.outer(size, size))
 
 
 def _bootstrapped(
@@ -347,14 +329,13 @@ def _profiled(solution: Solution, classical: Covariance) -> Intervals:
     fit = solution.fit
     ends = []
     for k, c in enumerate(fit.columns.tolist()):
-        parameter = solution.problem.model.parameters[c]
-        lower, upper = (
-            (parameter.lower, parameter.upper) if solution.problem.bounded else (-np.inf, np.inf)
-        )
+        parameter, bounds = solution.problem.model.parameters[c], (-np.inf, np.inf)
+        if solution.problem.bounded:
+            bounds = (parameter.lower, parameter.upper)
         found = profile_interval(
             profile_of(fit.problem, fit, c), float(fit.x[c]), float(classical.std[k]),
-            float(classical.dof[k]), LEVEL, lower, upper,
+            float(classical.dof[k]), LEVEL, *bounds,
         )  # fmt: skip
         ends.append((found.lower, found.upper))
     text = "profile of the nonlinear sum of squares (all readings independent)"
-    return Intervals(Covariance("profile", classical.matrix, classical.dof, text), np.array(ends))
+    return Intervals(replace(classical, kind="profile", description=text), np.array(ends))

@@ -19,7 +19,7 @@ from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
     linearised,
-    screen,
+    outlier_screening,
     settle,
     weights_of,
 )
@@ -39,60 +39,49 @@ ROUNDS = 6
 RESTARTS = 3
 SETTLED = 0.01  # of a standard deviation: what relinearising may still move an estimate by
 
-
-@dataclass(frozen=True)
-class Adapted:
-    """The fit to the `good` observations (N,) under the noise found from them."""
-
-    solution: Solution
-    noise: NoiseFit
-    good: BoolArray
+# A fit to the good observations (N,), the noise found from them, and which they are.
+Adapted = tuple[Solution, NoiseFit, BoolArray]
 
 
-def adapt(
-    whole: Solution, clean: Solution, faulty: BoolArray, refit: Refit, kind: str, progress: Progress
+def _adapted(
+    every: Solution, sound: Solution, faulty: BoolArray, refit: Refit, kind: str, progress: Progress
 ) -> Adapted:
     """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
 
-    `whole` holds all observations, `clean` the fit to those that are not `faulty` (N,) at equal or
+    `every` holds all observations, `sound` the fit to those that are not `faulty` (N,) at equal or
     stated weights.  At its values readings are screened, noise model and faulty readings settled
-    (variance.search) and the kept parameters fitted anew with the weights found, until neither
-    changes.  Where other readings turn out good than `clean` was fitted to, its parameters are
-    chosen again for these.
+    (`noise_choice.settle`) and the kept parameters fitted anew with the weights found, until
+    neither changes.  Where other readings turn out good than `sound` was fitted to, its parameters
+    are chosen again for these.
     """
-    start, good = clean, ~faulty
+    start, good = sound, ~faulty
     for _ in range(RESTARTS):
-        found = _settled(whole, start, good, kind, progress)
-        if np.array_equal(found.good, good):
+        solution, noise, judged = _settled(every, start, good, kind, progress)
+        if np.array_equal(judged, good):
             break
-        good = found.good
-        start = whole if good.all() else refit(good, True)
-    return found
-
-
-def adapt_all(whole: Solution, kind: str, progress: Progress) -> Adapted:
-    """As `adapt`, with all observations, whatever they are."""
-    return _settled(whole, whole, None, kind, progress)
+        good = judged
+        start = every if good.all() else refit(good, True)
+    return solution, noise, judged
 
 
 def _settled(
-    whole: Solution, start: Solution, good: BoolArray | None, kind: str, progress: Progress
+    every: Solution, start: Solution, good: BoolArray | None, kind: str, progress: Progress
 ) -> Adapted:
-    problem, kept = whole.problem, start.reduction.kept
+    """The noise and the fit in turn, from `start`; all observations where `good` is None."""
+    problem, kept = every.problem, start.reduction.kept
     model, observed = problem.model, problem.observations
-    solution, every = start, np.ones(len(observed.lead), dtype=bool)
+    solution, everything = start, np.ones(len(observed.lead), dtype=bool)
     readings = linearised(model, observed, start.fit.x, kept)
-    now = every if good is None else screen(readings, readings.e, good)
+    now = everything if good is None else outlier_screening(readings, readings.e, good)
     for _ in range(ROUNDS):
         before = now
         if good is None:
             noise = estimate_noise(readings, kind)
         else:
-            verdict = settle(readings, kind, now)
-            noise, now = verdict.noise, verdict.good
+            noise, now = settle(readings, kind, now)
         progress(f"fitting with the noise found ({noise.kind})")
         expected = solution.fit.x[kept] + noise.x
-        solution = refined(whole, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
+        solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
         readings = linearised(model, observed, solution.fit.x, kept)
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
         if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
@@ -101,14 +90,14 @@ def _settled(
     fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
     final = estimate_noise(fitted, noise.kind, noise)
     final = replace(final, trials=noise.trials, reason=noise.reason)
-    return Adapted(solution, final, now)
+    return solution, final, now
 
 
 def refined(
-    whole: Solution, start: Solution, x: Array, good: BoolArray, weights: Weights
+    every: Solution, start: Solution, x: Array, good: BoolArray, weights: Weights
 ) -> Solution:
     """The kept parameters of `start` fitted from x to the good observations with other weights."""
-    observed = whole.problem.observations
+    observed = every.problem.observations
     chosen = observed if good.all() else subset(observed, good)
     problem: Problem = replace(start.problem, observations=chosen, weights=weights)
     found = fit_kept(problem, start.sizes, x, start.reduction)
@@ -119,7 +108,7 @@ def refined(
     return replace(start, problem=problem, fit=found, reduction=reduction, heldout=heldout)
 
 
-# The methods: from a first fit to the final one, its noise and its intervals.
+# The methods by name.
 
 # A larger share of readings beyond the noise is no accident of measuring: an effect that the model
 # lacks looks like that.  Setting them apart would hide it.
@@ -156,8 +145,8 @@ class MethodResult:
 
 
 def run_method(
-    whole: Solution,
-    clean: Solution,
+    every: Solution,
+    sound: Solution,
     faulty: BoolArray,
     refit: Refit,
     options: Options,
@@ -165,44 +154,35 @@ def run_method(
 ) -> MethodResult:
     """Carry out `options.method` from the fit to all observations and that to the good ones.
 
-    `clean` is the fit to the observations that are not `faulty` (N,), `refit` makes another such.
+    `sound` is the fit to the observations that are not `faulty` (N,), `refit` makes another such.
     Constraints and prior come last, on the weights and the readings that the method ends with.
     """
-    if not options.knows:
-        return _by_readings(whole, clean, faulty, refit, options, progress)
-    alone = replace(options, constraints=None, prior=None, intervals="auto")
-    found = _by_readings(whole, clean, faulty, refit, alone, progress)
+    if options.knows:
+        alone = replace(options, constraints=None, prior=None, intervals="auto")
+        found = run_method(every, sound, faulty, refit, alone, progress)
+        return _with_knowledge(found, options, progress)
+    method, exact = options.resolved, is_exact(sound)
+    if method == "reml" and not every.problem.large and not exact:
+        return _reml(every, sound, faulty, refit, options, progress)
+    if method in ROBUST:
+        return _robust(method, sound, every, ~faulty, options)
+    # As published, every reading counts; and at equal weights noisy readings look faulty.
+    drop = _set_aside(faulty, options) and (method in ("wls", "reml") or options.faulty == "drop")
+    solution, good = (sound if drop else every), ~faulty
+    if method in ("eq14", "eq14-residual"):
+        return _published(method, every, solution, good, options, progress)
+    kind = "ols" if solution.problem.weights.kind == "none" else "wls"
+    intervals = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
+    warnings = (COMPUTED,) if exact else ()
+    return MethodResult(kind, solution, intervals, None, good, warnings=warnings)
+
+
+def _with_knowledge(found: MethodResult, options: Options, progress: Progress) -> MethodResult:
     known = fit_with_knowledge(found.solution, found.intervals, options, progress)
     return MethodResult(
         "constrained", known.solution, known.intervals, found.noise, found.good,
         known.active, known.prior_share, known.effective, known.leverage, known.warnings,
     )  # fmt: skip
-
-
-def _by_readings(
-    whole: Solution,
-    clean: Solution,
-    faulty: BoolArray,
-    refit: Refit,
-    options: Options,
-    progress: Progress,
-) -> MethodResult:
-    """What the method makes of the readings alone."""
-    method = options.resolved
-    exact = is_exact(clean)
-    if method == "reml" and not whole.problem.large and not exact:
-        return _reml(whole, clean, faulty, refit, options, progress)
-    if method in ROBUST:
-        return _robust(method, clean, whole, ~faulty, options)
-    # As published, every reading counts; and at equal weights noisy readings look faulty.
-    drop = _set_aside(faulty, options) and (method in ("wls", "reml") or options.faulty == "drop")
-    solution, good = (clean if drop else whole), ~faulty
-    if method in ("eq14", "eq14-residual"):
-        return _published(method, whole, solution, good, options, progress)
-    kind = "ols" if solution.problem.weights.kind == "none" else "wls"
-    intervals = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
-    warnings = (COMPUTED,) if exact else ()
-    return MethodResult(kind, solution, intervals, None, good, warnings=warnings)
 
 
 def is_exact(solution: Solution) -> bool:
@@ -217,25 +197,23 @@ def _set_aside(faulty: BoolArray, options: Options) -> bool:
 
 
 def _reml(
-    whole: Solution,
-    clean: Solution,
+    every: Solution,
+    sound: Solution,
     faulty: BoolArray,
     refit: Refit,
     options: Options,
     progress: Progress,
 ) -> MethodResult:
-    found = adapt(whole, clean, faulty, refit, options.noise, progress)
-    if not found.good.all() and not _set_aside(~found.good, options):
-        found = replace(adapt_all(whole, options.noise, progress), good=found.good)
-    intervals = intervals_of(
-        found.solution, options.intervals, found.noise, options.seed, options.jobs
-    )
-    return MethodResult("reml", found.solution, intervals, found.noise, found.good)
+    solution, noise, good = _adapted(every, sound, faulty, refit, options.noise, progress)
+    if not good.all() and not _set_aside(~good, options):
+        solution, noise, _ = _settled(every, every, None, options.noise, progress)
+    intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
+    return MethodResult("reml", solution, intervals, noise, good)
 
 
 def _published(
     method: str,
-    whole: Solution,
+    every: Solution,
     start: Solution,
     good: BoolArray,
     options: Options,
@@ -252,8 +230,8 @@ def _published(
     last = published.eq14(fit.B * size, fit.residual, group)[-1]
     text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
     weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)
-    kept = good if len(observed.lead) < len(good) else np.ones_like(good)
-    solution = refined(whole, start, start.fit.x, kept, weights)
+    fitted = good if len(observed.lead) < len(good) else np.ones_like(good)
+    solution = refined(every, start, start.fit.x, fitted, weights)
     if options.intervals != "auto":
         own = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
         return MethodResult(method, solution, own, None, good)
@@ -268,10 +246,10 @@ def _published(
 
 
 def _robust(
-    method: str, clean: Solution, whole: Solution, good: BoolArray, options: Options
+    method: str, sound: Solution, every: Solution, good: BoolArray, options: Options
 ) -> MethodResult:
     """A robust fit of all readings in the parameters that the good ones determine."""
-    if whole.problem.bounded or whole.problem.large:
+    if every.problem.bounded or every.problem.large:
         raise InputError(
             f"the method {method} takes no bounds and no table of this size; use the default "
             "method, which sets faulty readings apart"
@@ -281,31 +259,27 @@ def _robust(
             f"the method {method} has intervals of its own: 'auto' for independent readings, "
             "'cr3' where readings of a configuration depend on each other"
         )
-    problem, kept = whole.problem, clean.reduction.kept
+    problem, kept = every.problem, sound.reduction.kept
     observed = problem.observations
-    found = robust_fit(problem.fit_of(kept, clean.fit.x, clean.sizes), method, None, options.seed)  # type: ignore[arg-type]
+    found = robust_fit(problem.fit_of(kept, sound.fit.x, sound.sizes), method, None, options.seed)  # type: ignore[arg-type]
     clustered = options.intervals == "cr3"
     covariance = found.clustered(observed.configuration) if clustered else found.covariance()
     fit = replace(
-        clean.fit, x=found.x, residual=found.residual, whitened=found.whitened,
+        sound.fit, x=found.x, residual=found.residual, whitened=found.whitened,
         converged=found.converged, steps=found.steps,
-        problem=problem.fit_of(kept, found.x, clean.sizes),
-        reason=clean.fit.reason if found.converged else "the robust steps did not settle",
+        problem=problem.fit_of(kept, found.x, sound.sizes),
+        reason=sound.fit.reason if found.converged else "the robust steps did not settle",
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
     share = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), observed.size))
     whiten = sparse.csr_array(sparse.diags_array(share))
     if problem.weights.whiten is not None:
         whiten = sparse.csr_array(whiten @ problem.weights.whiten)
-    heldout = held_out_residual(
-        fit.B,
-        found.residual,
-        replace(problem.weights, whiten=whiten),
-        observed.configuration,
-        observed.size,
-    )
+    weights = replace(problem.weights, whiten=whiten)
+    groups = observed.configuration
+    heldout = held_out_residual(fit.B, found.residual, weights, groups, observed.size)
     solution = replace(
-        clean, problem=replace(problem, x0=clean.problem.x0), fit=fit, heldout=heldout
+        sound, problem=replace(problem, x0=sound.problem.x0), fit=fit, heldout=heldout
     )
     x = found.x[kept]
     intervals = Intervals(covariance, covariance.interval(x, LEVEL))

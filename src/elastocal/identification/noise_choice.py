@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +52,7 @@ from elastocal.units import Array, BoolArray, IntArray
 # Akaike's (AIC): one that is left out wrongly makes intervals too narrow.
 
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
-SEEN = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
+LEAST_START = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
 
 
@@ -122,13 +123,15 @@ def estimate_noise(
         if shared and not (fit.common > 0).any():
             shared = False  # none was found: the same model without
         label = name + (SHARED if shared else "")
-        own, common = _n_variances(fit)
+        own, common = len(fit.structure.names), int((fit.common > 0).sum())
+        if fit.structure.shrunk:
+            own = readings.size + 2  # means of log θ and its two variances
         criterion = own * price + 2 * common - 2 * fit.log_likelihood
         trials.append(Trial(label, own + common, float(criterion)))
         if best is None or criterion < best[0]:
             best = (criterion, label, fit)
 
-    could_share = bool(shared_effects(STRUCTURES["independent"](basis).cells, readings.size))
+    could_share = bool(shared_effects(STRUCTURES["independent"](basis).sets, readings.size))
     for name in _supported(basis):
         attempt(name, could_share)
     if best is None:
@@ -162,7 +165,7 @@ def _supported(readings: Readings) -> list[str]:
 def _fitted(readings: Readings, name: str, shared: bool, like: Reml | None = None) -> Reml:
     """A structure's fit; the search starts from the variances of `like` where it has the same."""
     structure = STRUCTURES[name](readings)
-    effects = shared_effects(structure.cells, readings.size, shared)
+    effects = shared_effects(structure.sets, readings.size, shared)
     if shared and not effects:
         raise InputError(
             f"'{name}{SHARED}' needs repeats or several markers in a configuration; this table "
@@ -176,25 +179,17 @@ def _fitted(readings: Readings, name: str, shared: bool, like: Reml | None = Non
     if like is not None and len(like.common) == len(effects):
         start[own:] = np.where(like.common > 0, like.common, start[own:])
         if like.structure.names == structure.names:
-            start[:own] = np.where(like.own > SEEN * like.own.max(), like.own, start[:own])
+            start[:own] = np.where(like.own > LEAST_START * like.own.max(), like.own, start[:own])
     return reml(structure, effects, prior, start)
 
 
 def _prior(structure: Structure) -> LogPrior:
     """Prior of the group variances, from residuals of a fit with the plain mean of repeats."""
-    cells = structure.cells
-    B, e = cells.B.reshape(-1, cells.B.shape[2]), cells.e.ravel()
-    weight = np.repeat(np.sqrt(cells.repeats), cells.e.shape[1])
+    sets = structure.sets
+    B, e = sets.B.reshape(-1, sets.B.shape[2]), sets.e.ravel()
+    weight = np.repeat(np.sqrt(sets.repeats), sets.e.shape[1])
     x = linalg.lstsq(B * weight[:, None], e * weight)[0]
-    return prior_of_groups(structure, (e - B @ x).reshape(cells.e.shape))
-
-
-def _n_variances(fit: Reml) -> tuple[int, int]:
-    """How many own and shared variances the readings chose."""
-    own = len(fit.structure.names)
-    if fit.structure.shrunk:
-        own = fit.structure.cells.e.shape[1] + 2  # means of log θ and its two variances
-    return own, int((fit.common > 0).sum())
+    return prior_of_groups(structure, (e - B @ x).reshape(sets.e.shape))
 
 
 def _reason(label: str, trials: list[Trial]) -> str:
@@ -233,7 +228,9 @@ def _result(label: str, fit: Reml, T: Array, trials: tuple[Trial, ...], reason: 
 # J. R. Stat. Soc. B 60, 201): one evaluation judges every reading of the fit.
 
 
-def beyond_noise(found: NoiseFit, readings: Readings, good: BoolArray, level: float) -> BoolArray:
+def unexplained_readings(
+    found: NoiseFit, readings: Readings, good: BoolArray, level: float
+) -> BoolArray:
     """Readings (N,) that the noise does not explain, at `level` for the whole table (Bonferroni).
 
     `found` was estimated from the `good` readings (N,); they and the others are judged by the
@@ -271,8 +268,8 @@ def own_noise(fit: Reml, readings: Readings) -> tuple[Array, Array]:
     theta = np.where(known >= 0, own[known], own.mean())
     W = fit.covariance[: len(own), : len(own)]
     spread = np.where(known >= 0, np.diag(W)[known], np.diag(W).max())
-    cell = readings.cell
-    index, matrix = whole.index[cell], whole.matrix[cell]
+    set_of = readings.set_of
+    index, matrix = whole.index[set_of], whole.matrix[set_of]
     if name == "stated":
         matrix = np.asarray(readings.stated)[:, None]
     covariance = np.einsum("nl,nlij->nij", theta[index], matrix)
@@ -285,26 +282,26 @@ def own_noise(fit: Reml, readings: Readings) -> tuple[Array, Array]:
 def _deletion_fit(found: NoiseFit, inside: Readings, own: Array) -> Array:
     """Deletion residuals (N, size) of the readings of the fit, each over its deviation."""
     fit = found.fit
-    cells, cell = fit.structure.cells, inside.cell
-    n_cells, size = len(cells), inside.size
-    mean_P, mean_Pe = np.zeros((n_cells, size, size)), np.zeros((n_cells, size))
+    sets, set_of = fit.structure.sets, inside.set_of
+    n_sets, size = len(sets), inside.size
+    mean_P, mean_Pe = np.zeros((n_sets, size, size)), np.zeros((n_sets, size))
     for w in fit.state.whitened:
         back = w.inverse.transpose(0, 2, 1)
         VB, Pe = back @ w.B, (back @ _residual(fit, w)[:, :, None])[..., 0]
-        for j in range(w.stack.cells.shape[1]):
+        for j in range(w.stack.sets.shape[1]):
             rows = slice(j * size, (j + 1) * size)
             column = w.inverse[:, :, rows]
             P = column.transpose(0, 2, 1) @ column
-            mean_P[w.stack.cells[:, j]] = P - VB[:, rows] @ fit.state.Phi @ VB[:, rows].transpose(
+            mean_P[w.stack.sets[:, j]] = P - VB[:, rows] @ fit.state.Phi @ VB[:, rows].transpose(
                 0, 2, 1
             )
-            mean_Pe[w.stack.cells[:, j]] = Pe[:, rows]
+            mean_Pe[w.stack.sets[:, j]] = Pe[:, rows]
     precision = np.linalg.inv(own)
     unit = np.einsum("cl,clij->cij", fit.own[fit.structure.index], fit.structure.mean_matrix)
-    share = precision @ unit[cell]  # of a reading in the mean of its cell, transposed
-    P = precision - share @ precision + share @ mean_P[cell] @ share.transpose(0, 2, 1)
-    deviation = (inside.e - cells.e[cell])[:, :, None]
-    Pe = (precision @ deviation + share @ mean_Pe[cell][:, :, None])[..., 0]
+    share = precision @ unit[set_of]  # of a reading in the mean of its set, transposed
+    P = precision - share @ precision + share @ mean_P[set_of] @ share.transpose(0, 2, 1)
+    deviation = (inside.e - sets.e[set_of])[:, :, None]
+    Pe = (precision @ deviation + share @ mean_Pe[set_of][:, :, None])[..., 0]
     # A direction that this reading alone determines has no deletion residual.
     values, vectors = np.linalg.eigh(P)
     smallest = 1e-9 * np.linalg.eigvalsh(precision)[:, -1:]
@@ -342,17 +339,17 @@ def _not_fitted(found: NoiseFit, rest: Readings, own: Array) -> Array:
 def _common(fit: Reml, w: Whitened, rest: Readings) -> tuple[tuple[IntArray, IntArray], Array]:
     """Which readings of `rest` have mates in which cluster of the stack, and R⁻¹k (n, rows, size).
 
-    k is what a reading and its configuration's fitted cells vary by together.
+    k is what a reading and its configuration's fitted sets vary by together.
     """
-    cells, size = fit.structure.cells, rest.size
-    cluster = {int(c): g for g, c in enumerate(cells.configuration[w.stack.cells[:, 0]])}
+    sets, size = fit.structure.sets, rest.size
+    cluster = {int(c): g for g, c in enumerate(sets.configuration[w.stack.sets[:, 0]])}
     mates = np.array([cluster.get(int(c), -1) for c in rest.configuration])
     here = np.flatnonzero(mates >= 0)
-    members = w.stack.cells[mates[here]]  # (n, cells)
+    members = w.stack.sets[mates[here]]  # (n, sets)
     common = np.zeros((len(here), members.shape[1], size))
     for effect, variance in zip(fit.shared, fit.common, strict=True):
         same = np.all(
-            [getattr(cells, by)[members] == getattr(rest, by)[here, None] for by in effect.by],
+            [getattr(sets, by)[members] == getattr(rest, by)[here, None] for by in effect.by],
             axis=0,
         )
         common += variance * same[:, :, None] * effect.axes
@@ -372,7 +369,9 @@ MOVED = 1 / 3  # share of a configuration's readings
 LIMIT = 5.0  # robust standard deviations; the verdict that follows takes back what it can explain
 
 
-def screen(readings: Readings, residual: Array, good: BoolArray | None = None) -> BoolArray:
+def outlier_screening(
+    readings: Readings, residual: Array, good: BoolArray | None = None
+) -> BoolArray:
     """Readings (N,) whose residual (N, size) from a robust fit lies with the others.
 
     Each component is compared with the median and the median absolute deviation of its
@@ -415,9 +414,8 @@ ROUNDS = 12
 FEWEST_GOOD = 0.5
 
 
-@dataclass(frozen=True)
-class NoiseAndOutliers:
-    """The noise found from the `good` readings (N,); the others lie beyond it."""
+class NoiseAndOutliers(NamedTuple):
+    """The noise found from the `good` readings (N,); the noise does not explain the others."""
 
     noise: NoiseFit
     good: BoolArray
@@ -442,7 +440,7 @@ def settle(
     own = np.asarray(np.linalg.inv(own_noise(noise.fit, readings)[0]), dtype=np.float64)
     visited = [(_misfit(noise, readings, own), good, noise)]
     for _ in range(ROUNDS):
-        updated = ~beyond_noise(noise, readings, good, FALSE_ALARM)
+        updated = ~unexplained_readings(noise, readings, good, FALSE_ALARM)
         if np.array_equal(updated, good) or updated.mean() < FEWEST_GOOD:
             break
         masks = [mask for _, mask, _ in visited]

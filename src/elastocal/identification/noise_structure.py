@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from elastocal.errors import InputError, require
+from elastocal.errors import require
 from elastocal.measurements import Measurements
+from elastocal.plugin_loader import check_registered, same_class
 from elastocal.units import Array, BoolArray, IntArray
 
 # Residuals and B per reading, with the labels that say what readings have in common.
@@ -69,13 +68,13 @@ class Readings:
         return self.table.take(self.lead)
 
     @cached_property
-    def cell(self) -> IntArray:
+    def set_of(self) -> IntArray:
         """Number (N,) of the set of repeats that a reading belongs to."""
         key = np.column_stack([self.configuration, self.load, self.marker])
         return np.unique(key, axis=0, return_inverse=True)[1].ravel()
 
     @cached_property
-    def cells(self) -> Cells:
+    def sets(self) -> RepeatSets:
         """Sets of repeats with plain means; every noise model but the stated one uses them."""
         return reduce_repeats(self)
 
@@ -95,15 +94,15 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Cells:
+class RepeatSets:
     """Sets of repeats, reduced without loss: a mean and what scatters about it.
 
-    With the covariance θ S_i of reading i in a cell, the weighted mean ȳ = U Σ S_i⁻¹ y_i with
+    With the covariance θ S_i of reading i in a set, the weighted mean ȳ = U Σ S_i⁻¹ y_i with
     U = (Σ S_i⁻¹)⁻¹ and the scatter about it are sufficient: ȳ varies by θ U plus whatever all
     repeats share, the scatter by θ alone with (repeats − 1) · size degrees of freedom.  Repeats
     are taken to have one B; where theirs differ a little, the mean stands for all.
     `B` (C, size, p), `e` (C, size), `unit` U (C, size, size), `dof` (C,) repeats − 1, `scatter`
-    (C, size, size), `log_offset`: Σ log|S_i| − log|U| over all cells, which the likelihood needs.
+    (C, size, size), `log_offset`: Σ log|S_i| − log|U| over all sets, which the likelihood needs.
     """
 
     B: Array
@@ -123,33 +122,33 @@ class Cells:
         return len(self.e)
 
 
-def reduce_repeats(readings: Readings, stated: bool = False) -> Cells:
-    """Cells of the readings; weighted by the stated covariances if `stated`, else plainly."""
-    cell = readings.cell
-    n_cells = int(cell.max()) + 1
-    first = np.unique(cell, return_index=True)[1]
-    repeats = np.bincount(cell, minlength=n_cells)
+def reduce_repeats(readings: Readings, stated: bool = False) -> RepeatSets:
+    """The sets of repeats; weighted by the stated covariances if `stated`, else plainly."""
+    set_of = readings.set_of
+    n_sets = int(set_of.max()) + 1
+    first = np.unique(set_of, return_index=True)[1]
+    repeats = np.bincount(set_of, minlength=n_sets)
     size = readings.size
     if stated:
         require(readings.stated is not None, "no noise is stated that could be used")
         S = np.asarray(readings.stated)
         P = np.linalg.inv(S)
-        unit = np.linalg.inv(_sum(P, cell, n_cells)).astype(np.float64)
+        unit = np.linalg.inv(_sum(P, set_of, n_sets)).astype(np.float64)
         offset = np.linalg.slogdet(S)[1].sum() - np.linalg.slogdet(unit)[1].sum()
-        share = unit[cell] @ P
-        e = _sum((share @ readings.e[:, :, None])[..., 0], cell, n_cells)
-        B = _sum(share @ readings.B, cell, n_cells)
-        deviation = readings.e - e[cell]
+        share = unit[set_of] @ P
+        e = _sum((share @ readings.e[:, :, None])[..., 0], set_of, n_sets)
+        B = _sum(share @ readings.B, set_of, n_sets)
+        deviation = readings.e - e[set_of]
         squares = np.einsum("ni,nij,nj->n", deviation, P, deviation)
-        scatter = np.bincount(cell, squares, n_cells)[:, None, None] * np.eye(size) / size
+        scatter = np.bincount(set_of, squares, n_sets)[:, None, None] * np.eye(size) / size
     else:
         unit = np.eye(size) / repeats[:, None, None]
         offset = size * np.log(repeats).sum()
-        e = _sum(readings.e, cell, n_cells) / repeats[:, None]
-        B = _sum(readings.B, cell, n_cells) / repeats[:, None, None]
-        deviation = readings.e - e[cell]
-        scatter = _sum(deviation[:, :, None] * deviation[:, None, :], cell, n_cells)
-    return Cells(
+        e = _sum(readings.e, set_of, n_sets) / repeats[:, None]
+        B = _sum(readings.B, set_of, n_sets) / repeats[:, None, None]
+        deviation = readings.e - e[set_of]
+        scatter = _sum(deviation[:, :, None] * deviation[:, None, :], set_of, n_sets)
+    return RepeatSets(
         B, e, unit, repeats, (repeats - 1).astype(float), scatter, float(offset),
         readings.configuration[first], readings.load[first], readings.marker[first],
         None if readings.sight is None else readings.sight[first],
@@ -157,9 +156,9 @@ def reduce_repeats(readings: Readings, stated: bool = False) -> Cells:
     )  # fmt: skip
 
 
-def _sum(values: Array, cell: IntArray, n_cells: int) -> Array:
-    total = np.zeros((n_cells, *values.shape[1:]))
-    np.add.at(total, cell, values)
+def _sum(values: Array, set_of: IntArray, n_sets: int) -> Array:
+    total = np.zeros((n_sets, *values.shape[1:]))
+    np.add.at(total, set_of, values)
     return total
 
 
@@ -170,21 +169,31 @@ def _sum(values: Array, cell: IntArray, n_cells: int) -> Array:
 
 @dataclass(frozen=True)
 class Structure:
-    """Covariance of one reading in cell c: Σ_l θ[index[c, l]] · matrix[c, l].
+    """Covariance of one reading in set c: Σ_l θ[index[c, l]] · matrix[c, l].
 
     `index` (C, L) into the `names` of the variances θ, in m² (rad²); `matrix` (C, L, size, size)
-    for a single reading.  The cell's mean has that covariance with `mean_matrix` in its place.
+    for a single reading.  The set's mean has that covariance with `mean_matrix` in its place.
     `shrunk` says that the variances are many and share a prior (see shrinkage).
     """
 
     name: str
     description: str
     names: tuple[str, ...]
-    cells: Cells
+    sets: RepeatSets
     index: IntArray
     matrix: Array
     mean_matrix: Array
     shrunk: bool = False
+
+
+def _plain(
+    name: str, text: str, names: Sequence[str], sets: RepeatSets, index: IntArray, matrix: Array
+) -> Structure:
+    """Where the mean of a set is the plain one; `index` (C, L), or (L,) the same in all sets."""
+    index = np.broadcast_to(index, (len(sets), index.shape[-1])).copy()
+    matrix = np.broadcast_to(matrix, (len(sets), *matrix.shape[-3:])).copy()
+    mean = matrix / sets.repeats[:, None, None, None]
+    return Structure(name, text, tuple(names), sets, index, matrix, mean)
 
 
 def independent(readings: Readings) -> Structure:
@@ -192,9 +201,10 @@ def independent(readings: Readings) -> Structure:
     size = readings.size
     kinds = [range(3), range(3, 6)] if size == 6 else [range(size)]
     names = ("position", "rotation")[: len(kinds)] if size > 1 else ("distance",)
-    return _diagonal(
-        readings, "independent", "one variance for all readings", names,
-        [np.isin(np.arange(size), kind) for kind in kinds],
+    parts = np.array([np.diag(np.isin(np.arange(size), kind).astype(float)) for kind in kinds])
+    return _plain(
+        "independent", "one variance for all readings", names, readings.sets,
+        np.arange(len(kinds)), parts,
     )  # fmt: skip
 
 
@@ -202,21 +212,19 @@ def by_axis(readings: Readings) -> Structure:
     """One variance for each component of a reading."""
     size = readings.size
     names = ("x", "y", "z", "rx", "ry", "rz")[:size] if size > 1 else ("distance",)
-    return _diagonal(
-        readings, "axis", "one variance per axis", names, [row == 1 for row in np.eye(size)]
-    )
+    parts = np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
+    return _plain("axis", "one variance per axis", names, readings.sets, np.arange(size), parts)
 
 
 def by_marker(readings: Readings) -> Structure:
     """One variance for each marker."""
     require(readings.size == 3, "variances per marker are for positions and deflections")
-    cells = readings.cells
-    labels, index = np.unique(cells.marker, return_inverse=True)
-    matrix = np.tile(np.eye(3), (len(cells), 1, 1, 1))
-    return Structure(
-        "marker", "one variance per marker", tuple(f"marker {m}" for m in labels), cells,
-        index.reshape(-1, 1), matrix, matrix / cells.repeats[:, None, None, None],
-    )  # fmt: skip
+    sets = readings.sets
+    labels, index = np.unique(sets.marker, return_inverse=True)
+    names = [f"marker {m}" for m in labels]
+    return _plain(
+        "marker", "one variance per marker", names, sets, index.reshape(-1, 1), np.eye(3)[None]
+    )
 
 
 def by_group(readings: Readings) -> Structure:
@@ -224,20 +232,17 @@ def by_group(readings: Readings) -> Structure:
 
     The group of Klimchik et al. 2013, section 4: its markers and repeats share one σ.
     """
-    cells = readings.cells
+    sets = readings.sets
     size = readings.size
-    key = np.column_stack([cells.configuration, cells.load])
+    key = np.column_stack([sets.configuration, sets.load])
     groups, number = np.unique(key, axis=0, return_inverse=True)
     index = number.ravel()[:, None] * size + np.arange(size)
     parts = np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
-    matrix = np.tile(parts, (len(cells), 1, 1, 1))
-    names = tuple(
+    names = [
         f"configuration {c}, load {load}, component {a}" for c, load in groups for a in range(size)
-    )
-    return Structure(
-        "groups", "a variance per configuration and direction, shrunk towards the others", names,
-        cells, index, matrix, matrix / cells.repeats[:, None, None, None], shrunk=True,
-    )  # fmt: skip
+    ]
+    text = "a variance per configuration and direction, shrunk towards the others"
+    return replace(_plain("groups", text, names, sets, index, parts), shrunk=True)
 
 
 def polar(readings: Readings, angular: bool | None = None) -> Structure:
@@ -251,8 +256,8 @@ def polar(readings: Readings, angular: bool | None = None) -> Structure:
         readings.sight is not None and readings.size == 3,
         "polar noise needs positions and the tracker's position",
     )
-    cells = readings.cells
-    u, d = np.asarray(cells.sight)[:, 0, :], np.asarray(cells.reach)
+    sets = readings.sets
+    u, d = np.asarray(sets.sight)[:, 0, :], np.asarray(sets.reach)
     along = u[:, :, None] * u[:, None, :]
     across = np.eye(3) - along
     matrix = np.stack([along, across], axis=1)
@@ -262,33 +267,18 @@ def polar(readings: Readings, angular: bool | None = None) -> Structure:
     if angular:
         matrix = np.concatenate([matrix, (across * d[:, None, None] ** 2)[:, None]], axis=1)
         names = (*names, "angular")
-    index = np.tile(np.arange(len(names)), (len(cells), 1))
-    return Structure(
-        "polar", "range and transverse variances of the tracker", names, cells, index, matrix,
-        matrix / cells.repeats[:, None, None, None],
-    )  # fmt: skip
+    text = "range and transverse variances of the tracker"
+    return _plain("polar", text, names, sets, np.arange(len(names)), matrix)
 
 
 def as_stated(readings: Readings) -> Structure:
     """The stated noise times one factor, which the residuals tell."""
-    cells = reduce_repeats(readings, stated=True)
-    matrix = np.tile(np.eye(readings.size), (len(cells), 1, 1, 1))
+    sets = reduce_repeats(readings, stated=True)
+    matrix = np.tile(np.eye(readings.size), (len(sets), 1, 1, 1))
     return Structure(
-        "stated", "the stated noise times one factor", ("factor",), cells,
-        np.zeros((len(cells), 1), dtype=np.int64), matrix, cells.unit[:, None],
+        "stated", "the stated noise times one factor", ("factor",), sets,
+        np.zeros((len(sets), 1), dtype=np.int64), matrix, sets.unit[:, None],
     )  # fmt: skip
-
-
-def _diagonal(
-    readings: Readings, name: str, text: str, names: tuple[str, ...], parts: list[NDArray[np.bool_]]
-) -> Structure:
-    cells = readings.cells
-    each = np.array([np.diag(part.astype(float)) for part in parts])
-    matrix = np.tile(each, (len(cells), 1, 1, 1))
-    index = np.tile(np.arange(len(parts)), (len(cells), 1))
-    return Structure(
-        name, text, names, cells, index, matrix, matrix / cells.repeats[:, None, None, None]
-    )
 
 
 STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
@@ -332,21 +322,17 @@ class NoiseModel:
         found = self.components(readings)
         require(bool(found), f"the noise model '{self.name}' has no components")
         whole = np.stack([self._matrices(name, S, readings) for name, S in found.items()], axis=1)
-        cells, cell = readings.cells, readings.cell
-        matrix = np.zeros((len(cells), *whole.shape[1:]))
-        np.add.at(matrix, cell, whole)
-        matrix /= cells.repeats[:, None, None, None]
+        sets, set_of = readings.sets, readings.set_of
+        matrix = np.zeros((len(sets), *whole.shape[1:]))
+        np.add.at(matrix, set_of, whole)
+        matrix /= sets.repeats[:, None, None, None]
         smallest = np.linalg.eigvalsh(matrix.sum(axis=1))[:, 0]
         require(
             bool((smallest > 0).all()),
             f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
             "components add up to a singular matrix",
         )
-        index = np.tile(np.arange(len(found)), (len(cells), 1))
-        return Structure(
-            self.name, self.description, tuple(found), cells, index, matrix,
-            matrix / cells.repeats[:, None, None, None],
-        )  # fmt: skip
+        return _plain(self.name, self.description, list(found), sets, np.arange(len(found)), matrix)
 
     def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
         """S (N, size, size) of one component, checked."""
@@ -378,28 +364,13 @@ def register(model: NoiseModel) -> None:
     Raises InputError where it is none, says too little, or has the name of another one; the same
     class takes the place of its former self.
     """
-    if isinstance(model, type) and issubclass(model, NoiseModel):
-        raise InputError(f"register a noise model, {model.__name__}(), not its class")
-    if not isinstance(model, NoiseModel):
-        raise InputError(
-            "a noise model is an object of a class derived from NoiseModel; "
-            f"found {type(model).__name__}"
-        )
-    kind = type(model)
-    name, text = getattr(model, "name", None), getattr(model, "description", None)
-    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise InputError(
-            f"{kind.__name__}.name takes lower-case letters, digits and underscores, as in "
-            f'"by_day"; found {name!r}'
-        )
+    check_registered(model, NoiseModel, "a noise model", "by_day")
+    kind, name, text = type(model), model.name, getattr(model, "description", None)
     require(isinstance(text, str) and bool(text), f"{kind.__name__}.description takes a short text")
     require(kind.components is not NoiseModel.components, f"{kind.__name__} lacks components")
     known = REGISTERED.get(name)
-    same = known is not None and (type(known).__module__, type(known).__qualname__) == (
-        kind.__module__, kind.__qualname__,
-    )  # fmt: skip
     require(
-        same or name not in (*STRUCTURES, "auto"),
+        (known is not None and same_class(known, model)) or name not in (*STRUCTURES, "auto"),
         f"there is a noise model '{name}' already; choose another name",
     )
     REGISTERED[name] = model
@@ -423,9 +394,9 @@ PARTITIONS = (
 
 @dataclass(frozen=True)
 class SharedEffect:
-    """A deviation common to all cells of one `unit` (C,): covariance τ² diag(`axes`).
+    """A deviation common to all sets of one `unit` (C,): covariance τ² diag(`axes`).
 
-    Cells are of one unit where they agree in the labels `by`.
+    Sets are of one unit where they agree in the labels `by`.
     """
 
     name: str
@@ -434,11 +405,11 @@ class SharedEffect:
     axes: Array
 
 
-def shared_effects(cells: Cells, size: int, wanted: bool = True) -> tuple[SharedEffect, ...]:
+def shared_effects(sets: RepeatSets, size: int, wanted: bool = True) -> tuple[SharedEffect, ...]:
     """The shared effects that these readings can tell apart.
 
     An arm does not come back to quite the same place: a deviation per configuration; per
-    configuration and load; per configuration and marker; and per cell, common to its repeats.
+    configuration and load; per configuration and marker; and per set, common to its repeats.
     One is left out where it would coincide with another or with the noise of single readings.
     Rotations, in rad, have variances of their own.
     """
@@ -447,10 +418,10 @@ def shared_effects(cells: Cells, size: int, wanted: bool = True) -> tuple[Shared
     kept: dict[tuple[str, ...], IntArray] = {}
     for by in PARTITIONS:
         unit = np.unique(
-            np.column_stack([getattr(cells, label) for label in by]), axis=0, return_inverse=True
+            np.column_stack([getattr(sets, label) for label in by]), axis=0, return_inverse=True
         )[1].ravel()
         # Alone in its unit and not repeated, a reading's own noise covers it.
-        observed = np.bincount(unit, cells.repeats)
+        observed = np.bincount(unit, sets.repeats)
         if (observed < 2).all() or any(np.array_equal(unit, other) for other in kept.values()):
             continue
         kept[by] = unit

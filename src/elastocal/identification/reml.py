@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse, special
 
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.noise_structure import Cells, SharedEffect, Structure
+from elastocal.identification.noise_structure import RepeatSets, SharedEffect, Structure
 from elastocal.units import Array, BoolArray, IntArray
 
-# Clusters of correlated cells, stacked by size so that linear algebra runs on whole stacks.
+# Clusters of correlated sets of repeats, stacked by size: linear algebra runs on whole stacks.
 
 MOST_NUMBERS = 4_000_000  # in a temporary array of a stack
 
@@ -26,7 +26,7 @@ class Stack:
     index 0 and a zero part.
     """
 
-    cells: IntArray  # (G, cells per cluster)
+    sets: IntArray  # (G, sets per cluster)
     B: Array
     e: Array
     index: IntArray
@@ -52,14 +52,14 @@ class Stack:
 
 
 def stacks(structure: Structure, shared: tuple[SharedEffect, ...]) -> list[Stack]:
-    """The clusters of a structure: a configuration where effects are shared, else a cell."""
-    cells = structure.cells
-    label = cells.configuration if shared else np.arange(len(cells))
+    """The clusters of a structure: a configuration where effects are shared, else a set."""
+    sets = structure.sets
+    label = sets.configuration if shared else np.arange(len(sets))
     _, cluster, count = np.unique(label, return_inverse=True, return_counts=True)
     order = np.argsort(cluster, kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)[:-1]])
     found = []
-    size, p = cells.e.shape[1], cells.B.shape[2]
+    size, p = sets.e.shape[1], sets.B.shape[2]
     for m in np.unique(count):
         groups = np.flatnonzero(count == m)
         n, parts = int(m) * size, structure.index.shape[1] * int(m) + len(shared)
@@ -71,9 +71,9 @@ def stacks(structure: Structure, shared: tuple[SharedEffect, ...]) -> list[Stack
 
 
 def _stack(structure: Structure, shared: tuple[SharedEffect, ...], members: IntArray) -> Stack:
-    cells = structure.cells
+    sets = structure.sets
     G, m = members.shape
-    size, p = cells.e.shape[1], cells.B.shape[2]
+    size, p = sets.e.shape[1], sets.B.shape[2]
     index, part = _own(structure, members)
     n_own = len(structure.names)
     for k, effect in enumerate(shared):
@@ -82,15 +82,15 @@ def _stack(structure: Structure, shared: tuple[SharedEffect, ...], members: IntA
         block = same[:, :, None, :, None] * np.diag(effect.axes)[None, None, :, None, :]
         part = np.concatenate([part, block.reshape(G, 1, m * size, m * size)], axis=1)
         index = np.concatenate([index, np.full((G, 1), n_own + k)], axis=1)
-    B = cells.B[members].reshape(G, m * size, p)
-    e = cells.e[members].reshape(G, m * size)
+    B = sets.B[members].reshape(G, m * size, p)
+    e = sets.e[members].reshape(G, m * size)
     return Stack(members, B, e, index, part, n_own + len(shared))
 
 
 def _own(structure: Structure, members: IntArray) -> tuple[IntArray, Array]:
     """Own variances of each cluster, each once: index (G, L) and part (G, L, n, n)."""
     G, m = members.shape
-    size = structure.cells.e.shape[1]
+    size = structure.sets.e.shape[1]
     index = structure.index[members].reshape(G, -1)  # (G, m * L)
     if (index.reshape(G, m, -1) == index.reshape(G, m, -1)[:, :1]).all():
         place = np.tile(np.arange(index.shape[1] // m), m)[None].repeat(G, axis=0)
@@ -102,9 +102,9 @@ def _own(structure: Structure, members: IntArray) -> tuple[IntArray, Array]:
     part = np.zeros((G, L, m, size, m, size))
     place = place.reshape(G, m, -1)
     g = np.arange(G)
-    for cell in range(m):
+    for k in range(m):
         for j in range(place.shape[2]):
-            part[g, place[:, cell, j], cell, :, cell, :] += blocks[:, cell, j]
+            part[g, place[:, k, j], k, :, k, :] += blocks[:, k, j]
     return distinct, part.reshape(G, L, m * size, m * size)
 
 
@@ -123,7 +123,7 @@ def _distinct(index: IntArray) -> tuple[IntArray, IntArray]:
 #     −2 ℓ_R = log|V| + log|BᵀV⁻¹B| + eᵀPe + (rows − p) log 2π,   P = V⁻¹ − V⁻¹BΦBᵀV⁻¹
 #     ∂ℓ/∂θ_k = ½ (eᵀP V_k P e − tr P V_k),   E[−∂²ℓ/∂θ_k∂θ_l] = ½ tr(P V_k P V_l)
 #
-# with Φ = (BᵀV⁻¹B)⁻¹.  Repeats enter as cell means, and their scatter as Wishart terms.
+# with Φ = (BᵀV⁻¹B)⁻¹.  Repeats enter as their means, and their scatter as Wishart terms.
 
 LEAST_TOLD = 1e-9  # of the information on θ_k that there would be if Δx were known
 
@@ -149,7 +149,7 @@ class State:
     Phi: Array
     log_likelihood: float
     whitened: list[Whitened]
-    inner: Array  # (repeated cells, size, size): inverse covariance of a single reading
+    inner: Array  # (sets with repeats, size, size): inverse covariance of a single reading
 
 
 @dataclass(frozen=True)
@@ -172,8 +172,8 @@ def evaluate(structure: Structure, stacked: list[Stack], theta: Array) -> State:
 
     InsufficientDataError where B has dependent columns.
     """
-    cells = structure.cells
-    p, size = cells.B.shape[2], cells.e.shape[1]
+    sets = structure.sets
+    p, size = sets.B.shape[2], sets.e.shape[1]
     whitened = [_whiten(stack, theta) for stack in stacked]
     normal = sum((np.tensordot(w.B, w.B, ((0, 1), (0, 1))) for w in whitened), np.zeros((p, p)))
     right = sum((np.tensordot(w.B, w.e, ((0, 1), (0, 1))) for w in whitened), np.zeros(p))
@@ -186,15 +186,15 @@ def evaluate(structure: Structure, stacked: list[Stack], theta: Array) -> State:
     x = linalg.cho_solve((factor, True), right)
     Phi = linalg.cho_solve((factor, True), np.eye(p))
     squares = sum(float(w.e.ravel() @ w.e.ravel()) for w in whitened) - float(right @ x)
-    repeated = cells.dof > 0
+    repeated = sets.dof > 0
     single = np.einsum("cl,clij->cij", theta[structure.index[repeated]], structure.matrix[repeated])
     inner = np.linalg.inv(single)
     log_det = np.linalg.slogdet(single)[1]
-    within = float(cells.dof[repeated] @ log_det) + float(np.vdot(inner, cells.scatter[repeated]))
-    rows = int(cells.repeats.sum()) * size
+    within = float(sets.dof[repeated] @ log_det) + float(np.vdot(inner, sets.scatter[repeated]))
+    rows = int(sets.repeats.sum()) * size
     total = (
         sum(w.log_det for w in whitened) + 2 * float(np.log(np.diag(factor)).sum()) + squares
-        + within + cells.log_offset + (rows - p) * np.log(2 * np.pi)
+        + within + sets.log_offset + (rows - p) * np.log(2 * np.pi)
     )  # fmt: skip
     return State(theta, x, Phi, -0.5 * total, whitened, inner)
 
@@ -240,15 +240,15 @@ def slope(structure: Structure, state: State) -> Slope:
 def _within(
     structure: Structure, state: State, score: Array, information: Array, observed: Array
 ) -> None:
-    """Add what the scatter of repeats says: Wishart terms of each cell."""
-    cells, K = structure.cells, len(score)
-    repeated = np.flatnonzero(cells.dof > 0)
+    """Add what the scatter of repeats says: Wishart terms of each set."""
+    sets, K = structure.sets, len(score)
+    repeated = np.flatnonzero(sets.dof > 0)
     if not len(repeated):
         return
-    dof, index = cells.dof[repeated], structure.index[repeated]
+    dof, index = sets.dof[repeated], structure.index[repeated]
     n, L = index.shape
     S = state.inner[:, None] @ structure.matrix[repeated]  # (C, L, size, size)
-    W = state.inner @ cells.scatter[repeated]
+    W = state.inner @ sets.scatter[repeated]
     flat = S.reshape(n, L, -1)
     other = S.transpose(0, 1, 3, 2).reshape(n, L, -1)
     squares = (flat @ W.transpose(0, 2, 1).reshape(n, -1, 1))[..., 0]
@@ -339,42 +339,38 @@ def reml(
     Own variances are stepped in log θ, shared ones in θ, each with a bound (zero for shared ones,
     next to nothing for own ones): one that the likelihood pushes below it stays there.
     """
-    stacked = stacks(structure, shared)
-    own = len(structure.names)
     theta = usual_start(structure, shared) if start is None else start.copy()
-    bound = np.zeros(len(theta))
-    bound[:own] = SMALLEST * float(theta[:own].max())
-    state = evaluate(structure, stacked, theta)
+    search = _VarianceSearch(structure, stacks(structure, shared), prior, theta)
+    own, bound = search.own, search.bound
+    state = search.state(theta)
     at = slope(structure, state)
     if not at.told[own:].all():  # shared, and the parameters could explain all of it
         theta[own:] *= at.told[own:]
-        state = evaluate(structure, stacked, theta)
+        state = search.state(theta)
         at = slope(structure, state)
-    value, converged, last = _objective(state, prior, own), False, np.inf
+    value, converged, last = search.value(state), False, np.inf
     for _ in range(STEPS):
-        score, step = _step(at, state.theta, prior, own, bound)
+        score, step = search.step(at, state.theta)
         gain = float(score @ step)
         if gain < DECREMENT or VISIBLE > gain >= last:
             converged = True
             break
         if gain < VISIBLE:
-            state, last = evaluate(structure, stacked, _moved(state.theta, step, own, bound)), gain
+            state, last = search.state(search.moved(state.theta, step)), gain
         else:
-            moved = _vanished(structure, stacked, state, value, gain, step, prior, own, bound)
-            if moved is None:
-                moved = _line_search(structure, stacked, state, value, step, prior, own, bound)
-            if moved is None:
+            found = search.vanished(state, value, gain, step) or search.along(state, value, step)
+            if found is None:
                 converged = gain < 1e-4  # as good as rounding allows
                 break
-            state, value = moved
+            state, value = found
         at = slope(structure, state)
-    _, H, chain = _working(at, state.theta, prior, own)
+    _, H, chain = search.working(at, state.theta)
     covariance = np.zeros_like(H)
-    kept = np.flatnonzero((state.theta > bound) & at.told)
+    free = np.flatnonzero((state.theta > bound) & at.told)
     # A variance at its bound is taken for zero, not for uncertain (the convention of mixed-model
     # software): counting it widens intervals that are wide enough already.
-    if kept.size:
-        covariance[np.ix_(kept, kept)] = _inverse(H[np.ix_(kept, kept)])
+    if free.size:
+        covariance[np.ix_(free, free)] = _inverse(H[np.ix_(free, free)])
     covariance = chain[:, None] * covariance * chain
     likelihood = state.log_likelihood
     if prior is not None:
@@ -383,43 +379,93 @@ def reml(
     return Reml(structure, shared, state, at, covariance, likelihood, converged)
 
 
-def _objective(state: State, prior: LogPrior | None, own: int) -> float:
-    return state.log_likelihood + (0.0 if prior is None else prior.value(state.theta[:own]))
+class _VarianceSearch:
+    """The objective, its derivatives and the steps that raise it; from θ = `start` (K,)."""
 
+    def __init__(
+        self, structure: Structure, stacked: list[Stack], prior: LogPrior | None, start: Array
+    ) -> None:
+        self.structure, self.stacked, self.prior = structure, stacked, prior
+        self.own = own = len(structure.names)
+        self.bound = np.zeros(len(start))
+        self.bound[:own] = SMALLEST * float(start[:own].max())
 
-def _working(
-    at: Slope, theta: Array, prior: LogPrior | None, own: int
-) -> tuple[Array, Array, Array]:
-    """Score and expected information in the stepping variables, and dθ/d(variable)."""
-    chain = np.ones(len(theta))
-    chain[:own] = theta[:own]
-    score, H = chain * at.score, chain[:, None] * at.information * chain
-    if prior is not None:
-        score[:own] -= prior.precision @ (np.log(theta[:own]) - prior.mean)
-        H[:own, :own] += prior.precision
-    return score, H, chain
+    def state(self, theta: Array) -> State:
+        return evaluate(self.structure, self.stacked, theta)
 
+    def value(self, state: State) -> float:
+        own = state.theta[: self.own]
+        return state.log_likelihood + (0.0 if self.prior is None else self.prior.value(own))
 
-def _step(
-    at: Slope, theta: Array, prior: LogPrior | None, own: int, bound: Array
-) -> tuple[Array, Array]:
-    """Score and step in the stepping variables.
+    def working(self, at: Slope, theta: Array) -> tuple[Array, Array, Array]:
+        """Score and expected information in the stepping variables, and dθ/d(variable)."""
+        own, prior = self.own, self.prior
+        chain = np.ones(len(theta))
+        chain[:own] = theta[:own]
+        score, H = chain * at.score, chain[:, None] * at.information * chain
+        if prior is not None:
+            score[:own] -= prior.precision @ (np.log(theta[:own]) - prior.mean)
+            H[:own, :own] += prior.precision
+        return score, H, chain
 
-    Newton's step where the objective is concave, else Fisher's.
-    """
-    score, expected, chain = _working(at, theta, prior, own)
-    free = ((theta > bound) | (score > 0)) & at.told
-    curvature = chain[:, None] * (at.observed - at.information) * chain
-    curvature[np.arange(own), np.arange(own)] -= (chain * at.score)[:own]
-    step = np.zeros(len(theta))
-    if not free.any():
+    def step(self, at: Slope, theta: Array) -> tuple[Array, Array]:
+        """Score and step in the stepping variables.
+
+        Newton's step where the objective is concave, else Fisher's.
+        """
+        score, expected, chain = self.working(at, theta)
+        free = ((theta > self.bound) | (score > 0)) & at.told
+        curvature = chain[:, None] * (at.observed - at.information) * chain
+        i = np.arange(self.own)
+        curvature[i, i] -= (chain * at.score)[: self.own]
+        step = np.zeros(len(theta))
+        if not free.any():
+            return score, step
+        inside = np.ix_(free, free)
+        try:
+            step[free] = _solve((expected + curvature)[inside], score[free])
+        except np.linalg.LinAlgError:
+            step[free] = _solve(expected[inside], score[free])
         return score, step
-    inside = np.ix_(free, free)
-    try:
-        step[free] = _solve((expected + curvature)[inside], score[free])
-    except np.linalg.LinAlgError:
-        step[free] = _solve(expected[inside], score[free])
-    return score, step
+
+    def moved(self, theta: Array, step: Array) -> Array:
+        """θ after a step, own variances in their logarithm, none below its bound."""
+        moved = theta + step
+        moved[: self.own] = theta[: self.own] * np.exp(step[: self.own])
+        return np.maximum(moved, self.bound)
+
+    def better(self, theta: Array, value: float) -> tuple[State, float] | None:
+        """State and objective at θ; None where that is not above `value`, or there is none."""
+        try:
+            trial = self.state(theta)
+        except np.linalg.LinAlgError:
+            return None
+        found = self.value(trial)
+        return (trial, found) if found > value else None
+
+    def vanished(
+        self, state: State, value: float, gain: float, step: Array
+    ) -> tuple[State, float] | None:
+        """The step that takes variances on their way to zero to their bound; None where there are
+        none or that costs."""
+        falling = np.zeros(len(step), dtype=bool)
+        falling[: self.own] = np.abs(step[: self.own] + 1.0) < 0.1
+        if gain > LITTLE or not falling.any():
+            return None
+        theta = self.moved(state.theta, step)
+        theta[falling] = self.bound[falling]
+        return self.better(theta, value)
+
+    def along(self, state: State, value: float, step: Array) -> tuple[State, float] | None:
+        """The first of ever shorter steps that raises the objective; None where none does."""
+        largest = float(np.abs(step[: self.own]).max(initial=0.0))
+        length = min(1.0, 2.0 / largest) if largest > 0 else 1.0
+        for _ in range(30):
+            found = self.better(self.moved(state.theta, length * step), value)
+            if found is not None:
+                return found
+            length /= 2
+        return None
 
 
 def _solve(H: Array, score: Array) -> Array:
@@ -445,78 +491,18 @@ def _inverse(H: Array) -> Array:
     return np.asarray(inverse / np.outer(scale, scale))
 
 
-def _moved(theta: Array, step: Array, own: int, bound: Array) -> Array:
-    """θ after a step, own variances in their logarithm, none below its bound."""
-    moved = theta + step
-    moved[:own] = theta[:own] * np.exp(step[:own])
-    return np.maximum(moved, bound)
-
-
-def _vanished(
-    structure: Structure,
-    stacked: list[Stack],
-    state: State,
-    value: float,
-    gain: float,
-    step: Array,
-    prior: LogPrior | None,
-    own: int,
-    bound: Array,
-) -> tuple[State, float] | None:
-    """The step that takes variances on their way to zero to their bound; None where there are
-    none or that costs."""
-    falling = np.zeros(len(step), dtype=bool)
-    falling[:own] = np.abs(step[:own] + 1.0) < 0.1
-    if gain > LITTLE or not falling.any():
-        return None
-    theta = _moved(state.theta, step, own, bound)
-    theta[falling] = bound[falling]
-    try:
-        trial = evaluate(structure, stacked, theta)
-    except np.linalg.LinAlgError:
-        return None
-    found = _objective(trial, prior, own)
-    return (trial, found) if found > value else None
-
-
-def _line_search(
-    structure: Structure,
-    stacked: list[Stack],
-    state: State,
-    value: float,
-    step: Array,
-    prior: LogPrior | None,
-    own: int,
-    bound: Array,
-) -> tuple[State, float] | None:
-    """The first of ever shorter steps that raises the objective; None where none does."""
-    largest = float(np.abs(step[:own]).max(initial=0.0))
-    length = min(1.0, 2.0 / largest) if largest > 0 else 1.0
-    for _ in range(30):
-        try:
-            trial = evaluate(structure, stacked, _moved(state.theta, length * step, own, bound))
-        except np.linalg.LinAlgError:
-            length /= 2
-            continue
-        found = _objective(trial, prior, own)
-        if found > value:
-            return trial, found
-        length /= 2
-    return None
-
-
 def usual_start(structure: Structure, shared: tuple[SharedEffect, ...]) -> Array:
     """Own variances from the scatter of repeats where there is any, else from all residuals."""
-    cells = structure.cells
-    size = cells.e.shape[1]
+    sets = structure.sets
+    size = sets.e.shape[1]
     # Variance of one reading that θ = 1 would give: 1, but for noise that is stated.
-    unit = np.trace(structure.mean_matrix.sum(axis=1), axis1=1, axis2=2) * cells.repeats / size
-    own = float(np.median((cells.e**2).mean(axis=1) * cells.repeats / unit))
-    if cells.dof.sum() > 0:
-        squares = float(np.trace(cells.scatter, axis1=1, axis2=2).sum())
-        own = max(squares / (float(cells.dof.sum()) * size), 1e-9 * own)
+    unit = np.trace(structure.mean_matrix.sum(axis=1), axis1=1, axis2=2) * sets.repeats / size
+    own = float(np.median((sets.e**2).mean(axis=1) * sets.repeats / unit))
+    if sets.dof.sum() > 0:
+        squares = float(np.trace(sets.scatter, axis1=1, axis2=2).sum())
+        own = max(squares / (float(sets.dof.sum()) * size), 1e-9 * own)
     # Shared effects start above zero, from where they are free to go there.
-    share = max(0.1 * float((cells.e**2).mean()), TINY)
+    share = max(0.1 * float((sets.e**2).mean()), TINY)
     return np.concatenate(
         [np.full(len(structure.names), max(own, TINY)), np.full(len(shared), share)]
     )
@@ -580,16 +566,16 @@ NARROWEST = 1e-3  # variance of log θ: equal to within 3 %
 
 
 def prior_of_groups(structure: Structure, residual: Array) -> LogPrior:
-    """Prior of the group variances from the scatter of a group's cells about their own mean.
+    """Prior of the group variances from the scatter of a group's sets about their own mean.
 
-    `residual` (C, size): cell means less a fit.  What all cells of a group share, an effect of
+    `residual` (C, size): means less a fit.  What all sets of a group share, an effect of
     its configuration, is taken out with the mean.  Raises InsufficientDataError where the groups
     hold too few readings.
     """
-    cells = structure.cells
+    sets = structure.sets
     size = residual.shape[1]
     K = len(structure.names)
-    s2, f = _sample_variances(cells, structure.index, residual, K)
+    s2, f = _sample_variances(sets, structure.index, residual, K)
     if np.median(f) < FEWEST or 3 * size > K:
         raise InsufficientDataError(
             "the groups of a configuration and a direction hold too few readings for variances of "
@@ -616,13 +602,13 @@ def prior_of_groups(structure: Structure, residual: Array) -> LogPrior:
 
 
 def _sample_variances(
-    cells: Cells, index: NDArray[np.int64], residual: Array, K: int
+    sets: RepeatSets, index: NDArray[np.int64], residual: Array, K: int
 ) -> tuple[Array, Array]:
     """Variance of a single reading within each group (K,), and its degrees of freedom (K,)."""
-    weight = np.repeat(cells.repeats[:, None], residual.shape[1], axis=1).ravel()
+    weight = np.repeat(sets.repeats[:, None], residual.shape[1], axis=1).ravel()
     group, e = index.ravel(), residual.ravel()
     mean = np.bincount(group, weight * e, K) / np.bincount(group, weight, K)
     squares = np.bincount(group, weight * (e - mean[group]) ** 2, K)
-    squares += np.bincount(group, np.diagonal(cells.scatter, axis1=1, axis2=2).ravel(), K)
+    squares += np.bincount(group, np.diagonal(sets.scatter, axis1=1, axis2=2).ravel(), K)
     dof = np.bincount(group, weight, K) - 1.0
     return squares / np.maximum(dof, 1.0), np.maximum(dof, 0.5)

@@ -50,7 +50,7 @@ def held_out_by_parts(
 ) -> Array:
     """Residual (rows,) of every configuration, the model linearised at x fitted to the others.
 
-    `triangle` is that of the whitened B of `columns` and residual at x, `step` (columns,) the
+    `r_factor` is that of the whitened B of `columns` and residual at x, `step` (columns,) the
     Gauss–Newton step to the linear model's minimum, zero where x is it.
     """
     held = np.empty(len(parts.observed.value))
@@ -389,7 +389,7 @@ def summarise_residuals(
     *,
     absolute: bool = True,
 ) -> ResidualSummary | None:
-    """Histograms, normal scores and tests of the whitened residuals (rows,) of `seen`.
+    """Histograms, normal scores and tests of the whitened residuals (rows,) of `observed`.
 
     `leverage` (rows,) is diag H of the whitened B, by default zero; `held_out` (rows,) the
     whitened residuals of fits to the other configurations, infinite where there is none.

@@ -33,7 +33,7 @@ from elastocal.model.function_cache import (
     store,
 )
 
-# The C text of a tape: CasADi's generated code for one row, and a driver that loops over rows.
+# The C text of a function: CasADi's generated code for one row, and a loop over rows.
 #
 # CasADi writes one function of thousands of statements on one work array.  Compilers need time that
 # grows faster than a function's length, so its statements are cut into functions; they
@@ -49,7 +49,7 @@ from elastocal.model.function_cache import (
 # on another processor, beside CasADi's code compiled whole at -O3: 200 × 8 0.7 s and 1.24 times its
 # time, 1000 × 4 0.8 s and 1.17, 2000 × 4 0.9 s and 1.10.
 PIECE, LONG_PIECE = 200, 2000
-SHORT = 5000  # statements of a tape that is cut into long pieces
+SHORT = 5000  # statements of a function that is cut into long pieces
 ROWS = 4
 
 _READ = re.compile(r"arg\[(\d+)\]\? arg\[\d+\]\[(\d+)\] : 0")
@@ -57,7 +57,7 @@ _STORE = re.compile(r"if \(res\[(\d+)\]!=0\) res\[\d+\]\[(\d+)\]=")
 _STATEMENT = re.compile(r"  (?:w\[\d+\]|out\[\d+\]\[\d+\])=[^;]*;")
 _BODY = re.compile(r"static int casadi_f0\([^)]*\) \{\n(.*?)  return 0;\n\}\n", re.DOTALL)
 
-_DRIVER = """
+_LOOP = """
 CASADI_SYMBOL_EXPORT long long elastocal_work(void) {{ return {work}; }}
 
 CASADI_SYMBOL_EXPORT void elastocal_rows(long long first, long long last,
@@ -117,7 +117,7 @@ def c_source(function: ca.Function) -> str:
     parts = [_PIECE.format(k=k, statements="\n".join(p)) for k, p in enumerate(pieces)]
     calls = "\n".join(_CALL.format(k=k, registers=registers) for k in range(len(pieces)))
     sizes = ", ".join(str(function.numel_out(k)) for k in range(function.n_out()))
-    driver = _DRIVER.format(
+    loop = _LOOP.format(
         sizes=sizes or "0",
         rows=ROWS,
         n_in=max(function.n_in(), 1),
@@ -125,14 +125,14 @@ def c_source(function: ca.Function) -> str:
         calls=calls,
         work=ROWS * max(registers, 1),
     )
-    return "".join([helpers, *parts, driver])
+    return "".join([helpers, *parts, loop])
 
 
 # The system's C compiler: finding it, what it is, and one library from one C text.
 
 # -O2 and no more: with the pieces of `compiled_source`, -march=native gains 8 % and binds a library
 # to one processor; -O3 gains nothing.  No contraction to fused operations and no -ffast-math, so
-# that results are the replay's but for the last digits of the mathematical functions.
+# that results are numpy's but for the last digits of the mathematical functions.
 FLAGS = ("-O2", "-shared", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-w")
 LIBRARIES = ("-lm",)
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
@@ -201,7 +201,7 @@ def compile_library(compiler: Compiler, source: str) -> bytes:
     Raises NoCompiler with the compiler's first complaint where it fails.
     """
     with tempfile.TemporaryDirectory(prefix="elastocal-") as folder:
-        text, library = Path(folder, "tape.c"), Path(folder, f"tape{SUFFIX}")
+        text, library = Path(folder, "rows.c"), Path(folder, f"rows{SUFFIX}")
         text.write_text(source)
         command = [*compiler.command, *FLAGS, text.name, "-o", library.name, *LIBRARIES]
         try:
@@ -217,7 +217,7 @@ def compile_library(compiler: Compiler, source: str) -> bytes:
     raise NoCompiler(f"{compiler.command[0]} failed with exit code {done.returncode}: {complaint}")
 
 
-# A tape as compiled C: its library found in the cache or compiled, loaded, and called on rows.
+# A function as compiled C: its library found in the cache or compiled, loaded, and called on rows.
 
 
 class Compiled:
@@ -293,7 +293,7 @@ def compile_function(function: HashedFunction) -> Compiled:
         return _loaded(library, compiler, cached=False)
     # Without a cache the file is needed only until it is loaded, where the system allows that.
     with tempfile.TemporaryDirectory(prefix="elastocal-", ignore_cleanup_errors=True) as folder:
-        library = Path(folder, f"tape-{secrets.token_hex(8)}{SUFFIX}")
+        library = Path(folder, f"rows-{secrets.token_hex(8)}{SUFFIX}")
         library.write_bytes(data)
         return _loaded(library, compiler, cached=False)
 

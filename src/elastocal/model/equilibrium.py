@@ -15,7 +15,7 @@ MAX_STEPS = 30
 LARGEST = 0.5  # rad or m
 # F_θ written out whole takes about half of F's instructions for every spring.  Beyond this many,
 # one derivative along a direction is evaluated in every direction first: with 56 springs and the
-# whole catalogue 15 000 instructions instead of 174 000, which are made and replayed on a small
+# whole catalogue 15 000 instructions instead of 174 000, which are made and evaluated on a small
 # table in a fraction of the time.  A row takes twice as long, so that after ROWS_THAT_PAY rows
 # F_θ is written out after all; counted and not timed, so that nothing depends on the clock.
 LARGEST_JACOBIAN = 60_000

@@ -69,20 +69,20 @@ def run_blocks(
             future.result()
 
 
-# Which engine evaluates a tape: numpy's replay or compiled C, asked for and reported.
+# Which engine evaluates a function: numpy or compiled C, asked for and reported.
 #
-# "auto" rents before it buys: a tape is replayed until replaying it has cost about as much more
+# "auto" rents before it buys: numpy evaluates until that has cost about as much more
 # than compiled code as compiling costs, and compiled then.  What has been compiled before is used
-# as soon as replaying has cost more than looking for it.  Both are counted in calls and rows and
+# as soon as numpy has cost more than looking for it.  Both are counted in calls and rows and
 # never timed, so that the same work with the same cache is evaluated by the same engine.
 
 BACKENDS = ("auto", "numpy", "compiled")
 VARIABLE = "ELASTOCAL_BACKEND"
 
-# Seconds, on one core of a 2023 server.  Replay costs a numpy call per instruction and block and
+# Seconds, on one core of a 2023 server.  Numpy costs a call per instruction and block and
 # is then bound by the second-level cache; compiled code keeps most operands in registers.
-REPLAY_CALL = 0.3e-6  # per instruction and block
-REPLAY_ROW = 0.15e-9  # per instruction and row, above compiled code
+NUMPY_CALL = 0.3e-6  # per instruction and block
+NUMPY_ROW = 0.15e-9  # per instruction and row, above compiled code
 COMPILE_START, COMPILE_INSTRUCTION = 0.2, 1.2e-4  # one run of the compiler
 LOOKUP_START, LOOKUP_INSTRUCTION = 0.02, 1e-6  # hash, verify and load a library
 
@@ -100,7 +100,7 @@ def checked(name: str, source: str) -> str:
 
 
 def set_default_backend(name: str | None) -> None:
-    """What tapes use that were not told otherwise; None: ELASTOCAL_BACKEND, else "auto".
+    """What functions use that were not told otherwise; None: ELASTOCAL_BACKEND, else "auto".
 
     Raises InputError for an unknown name.
     """
@@ -122,14 +122,14 @@ def chosen_backend(name: str | None = None) -> str:
 
 @dataclass
 class Work:
-    """Seconds that replaying a tape of `instructions` has cost above compiled code, estimated."""
+    """Seconds that numpy has cost above compiled code of `instructions`, estimated."""
 
     instructions: int
     wasted: float = 0.0
 
     def add(self, rows: int, blocks: int) -> None:
         """One more call of `rows` rows in `blocks` blocks."""
-        self.wasted += self.instructions * (REPLAY_CALL * blocks + REPLAY_ROW * rows)
+        self.wasted += self.instructions * (NUMPY_CALL * blocks + NUMPY_ROW * rows)
 
     @property
     def pays_to_look(self) -> bool:
@@ -144,7 +144,7 @@ class Work:
 
 @dataclass(frozen=True)
 class BackendReport:
-    """What evaluated a tape last.
+    """What evaluated a function last.
 
     `backend` "numpy" or "compiled" ("none" before the first call), `compiler` its path and version
     where compiled, `threads` used, `cached` True where the library was found and
@@ -166,7 +166,7 @@ class BackendReport:
 
 
 def summary(reports: Iterable[BackendReport]) -> str:
-    """One line for a report: every engine that was used, and by how many of the tapes."""
+    """One line for a report: every engine that was used, and by how many of the functions."""
     groups: dict[tuple[str, str | None, str], list[BackendReport]] = {}
     for report in reports:
         if report.backend != "none":
@@ -193,17 +193,17 @@ WORK_OF_A_THREAD = 3_000_000  # instructions × rows
 class BatchFunction:
     """An `SX` expression list, evaluated row by row on arrays.
 
-    `inputs` and `outputs` are lists of SX vectors / matrices.  Calling the tape takes one array
+    `inputs` and `outputs` are lists of SX vectors / matrices.  Calling it takes one array
     per input: (n, size) for a quantity that varies by row, (size,) for one that is the same in
     every row; it returns one array (n, rows, columns) per output, float64, or complex where an
     input is.  `backend` is "auto", "numpy" or "compiled"; None follows `set_default_backend`.
-    Complex numbers are always replayed.
+    Complex numbers are always evaluated by numpy.
 
-    `whole`, where given, is a tape of the same inputs and outputs whose last output has more
+    `wider`, where given, is a function of the same inputs and outputs whose last output has more
     columns, and `columns` says which of them this one's are: where its instructions are known
     already, they serve here too.
 
-    A call raises NotImplementedError where it replays an operation that numpy lacks, ValueError
+    A call raises NotImplementedError for an operation that numpy lacks, ValueError
     for arrays of other shapes, InputError where `backend` is "compiled" and nothing can compile.
     """
 
@@ -212,7 +212,7 @@ class BatchFunction:
         inputs: Sequence[ca.SX],
         outputs: Sequence[ca.SX],
         backend: str | None = None,
-        whole: BatchFunction | None = None,
+        wider: BatchFunction | None = None,
         columns: Sequence[int] = (),
     ) -> None:
         self._asked = None if backend is None else checked(backend, "backend")
@@ -221,14 +221,14 @@ class BatchFunction:
         self._sizes = self._function.sizes
         self.n_instructions = self._function.n_instructions
         self._forget()
-        self._whole, self._columns = whole, tuple(columns)
+        self._wider, self._columns = wider, tuple(columns)
 
-    _whole: BatchFunction | None
+    _wider: BatchFunction | None
     _columns: tuple[int, ...]
 
     def _forget(self) -> None:
         self._lock = threading.Lock()
-        self._whole, self._columns = None, ()
+        self._wider, self._columns = None, ()
         self._work = Work(self.n_instructions)
         self._compiled: Compiled | None = None
         self._looked = False
@@ -245,8 +245,8 @@ class BatchFunction:
         self._forget()
 
     @cached_property
-    def _replay(self) -> NumpyFunction:
-        known = None if self._whole is None else self._whole.__dict__.get("_replay")
+    def _by_numpy(self) -> NumpyFunction:
+        known = None if self._wider is None else self._wider.__dict__.get("_by_numpy")
         return NumpyFunction(self._function, known, self._columns)
 
     @property
@@ -280,13 +280,13 @@ class BatchFunction:
         per_row, common = [(n, size) for size in self._sizes], [(size,) for size in self._sizes]
         fit = [s in pair for s, *pair in zip(shapes, per_row, common, strict=False)]
         if len(shapes) != len(self._sizes) or not all(fit):
-            raise ValueError(f"inputs of shapes {shapes}; this tape takes {self._sizes} per row")
+            raise ValueError(f"inputs of shapes {shapes}; it takes {self._sizes} per row")
         return arrays, n
 
     def _engine(self, dtype: np.dtype, rows: int, blocks: int) -> NumpyFunction | Compiled:
         backend = chosen_backend(self._asked)
         if backend == "numpy" or dtype != np.float64:
-            return self._replay
+            return self._by_numpy
         with self._lock:
             if self._compiled is None and backend == "compiled":
                 try:
@@ -295,10 +295,10 @@ class BatchFunction:
                     raise InputError(f"backend compiled: {error}; {HOW_TO_GET_ONE}") from None
             if self._compiled is None and not self._refused:
                 self._compiled = self._where_it_pays(rows, blocks)
-            return self._compiled or self._replay
+            return self._compiled or self._by_numpy
 
     def _where_it_pays(self, rows: int, blocks: int) -> Compiled | None:
-        """Compiled code under "auto", this call counted; None where replaying is still cheaper."""
+        """Compiled code under "auto", this call counted; None where numpy is still cheaper."""
         self._work.add(rows, blocks)
         try:
             if self._work.pays_to_compile:

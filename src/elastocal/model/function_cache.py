@@ -17,7 +17,7 @@ import casadi as ca
 from elastocal.errors import InputError
 from elastocal.files import UNFINISHED, atomic_write_bytes
 
-# A tape's CasADi function: as given, by content, and without repeated subexpressions.
+# A function of a table's rows: as given, by content, and without repeated subexpressions.
 
 # Finding common subexpressions takes 7 µs per instruction.  It saves 2 to 14 % of the instructions
 # of B and 1 % of a Jacobian of 170 000, where it would take longer than all the rest.
@@ -80,7 +80,7 @@ def row_by_row(sparsity: ca.Sparsity) -> list[int]:
 # The user's cache folder: entries under a content key that are whole or not there.
 #
 # An entry is one file `KEY.SHA256.SUFFIX`.  Its name holds the digest of its bytes, so a damaged or
-# truncated file is seen before it is used, and it appears by one rename, so that of two processes
+# truncated file is noticed before it is used; it appears by one rename, so that of two processes
 # writing the same entry each reads a whole one.  No cache is no error: everything in it can be
 # made again.
 

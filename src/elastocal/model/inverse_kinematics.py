@@ -118,11 +118,11 @@ class Reaching(BoundedSearch):
             turned = np.broadcast_to(rotation, (len(self.goal), 3, 3))
             by_column = turned.transpose(0, 2, 1).reshape(len(self.goal), 9)
             self.goal = np.hstack([self.goal, scale * by_column])
-        self._tape = BatchFunction([q], [value, ca.jacobian(value, q)])
+        self._evaluate = BatchFunction([q], [value, ca.jacobian(value, q)])
 
     def residual(self, q: Array, target: IntArray) -> tuple[Array, Array]:
         """r (R, m) and J (R, m, n) of postures q (R, n) for the targets (R,)."""
-        value, J = self._tape(q)
+        value, J = self._evaluate(q)
         return value[..., 0] - self.goal[target], J
 
     @property
@@ -169,7 +169,7 @@ def _in_null_space(J: Array, v: Array) -> Array:
     return np.asarray(v - (np.linalg.pinv(J, rcond=1e-6) @ (J @ v[..., None]))[..., 0])
 
 
-# Inverse kinematics: joints that bring a point of the flange where it shall be.
+# Inverse kinematics: joints that bring a point of the flange to its target.
 #
 # From many starts over the joint ranges (scrambled Sobol points) to the minima of the error; all
 # targets and starts are one batch, with derivatives from CasADi.

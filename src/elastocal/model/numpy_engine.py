@@ -46,10 +46,10 @@ def _not(x: Any, out: Any = None) -> Any:
 
 
 def _as_number(compare: Callable) -> Callable:
-    def replay(a: Any, b: Any, out: Any = None) -> Any:
+    def evaluate(a: Any, b: Any, out: Any = None) -> Any:
         return np.multiply(compare(a, b), 1.0, out=out)
 
-    return replay
+    return evaluate
 
 
 UNARY: dict[int, Any] = {
@@ -78,7 +78,7 @@ ON_NUMBERS: dict[Any, Any] = {
 }  # fmt: skip
 
 
-# CasADi's instructions of a tape as arrays, kept in the cache where asking for them takes long.
+# CasADi's instructions of a function as arrays, kept in the cache where asking for them takes long.
 
 CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
 SUFFIX = ".tape.npz"
@@ -88,7 +88,7 @@ SMALLEST_CACHED = 4000
 
 
 def instructions(function: HashedFunction) -> tuple[NDArray[np.int32], NDArray, int]:
-    """Instructions (m, 5), constants (c,) and number of registers of a tape; cached when long.
+    """Instructions (m, 5), constants (c,) and number of registers of a function; cached when long.
 
     An instruction is kind, operation or constant's index, register, first and second operand;
     of READ the operands are input and component, of WRITE output and place row by row.
@@ -173,12 +173,10 @@ def _steps(f: ca.Function, constants: list[float]) -> Iterator[tuple[int, int, i
             source, component = f.instruction_input(k)
             yield READ, 0, f.instruction_output(k)[0], source, component
         else:
-            raise NotImplementedError(
-                f"CasADi operation {code} has no numpy counterpart in the tape"
-            )
+            raise NotImplementedError(f"CasADi operation {code} has no numpy counterpart")
 
 
-# In which order a tape's instructions are replayed, and where their operands stand.
+# In which order instructions are carried out, and where their operands stand.
 
 
 @dataclass(frozen=True)
@@ -208,7 +206,7 @@ class Steps:
 
 
 class EvaluationOrder:
-    """What a tape does where the inputs `by_row` vary by row and the others do not.
+    """What is done where the inputs `by_row` vary by row and the others do not.
 
     Slots hold, in this order: components of the inputs, components of the outputs, every value
     that is the same in all rows, and `n_registers` registers.  `constants` are the slots of
@@ -299,15 +297,15 @@ def _placed(steps: Steps, home: dict[int, int], unplaced: int, first: int) -> tu
     return placed, count
 
 
-# A tape replayed on numpy arrays, one numpy call per instruction and block of rows.
+# Instructions carried out on numpy arrays, one call per instruction and block of rows.
 #
-# A CasADi `SX` function is a list of scalar instructions.  Replaying each instruction once on an
+# A CasADi `SX` function is a list of scalar instructions.  Carrying out each once on an
 # array of all poses costs one numpy call per instruction and block instead of one CasADi call per
-# pose, and the same replay runs on complex arrays, which complex-step checks use.
+# pose, and the same runs on complex arrays, which complex-step checks use.
 
 
 class NumpyFunction:
-    """A tape's instructions, and `evaluate`, which replays them on whole blocks of rows.
+    """Instructions, and `evaluate`, which carries them out on whole blocks of rows.
 
     `n_registers` is the most that any plan needs.  Raises NotImplementedError for a CasADi
     operation that numpy has no counterpart for.
@@ -316,18 +314,18 @@ class NumpyFunction:
     def __init__(
         self,
         function: HashedFunction,
-        whole: NumpyFunction | None = None,
+        wider: NumpyFunction | None = None,
         columns: Sequence[int] = (),
     ) -> None:
-        """`whole`, where given, replays the same with more columns in its last output: of its
+        """`wider`, where given, evaluates the same with more columns in its last output: of its
         instructions, those for `columns` are taken instead of asking CasADi again."""
         self.shapes = function.shapes
-        if whole is None:
+        if wider is None:
             self._table, self._constants, self.n_registers = instructions(function)
         else:
-            output, (_, width) = len(whole.shapes) - 1, whole.shapes[-1]
-            self._table = of_columns(whole._table, output, width, columns)
-            self._constants, self.n_registers = whole._constants, whole.n_registers
+            output, (_, width) = len(wider.shapes) - 1, wider.shapes[-1]
+            self._table = of_columns(wider._table, output, width, columns)
+            self._constants, self.n_registers = wider._constants, wider.n_registers
         widths = [*function.sizes, *[rows * columns for rows, columns in function.shapes]]
         self._ends = [int(end) for end in np.cumsum([0, *widths])]
         self._plans: dict[tuple[bool, ...], EvaluationOrder] = {}

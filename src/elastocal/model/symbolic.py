@@ -22,7 +22,7 @@ from elastocal.model.equilibrium import Equilibrium
 from elastocal.model.evaluate import BackendReport, BatchFunction
 from elastocal.model.observations import observe
 
-# The symbolic arm: effects applied to the chain, its expressions, and their tapes.
+# The symbolic arm: effects applied to the chain, its expressions, and functions of tables.
 
 
 class SymbolicArm:
@@ -30,7 +30,7 @@ class SymbolicArm:
 
     `parameters` are those of all active effects, in order; `arm.inputs` what a row must give.
     `extra` effects with their places act besides those that the cell chooses.  `backend` is that
-    of its tapes.
+    of its functions.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class SymbolicArm:
         self.p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
         self._reading = self._expression(cell.model.observe)
         self._linear_model = cell.model.deflection_model == "linear"
-        self._tapes: dict[tuple[str, tuple[int, ...]], BatchFunction] = {}
+        self._functions: dict[tuple[str, tuple[int, ...]], BatchFunction] = {}
 
     def _expression(self, observe: str) -> ca.SX:
         """The reading of one row (3, 6 or 1 components) as an expression."""
@@ -136,22 +136,22 @@ class SymbolicArm:
 
     @property
     def backend_reports(self) -> dict[str, BackendReport]:
-        """What evaluated each tape last, by the tape's name and number of columns."""
+        """What evaluated each function last, by its name and number of columns."""
         reports = {
             f"{name}[{len(columns)}]" if columns else name: function.report
-            for (name, columns), function in self._tapes.items()
+            for (name, columns), function in self._functions.items()
         }
         if "equilibrium" in self.__dict__:  # built: a cached property
             reports["equilibrium"] = self.equilibrium.report
         return reports
 
     def function(self, name: str, columns: tuple[int, ...] = ()) -> BatchFunction:
-        """Tapes are built on first use: "reading", "slopes", "B" (of `columns`), "frames"."""
-        if (name, columns) not in self._tapes:
-            self._tapes[name, columns] = self._build_tape(name, list(columns))
-        return self._tapes[name, columns]
+        """Built on first use: "reading", "slopes", "B" (of `columns`), "frames"."""
+        if (name, columns) not in self._functions:
+            self._functions[name, columns] = self._build(name, list(columns))
+        return self._functions[name, columns]
 
-    def _build_tape(self, name: str, columns: list[int]) -> BatchFunction:
+    def _build(self, name: str, columns: list[int]) -> BatchFunction:
         arm, p, theta = self.arm, self.p, self.arm.theta
         inputs = [*arm.inputs.values(), p, theta]
         if name == "frames":
@@ -164,10 +164,10 @@ class SymbolicArm:
             return BatchFunction(inputs, [h], self.backend)
         if name == "slopes":
             return BatchFunction(inputs, [ca.jacobian(h, theta)], self.backend)
-        whole = self._tapes.get(("B", tuple(range(len(self.parameters)))))
+        wider = self._functions.get(("B", tuple(range(len(self.parameters)))))
         adjoint, B = self._derivative
         more = [ca.vec(adjoint.T)] if self.implicit else []
-        return BatchFunction([*inputs, *more], [h, B[:, columns]], self.backend, whole, columns)
+        return BatchFunction([*inputs, *more], [h, B[:, columns]], self.backend, wider, columns)
 
     @cached_property
     def _settled_reading(self) -> ca.SX:

@@ -7,7 +7,13 @@ import pytest
 from identification.variance.dense import Table, own_parts, readings, shared_part
 from scipy import stats
 
-from elastocal.identification import Readings, beyond_noise, estimate_noise, own_noise, screen
+from elastocal.identification import (
+    Readings,
+    estimate_noise,
+    outlier_screening,
+    own_noise,
+    unexplained_readings,
+)
 from elastocal.identification.noise_choice import _deletion_fit, _not_fitted, settle
 from elastocal.identification.outliers import FALSE_ALARM
 
@@ -79,7 +85,7 @@ def test_other_sizes_are_judged_the_same(size):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_readings_outside_the_fit_are_predicted_from_it(kind):
-    """Some with mates in their configuration or cell, some whose configuration is not fitted."""
+    """Some with mates in their configuration or set, some whose configuration is not fitted."""
     r = table()
     good = np.random.default_rng(3).random(len(r)) < 0.8
     good[r.configuration == 2] = False
@@ -120,7 +126,7 @@ def test_one_component_and_variance_give_externally_studentised_residuals():
     found = estimate_noise(r, "independent")
     for count in range(1, 4):
         level = n * np.sqrt(smallest[count - 1] * smallest[count])
-        faulty = beyond_noise(found, r, np.ones(n, dtype=bool), level)
+        faulty = unexplained_readings(found, r, np.ones(n, dtype=bool), level)
         assert faulty.sum() == count
         assert set(np.argsort(-np.abs(external))[:count]) == set(np.flatnonzero(faulty))
 
@@ -156,7 +162,7 @@ def test_false_alarms_do_happen():
     found = 0
     for _ in range(200):
         r = r.moved(1e-5 * rng.normal(size=r.e.shape))
-        found += beyond_noise(estimate_noise(r, "independent"), r, everything, 0.5).any()
+        found += unexplained_readings(estimate_noise(r, "independent"), r, everything, 0.5).any()
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 200, 1 - np.exp(-0.5))
     assert low <= found <= high
 
@@ -164,20 +170,20 @@ def test_false_alarms_do_happen():
 @pytest.mark.parametrize("kind", ["independent", "axis+configuration", "auto"])
 def test_gross_errors_are_found_and_nothing_else(kind):
     """From all readings under one variance or three; the free choice, which could take errors for
-    the noise of a group, from the screen."""
+    the noise of a group, from the screening."""
     r = table(4, configurations=10, repeats=4)
     rng = np.random.default_rng(7)
     for _ in range(10):
         bad = rng.permutation(len(r))[:3]
         e = 1e-5 * rng.normal(size=r.e.shape)
         e[bad, rng.integers(3, size=3)] += 1e-3
-        start = screen(r, e) if kind == "auto" else None
+        start = outlier_screening(r, e) if kind == "auto" else None
         assert set(np.flatnonzero(~settle(r.moved(e), kind, start).good)) == set(bad)
 
 
 def test_errors_that_mask_each_other_are_found_from_a_robust_start():
     """Two readings with the same error and the same great leverage draw the fit to them: each is
-    predicted well by the other.  Starting from all readings they stay; the screen sees them."""
+    predicted well by the other.  Starting from all readings they stay; the screening finds them."""
     r = table(4, configurations=10, repeats=4, unbalanced=False)
     bad = np.flatnonzero((r.configuration == 0) & (r.marker == 0))[:2]
     B, e = r.B.copy(), 1e-5 * np.random.default_rng(5).normal(size=r.e.shape)
@@ -186,7 +192,7 @@ def test_errors_that_mask_each_other_are_found_from_a_robust_start():
     marker = np.where(np.isin(np.arange(len(r)), bad), 9, r.marker)
     r = Readings(B, e, r.configuration, r.load, marker)
     assert settle(r, "independent").good[bad].all()
-    first = screen(r, e)  # what a robust fit leaves: the errors
+    first = outlier_screening(r, e)  # what a robust fit leaves: the errors
     assert not first[bad].any()
     assert set(np.flatnonzero(~settle(r, "independent", first).good)) == set(bad)
 
@@ -220,7 +226,7 @@ def test_a_search_that_goes_in_circles_ends_and_keeps_what_was_good_in_between(m
         faulty[[0, 1] if good[0] else [1, 2]] = True
         return faulty
 
-    monkeypatch.setattr("elastocal.identification.noise_choice.beyond_noise", undecided)
+    monkeypatch.setattr("elastocal.identification.noise_choice.unexplained_readings", undecided)
     verdict = settle(r, "independent")
     assert len(rounds) < 6
     assert set(np.flatnonzero(~verdict.good)) == {1}  # 0 and 2 come and go
@@ -233,6 +239,6 @@ def test_more_than_half_are_never_excluded(monkeypatch, share, kept):
     """Where most readings would have to go, the model is at fault, and all stay."""
     r = table(4, configurations=10)
     faulty = np.arange(len(r)) < share * len(r)
-    judge = "elastocal.identification.noise_choice.beyond_noise"
+    judge = "elastocal.identification.noise_choice.unexplained_readings"
     monkeypatch.setattr(judge, lambda *_: faulty)
     assert settle(r, "independent").good.all() == kept

@@ -40,7 +40,7 @@ def oats():
     r = Readings(B[:, None, :], e[:, None], block[kept], nitro[kept], variety[kept])
     structure = independent(r)
     wanted = (("configuration",), ("configuration", "marker"))
-    effects = tuple(e for e in shared_effects(structure.cells, 1) if e.by in wanted)
+    effects = tuple(e for e in shared_effects(structure.sets, 1) if e.by in wanted)
     assert len(effects) == 2
     return reml(structure, effects)
 
@@ -83,7 +83,7 @@ CASES = [
 def test_textbook_formula(name, table, share):
     r = readings(table, 3, shared=2e-5)
     structure = STRUCTURES[name](r)
-    fit = reml(structure, shared_effects(structure.cells, r.size, share))
+    fit = reml(structure, shared_effects(structure.sets, r.size, share))
     covariance, dof = kenward_roger(fit)
     shared = [e.name for e in fit.shared]
     whole = dense(name, r, structure.names, shared, fit.state.theta)

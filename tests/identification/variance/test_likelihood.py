@@ -27,7 +27,7 @@ def at_random(table, name, share, seed=0):
     """A state at random θ, and the dense model there; units are metres."""
     r = readings(TABLES[table], seed)
     structure = STRUCTURES[name](r)
-    effects = shared_effects(structure.cells, r.size, share)
+    effects = shared_effects(structure.sets, r.size, share)
     rng = np.random.default_rng(seed + 1)
     theta = np.exp(rng.normal(size=len(structure.names) + len(effects)))
     theta *= 1.0 if name == "stated" else 1e-10
@@ -97,7 +97,7 @@ def test_the_stacks_are_cut_small_enough_without_changing_anything(monkeypatch):
     structure, stacked, theta, _ = at_random("loads", "groups", True)
     whole = slope(structure, evaluate(structure, stacked, theta))
     monkeypatch.setattr("elastocal.identification.reml.MOST_NUMBERS", 1)
-    effects = shared_effects(structure.cells, 3)
+    effects = shared_effects(structure.sets, 3)
     cut = stacks(structure, effects)
     assert len(cut) > len(stacked)
     found = slope(structure, evaluate(structure, cut, theta))

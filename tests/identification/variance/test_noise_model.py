@@ -96,11 +96,11 @@ def test_repeats_share_the_mean_of_what_each_says() -> None:
             return {"growing": 1.0 + np.arange(len(readings))}
 
     structure = Growing().structure(UNBALANCED)
-    cell, number = UNBALANCED.cell, 1.0 + np.arange(len(UNBALANCED))
-    for c in range(len(structure.cells)):
-        mean = number[cell == c].mean()
+    set_of, number = UNBALANCED.set_of, 1.0 + np.arange(len(UNBALANCED))
+    for c in range(len(structure.sets)):
+        mean = number[set_of == c].mean()
         np.testing.assert_allclose(structure.matrix[c, 0], mean * np.eye(3))
-        repeats = (cell == c).sum()
+        repeats = (set_of == c).sum()
         np.testing.assert_allclose(structure.mean_matrix[c, 0], mean / repeats * np.eye(3))
 
 

@@ -37,7 +37,7 @@ def test_random_intercept_equals_mixed_lm(size, unbalanced):
     table = Table(size=size, configurations=12, markers=2, repeats=4, unbalanced=unbalanced)
     r = readings(table, 2, noise=1.0, shared=0.8)
     structure = independent(r)
-    effects = [e for e in shared_effects(structure.cells, size) if e.by == ("configuration",)]
+    effects = [e for e in shared_effects(structure.sets, size) if e.by == ("configuration",)]
     found = reml(structure, tuple(effects))
     assert found.converged
     model, theirs = mixed_lm(r)
@@ -64,7 +64,7 @@ def test_two_nested_effects_equal_mixed_lm(unbalanced):
     rng = np.random.default_rng(0)
     r = r.moved(r.e + 0.7 * rng.normal(size=(14, 4))[r.configuration, r.marker][:, None])
     structure = independent(r)
-    effects = shared_effects(structure.cells, 1)
+    effects = shared_effects(structure.sets, 1)
     assert [e.by for e in effects] == [("configuration",), ("configuration", "marker")]
     found = reml(structure, effects)
     _, theirs = mixed_lm(r, re_formula="1", vc_formula={"marker": "0 + C(marker)"})
@@ -91,7 +91,7 @@ def test_no_optimiser_finds_a_higher_likelihood(name, table):
     """Nelder–Mead in log θ from the optimum stays there: θ to 1e-6, ℓ to rounding."""
     r = readings(table, 6, noise=1.0, shared=1.0)
     structure = STRUCTURES[name](r)
-    effects = shared_effects(structure.cells, r.size)
+    effects = shared_effects(structure.sets, r.size)
     found = reml(structure, effects)
     assert found.converged
     free = found.state.theta > 1e-6 * found.state.theta.max()
@@ -117,7 +117,7 @@ def test_score_vanishes_at_the_optimum_or_points_out_of_the_bound():
     for _ in range(20):
         r = r.moved(rng.normal(size=r.e.shape))
         structure = by_axis(r)
-        found = reml(structure, shared_effects(structure.cells, 3))
+        found = reml(structure, shared_effects(structure.sets, 3))
         free = found.state.theta > 0
         size = np.sqrt(np.diag(found.slope.information))
         assert np.abs(found.slope.score / size)[free].max() < 1e-4
@@ -130,7 +130,7 @@ def test_score_vanishes_at_the_optimum_or_points_out_of_the_bound():
 def test_the_start_does_not_matter(start):
     r = readings(Table(configurations=10), 3, noise=1.0, shared=1.0)
     structure = by_axis(r)
-    effects = shared_effects(structure.cells, 3)
+    effects = shared_effects(structure.sets, 3)
     usual = reml(structure, effects)
     other = reml(structure, effects, start=np.full(3 + len(effects), start))
     np.testing.assert_allclose(other.state.theta, usual.state.theta, rtol=1e-4)

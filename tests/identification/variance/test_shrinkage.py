@@ -36,7 +36,7 @@ def test_hyperparameters_are_recovered(omega_u, omega_v):
     """On 600 configurations of 10: four standard errors are 0.14, 0.15 and 0.05."""
     r, _ = groups(600, 10, omega_u, omega_v, 0)
     structure = by_group(r)
-    prior = prior_of_groups(structure, structure.cells.e)
+    prior = prior_of_groups(structure, structure.sets.e)
     np.testing.assert_allclose(prior.mean[:3], MEAN, atol=0.15)
     block = np.linalg.inv(prior.precision[:3, :3])
     assert block[0, 1] == pytest.approx(omega_u, abs=0.2)
@@ -50,7 +50,7 @@ def test_shrunk_variances_are_nearer_the_truth():
     for seed in range(10):
         r, log = groups(15, 6, 0.2, 0.1, seed)
         structure = by_group(r)
-        prior = prior_of_groups(structure, structure.cells.e)
+        prior = prior_of_groups(structure, structure.sets.e)
         fit = reml(structure, (), prior, np.exp(prior.mean))
         free = reml(structure, (), None, np.exp(prior.mean))
         assert fit.converged and free.converged
@@ -62,7 +62,7 @@ def test_shrunk_variances_are_nearer_the_truth():
 def test_equal_variances_are_shrunk_onto_each_other():
     r, _ = groups(40, 10, 0.0, 0.0, 3)
     structure = by_group(r)
-    prior = prior_of_groups(structure, structure.cells.e)
+    prior = prior_of_groups(structure, structure.sets.e)
     fit = reml(structure, (), prior, np.exp(prior.mean))
     free = reml(structure, (), None, np.exp(prior.mean))
     spread = np.log(fit.own).reshape(-1, 3).std(axis=0)
@@ -111,7 +111,7 @@ def test_a_group_of_equal_readings_does_not_pull_the_others():
     e = r.e.copy()
     e[r.configuration == 4, 1] = 0.0
     structure = by_group(r.moved(e))
-    prior = prior_of_groups(structure, structure.cells.e)
+    prior = prior_of_groups(structure, structure.sets.e)
     fit = reml(structure, (), prior, np.exp(prior.mean))
     others = np.delete(np.arange(60), 13)
     assert np.abs(np.log(fit.own)[others] - log.ravel()[others]).max() < 2.5
@@ -124,18 +124,18 @@ def test_what_a_configuration_shares_is_not_taken_for_noise():
     r, _ = groups(200, 9, 0.0, 0.0, 6)
     shift = 1e-3 * np.random.default_rng(0).normal(size=(200, 3))
     structure = by_group(r.moved(r.e + shift[r.configuration]))
-    prior = prior_of_groups(structure, structure.cells.e)
+    prior = prior_of_groups(structure, structure.sets.e)
     np.testing.assert_allclose(prior.mean[:3], MEAN, atol=0.1)
-    assert shared_effects(structure.cells, 3)
+    assert shared_effects(structure.sets, 3)
 
 
 def test_repeats_and_means_give_the_same_prior_as_their_readings():
-    """A group's variance is that of its single readings, however they are spread over cells."""
+    """A group's variance is that of its single readings, however they are spread over sets."""
     r, _ = groups(30, 12, 0.3, 0.2, 7)
     alone = by_group(r)
-    cells = by_group(Readings(r.B, r.e, r.configuration, r.load, r.marker // 4))
-    first = prior_of_groups(alone, alone.cells.e)
-    second = prior_of_groups(cells, cells.cells.e)
+    sets = by_group(Readings(r.B, r.e, r.configuration, r.load, r.marker // 4))
+    first = prior_of_groups(alone, alone.sets.e)
+    second = prior_of_groups(sets, sets.sets.e)
     np.testing.assert_allclose(second.mean, first.mean, rtol=1e-12)
     np.testing.assert_allclose(second.precision, first.precision, rtol=1e-9)
 
@@ -144,4 +144,4 @@ def test_too_few_readings_to_shrink_are_refused():
     r = readings(Table(configurations=8, markers=1, repeats=2, unbalanced=False), 0)
     structure = by_group(r)
     with pytest.raises(InsufficientDataError, match="repeat readings, or choose another"):
-        prior_of_groups(structure, structure.cells.e)
+        prior_of_groups(structure, structure.sets.e)

@@ -48,8 +48,9 @@ from elastocal.model.effects.placements import (
 )
 from elastocal.model.effects.play import Backlash, Hysteresis
 from elastocal.model.effects.tracker_distortion import TrackerDistortion
+from elastocal.plugin_loader import same_class
 
-# Hooks run in this order: what sets a frame or a marker stands before what moves it.
+# Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {
     effect.name: effect
     for effect in (
@@ -104,7 +105,7 @@ def register(effect: Effect) -> None:
     known = CATALOGUE.get(effect.name)
     if known is not None:
         require(
-            effect.name not in BUILT_IN and _same_class(known, effect),
+            effect.name not in BUILT_IN and same_class(known, effect),
             f"there is an effect '{effect.name}' already; choose another name",
         )
         CATALOGUE[effect.name] = effect
@@ -114,8 +115,3 @@ def register(effect: Effect) -> None:
     order.insert(last + 1, effect)
     CATALOGUE.clear()
     CATALOGUE.update({each.name: each for each in order})
-
-
-def _same_class(known: object, new: object) -> bool:
-    a, b = type(known), type(new)
-    return (a.__module__, a.__qualname__) == (b.__module__, b.__qualname__)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
@@ -12,6 +11,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.model.arm import ParameterSpec, Setting
 from elastocal.model.chain import Chain
+from elastocal.plugin_loader import check_registered
 from elastocal.text import listed
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Effect:
     """One physical effect on the chain.  It knows nothing about estimation.
 
     A subclass states `name` and `stage`, the places where it can act, the
-    parameters it has at a place, and overrides the one hook its stage calls for:
+    parameters it has at a place, and overrides the one method its stage calls for:
 
     - `shape`: changes joint motion, link transforms, springs, markers, base frame;
       called before the chain is put together.
@@ -132,19 +132,9 @@ class Effect:
 
 def check(effect: object) -> None:
     """InputError where `effect` cannot stand in the catalogue, and what it lacks."""
-    if isinstance(effect, type) and issubclass(effect, Effect):
-        raise InputError(f"register an effect, {effect.__name__}(), not its class")
-    if not isinstance(effect, Effect):
-        raise InputError(
-            f"an effect is an object of a class derived from Effect; found {type(effect).__name__}"
-        )
-    kind = type(effect)
-    name, stage = getattr(effect, "name", None), getattr(effect, "stage", None)
-    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise InputError(
-            f"{kind.__name__}.name takes lower-case letters, digits and underscores, as in "
-            f'"joint_offset"; found {name!r}'
-        )
+    check_registered(effect, Effect, "an effect", "joint_offset")
+    assert isinstance(effect, Effect)
+    kind, stage = type(effect), getattr(effect, "stage", None)
     if stage not in get_args(Stage):
         raise InputError(f"{kind.__name__}.stage takes {listed(get_args(Stage))}; found {stage!r}")
     if not set(effect.formats) <= set(get_args(Format)):

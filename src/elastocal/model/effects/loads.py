@@ -53,7 +53,7 @@ class Payload(Effect):
 class PayloadError(Effect):
     """The row's force f acts as (1 + s) f at `load_point_m` + d; s (1), d (3,) m, flange frame.
 
-    The weight was not weighed, or the hook hangs elsewhere than drawn.  Adds to the declared
+    The weight was not weighed, or the load hangs elsewhere than drawn.  Adds to the declared
     load's potential −f·p(θ) what is missing: V = −f·(s p + (1 + s) R d), R the flange's rotation.
     """
 

@@ -144,7 +144,7 @@ def long_function(factor: float) -> HashedFunction:
     return HashedFunction([x], [y])
 
 
-def test_long_tapes_are_read_from_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_functions_are_read_from_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     first = backend_instructions.instructions(long_function(3.0))
     monkeypatch.setattr(backend_instructions, "_extracted", None)  # not asked again
     second = backend_instructions.instructions(long_function(3.0))
@@ -159,7 +159,7 @@ def test_another_constant_is_another_tape() -> None:
     assert not np.array_equal(first[1], second[1])
 
 
-def test_short_tapes_are_not_cached(folder: Path) -> None:
+def test_short_functions_are_not_cached(folder: Path) -> None:
     x = ca.SX.sym("x")
     backend_instructions.instructions(HashedFunction([x], [ca.sin(x)]))
     assert not folder.exists()

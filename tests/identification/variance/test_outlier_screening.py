@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from elastocal.identification import Readings, screen
+from elastocal.identification import Readings, outlier_screening
 
 
 def table(configurations=10, each=12):
@@ -19,32 +19,32 @@ def table(configurations=10, each=12):
 def test_a_component_of_eight_deviations_is_suspected(each, axis):
     r, e = table(120 // each, each)
     e[7, axis] = 8.0
-    assert not screen(r, e)[7]
+    assert not outlier_screening(r, e)[7]
 
 
 def test_clean_noise_is_seldom_suspected():
     """Five robust deviations of 12 readings: fewer than one reading in fifty, of the whole table
     fewer than one in a thousand."""
     r, e = table(300, 12)
-    assert screen(r, e).mean() > 0.98
+    assert outlier_screening(r, e).mean() > 0.98
     r, e = table(1500, 2)
-    assert screen(r, e).mean() > 0.999
+    assert outlier_screening(r, e).mean() > 0.999
 
 
 def test_what_a_configuration_shares_is_not_suspected():
     """Its median is taken out, where it holds enough readings to have one."""
     r, e = table()
     e[r.configuration == 4] += 30.0
-    assert screen(r, e)[r.configuration == 4].mean() > 0.9
+    assert outlier_screening(r, e)[r.configuration == 4].mean() > 0.9
     few, e = table(60, 2)
     e[few.configuration == 4] += 30.0
-    assert not screen(few, e)[few.configuration == 4].any()
+    assert not outlier_screening(few, e)[few.configuration == 4].any()
 
 
 def test_a_noisy_configuration_is_measured_by_its_own_scale():
     r, e = table()
     e[r.configuration == 4] *= 20
-    assert screen(r, e)[r.configuration == 4].mean() > 0.8
+    assert outlier_screening(r, e)[r.configuration == 4].mean() > 0.8
 
 
 def test_readings_that_agree_by_luck_do_not_accuse_one_that_differs_a_little():
@@ -52,7 +52,7 @@ def test_readings_that_agree_by_luck_do_not_accuse_one_that_differs_a_little():
     r, e = table()
     e[r.configuration == 4] = 0.0
     e[5 + 4 * 12] = 0.5
-    assert screen(r, e)[r.configuration == 4].all()
+    assert outlier_screening(r, e)[r.configuration == 4].all()
 
 
 def test_loads_are_groups_of_their_own():
@@ -60,14 +60,14 @@ def test_loads_are_groups_of_their_own():
     load = np.tile([0, 1], 80)
     r = Readings(r.B, r.e, r.configuration, load, r.marker)
     shifted = e + np.where(load == 1, 25.0, 0.0)[:, None]
-    assert screen(r, shifted).mean() > 0.95
+    assert outlier_screening(r, shifted).mean() > 0.95
 
 
 def test_unit_and_order_do_not_matter():
     r, e = table()
     e[::13] += 9
-    usual = screen(r, e)
+    usual = outlier_screening(r, e)
     assert not usual.all()
-    np.testing.assert_array_equal(screen(r, 1e-6 * e), usual)
+    np.testing.assert_array_equal(outlier_screening(r, 1e-6 * e), usual)
     order = np.random.default_rng(1).permutation(len(r))
-    np.testing.assert_array_equal(screen(r.take(order), e[order]), usual[order])
+    np.testing.assert_array_equal(outlier_screening(r.take(order), e[order]), usual[order])

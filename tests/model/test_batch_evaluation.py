@@ -1,4 +1,4 @@
-"""A replayed tape computes what CasADi computes: every operation, chunk, shape, complex step."""
+"""Evaluation of arrays is what CasADi computes: operations, chunks, shapes, complex steps."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def casadi_values(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> np
     return np.array([function(*row).full() for row in rows])
 
 
-def assert_replays(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> None:
+def assert_evaluates(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> None:
     with np.errstate(all="ignore"):
-        replayed = BatchFunction(inputs, [output])(*values)[0]
+        found = BatchFunction(inputs, [output])(*values)[0]
     np.testing.assert_allclose(
-        replayed, casadi_values(inputs, output, *values), rtol=4e-15, atol=1e-300
+        found, casadi_values(inputs, output, *values), rtol=4e-15, atol=1e-300
     )
 
 
@@ -59,20 +59,20 @@ def assert_replays(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> N
 @pytest.mark.parametrize("name", UNARY)
 def test_unary_operations(name: str) -> None:
     """NaN and infinity included: log(−1), 1/0."""
-    assert_replays([X], UNARY[name], POINTS[:, :1])
+    assert_evaluates([X], UNARY[name], POINTS[:, :1])
 
 
 @pytest.mark.parametrize("name", BINARY)
 def test_binary_operations(name: str) -> None:
-    assert_replays([X, Y], BINARY[name], POINTS[:, :1], POINTS[:, 1:])
+    assert_evaluates([X, Y], BINARY[name], POINTS[:, :1], POINTS[:, 1:])
 
 
 @pytest.mark.parametrize("name", BINARY)
 def test_binary_operations_of_a_row_quantity_and_a_scalar(name: str) -> None:
     """One operand varies by row, the other does not; and the other way round."""
     for scalar in (np.array([0.5]), np.array([-2.0]), np.array([0.0])):
-        assert_replays([X, Y], BINARY[name], POINTS[:, :1], scalar)
-        assert_replays([X, Y], BINARY[name], scalar, POINTS[:, 1:])
+        assert_evaluates([X, Y], BINARY[name], POINTS[:, :1], scalar)
+        assert_evaluates([X, Y], BINARY[name], scalar, POINTS[:, 1:])
 
 
 def test_the_operations_above_are_all_that_the_tape_knows() -> None:
@@ -86,12 +86,12 @@ def test_the_operations_above_are_all_that_the_tape_knows() -> None:
 
 
 def test_if_else_with_two_branches() -> None:
-    assert_replays([X, Y], BRANCHES, POINTS[:, :1], POINTS[:, 1:])
+    assert_evaluates([X, Y], BRANCHES, POINTS[:, :1], POINTS[:, 1:])
 
 
 def test_a_branch_not_taken_may_be_undefined() -> None:
     guarded = ca.if_else(X > 0, ca.log(X), 0)
-    assert_replays([X], guarded, POINTS[:, :1])
+    assert_evaluates([X], guarded, POINTS[:, :1])
 
 
 def test_unknown_operations_are_refused() -> None:
@@ -126,12 +126,12 @@ def test_random_expressions_and_their_derivatives(tree, seed: int) -> None:
     values = (rng.normal(size=(5, 1)), rng.normal(size=(5, 1)), rng.normal(size=1))
     for output in (expression, slopes):
         with np.errstate(all="ignore"):
-            replayed = BatchFunction(inputs, [output])(*values)[0]
+            found = BatchFunction(inputs, [output])(*values)[0]
         expected = casadi_values(inputs, output, *values)
         defined = np.isfinite(expected)
         # Common subexpressions change the order of additions, hence the absolute part.
         tolerance = 1e-12 * max(1.0, np.abs(expected[defined]).max(initial=0.0))
-        np.testing.assert_allclose(replayed[defined], expected[defined], rtol=0, atol=tolerance)
+        np.testing.assert_allclose(found[defined], expected[defined], rtol=0, atol=tolerance)
 
 
 def three_outputs() -> tuple[list[ca.SX], list[ca.SX]]:
@@ -248,9 +248,9 @@ def test_a_long_sum_needs_few_registers() -> None:
         total = ca.sin(total + x[k])
     function = BatchFunction([x], [total], "numpy")
     rows = np.random.default_rng(5).normal(size=(3, 40))
-    assert_replays([x], total, rows)
+    assert_evaluates([x], total, rows)
     function(rows)
-    assert function._replay._plan((True,)).n_registers <= 2
+    assert function._by_numpy._plan((True,)).n_registers <= 2
 
 
 def test_a_table_without_rows_gives_no_rows() -> None:
@@ -305,8 +305,8 @@ def test_complex_step_of_kinks(name: str) -> None:
 
 
 @pytest.mark.parametrize("columns", [[], [1], [3, 0], [0, 1, 2, 3]])
-def test_columns_of_a_known_tape_have_the_same_values(columns: list[int]) -> None:
-    """The instructions taken from a tape of all columns are those CasADi would be asked for."""
+def test_columns_of_a_known_function_have_the_same_values(columns: list[int]) -> None:
+    """The instructions taken from a function of all columns are those CasADi would be asked for."""
     v = ca.SX.sym("v", 4)
     head = ca.sin(v[0]) * v[1]
     matrix = ca.jacobian(ca.vertcat(head * v[2], ca.exp(v[3]) * head, v[1]), v)
