@@ -363,7 +363,7 @@ def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
         ("simulate", {"load": [0, 1]}, "`load` takes three finite numbers"),
         ("simulate", {"draw": -1.0}, "`draw` takes a factor"),
         ("simulate", {"values": {"joint3": 1.0}}, "no parameter 'joint3'"),
-        ("compensate", {"frame": "tool"}, "`frame` 'tool' is unknown"),
+        ("compensate", {"frame": "tool"}, "`frame` takes base or tracker; found 'tool'"),
         ("compensate", {"point": "M9"}, "`point`: 'M9' is no marker"),
         ("compensate", {"near": [0, 0]}, "`near` takes 6 joints"),
     ],

@@ -18,8 +18,6 @@ from elastocal.errors import InputError
 from elastocal.identification.result import Calibration
 from elastocal.planning.plan import Plan
 from elastocal.report.diagnosis_view import (
-    BUDGET_HEADS,
-    CANDIDATE_HEADS,
     diagnosis_lines,
     diagnosis_steps,
     effect_at,
@@ -28,7 +26,7 @@ from elastocal.report.diagnosis_view import (
     hypothesis_rows,
     name_of,
 )
-from elastocal.report.formatting import display, length, printable
+from elastocal.report.formatting import display, length, minus, printable
 from elastocal.report.identification_view import (
     combination_rows,
     judgement,
@@ -320,14 +318,14 @@ def view_of(result: object) -> View:
 
 def _identification_html(result: Calibration) -> str:
     known = [row for row in parameter_rows(result, None) if row.determined]
-    rows = [(r.name, r.value, r.interval, r.unit, r.nominal) for r in known]
-    rows += [(r.name, r.value, r.interval, r.unit, "") for r in combination_rows(result, None)]
+    rows = [
+        (r.name if r.effect else minus(r.name), minus(r.value), minus(r.interval), r.unit,
+         minus(r.nominal))
+        for r in (*known, *combination_rows(result, None))
+    ]  # fmt: skip
     heads = ("parameter", "value", "95 %", "unit", "nominal")
     lines = [(label, text) for label, _, text in (x.partition(": ") for x in summary_lines(result))]
-    judged = judgement(result)
-    lines += [("Verdict", printable(judged.headline))]
-    lines += [("Next", printable(step)) for step in judged.steps]
-    return _table("Identification", heads, rows) + _lines(lines)
+    return _table("Identification", heads, rows) + _lines(lines + judgement(result).lines)
 
 
 def _plan_html(plan: Plan) -> str:
@@ -337,10 +335,11 @@ def _plan_html(plan: Plan) -> str:
 
 
 def _diagnosis_html(d: Diagnosis) -> str:
+    budget, best = gap_rows(d), hypothesis_rows(d, MOST_CANDIDATES_SHOWN)
     return (
         _lines(diagnosis_lines(d) + [("Next", step) for step in diagnosis_steps(d)])
-        + _table("Gap budget (3-D rms error on held-out poses)", BUDGET_HEADS, gap_rows(d))
-        + _table("Candidates", CANDIDATE_HEADS, hypothesis_rows(d, MOST_CANDIDATES_SHOWN))
+        + _table("Gap budget (3-D rms error on held-out poses)", budget.heads, budget.rows)
+        + _table("Candidates", best.heads, best.rows)
     )
 
 
