@@ -34,7 +34,7 @@ LAYERS = (
 MOST_LINES = 800
 FEWEST_LINES = 60
 
-# Their work is begun on the command line alone; the pages of `report` tell how it goes on there.
+# Their work is begun on the command line alone.
 OF_THE_COMMAND_LINE = ("studies", "importing")
 ELSEWHERE = ("--install", "--version")  # flags of other programs
 

@@ -307,8 +307,10 @@ def simulate(
         >>> ec.identify("cell.toml", data)["joint3.compliance"].ci95
         (3.3...e-07, 3.4...e-07)
     """
-    options = {"draw": draw, "load": load, "repeats": repeats, "noise": noise, "seed": seed}
-    return simulated(_model(model), plan, values=values, **options)[0]
+    return simulated(
+        _model(model), plan, values=values, draw=draw, load=load, repeats=repeats, noise=noise,
+        seed=seed,
+    )[0]  # fmt: skip
 
 
 def simulated(

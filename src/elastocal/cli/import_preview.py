@@ -13,8 +13,8 @@ from rich.text import Text
 
 from elastocal.importing.import_files import Imported
 from elastocal.importing.records import Understood
-from elastocal.report.formatting import counted, printable
-from elastocal.report.terminal import titled
+from elastocal.report.formatting import ShownTable, counted, printable
+from elastocal.report.terminal import table_of
 from elastocal.text import listed
 
 
@@ -109,13 +109,11 @@ def _heading(observed: Understood) -> str:
 
 
 def _columns_of(observed: Understood) -> Table:
-    table = titled("")
-    table.title = None
-    for head in ("in the file", "read as", "unit"):
-        table.add_column(head, overflow="fold")
-    for name, column, unit in observed.columns:
-        table.add_row(*(Text(printable(text)) for text in (name, column, unit or "–")))
-    return table
+    rows = [
+        (printable(name), printable(column), printable(unit or "–"))
+        for name, column, unit in observed.columns
+    ]
+    return table_of(None, ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2)))
 
 
 def _first_rows(found: Imported, width: int) -> Table:
@@ -125,13 +123,13 @@ def _first_rows(found: Imported, width: int) -> Table:
     ]
     rest = len(columns) - len(shown)
     more = f", {rest} more columns" if rest else ""
-    table = titled(f"The first rows of the table{more}")
-    for name in shown:
-        numeric = isinstance(columns[name], np.ndarray)
-        table.add_column(name, justify="right" if numeric else "left", overflow="fold")
-    for i in range(min(FIRST_ROWS, len(found.assembled))):
-        table.add_row(*(Text(_cell(columns[name], i)) for name in shown))
-    return table
+    words = [k for k, name in enumerate(shown) if not isinstance(columns[name], np.ndarray)]
+    rows = [
+        tuple(_cell(columns[name], i) for name in shown)
+        for i in range(min(FIRST_ROWS, len(found.assembled)))
+    ]
+    title = f"The first rows of the table{more}"
+    return table_of(title, ShownTable(tuple(shown), rows, tuple(words)))
 
 
 def _cell(values: Sequence[str] | np.ndarray, i: int) -> str:
@@ -141,13 +139,12 @@ def _cell(values: Sequence[str] | np.ndarray, i: int) -> str:
 
 
 def _ranges(found: Imported) -> Table:
-    table = titled("Ranges")
-    for head in ("column", "least", "largest"):
-        table.add_column(head, justify="left" if head == "column" else "right", overflow="fold")
-    for name, values in found.assembled.columns.items():
-        if isinstance(values, np.ndarray) and name != "repeat":
-            table.add_row(Text(name), Text(f"{values.min():.6g}"), Text(f"{values.max():.6g}"))
-    return table
+    rows = [
+        (name, f"{values.min():.6g}", f"{values.max():.6g}")
+        for name, values in found.assembled.columns.items()
+        if isinstance(values, np.ndarray) and name != "repeat"
+    ]
+    return table_of("Ranges", ShownTable(("column", "least", "largest"), rows))
 
 
 def _counts(found: Imported) -> list[tuple[str, str]]:

@@ -363,7 +363,7 @@ def gap_rows(d: Diagnosis) -> ShownTable:
 
 def hypothesis_rows(d: Diagnosis, most: int) -> ShownTable:
     """The best `most` candidates; nothing and an unknown effect are candidates as well."""
-    rows: Rows = [
+    rows = [
         (
             effect_at(c),
             probability(c.probability),
@@ -403,7 +403,7 @@ def structure_rows(d: Diagnosis, most: int) -> ShownTable:
 
 def pair_rows(d: Diagnosis) -> ShownTable:
     """How far apart each pair of rivals is before and after the extra poses."""
-    rows: Rows = [
+    rows = [
         (
             f"{name_of(pair.first)} or {name_of(pair.second)}",
             significant(pair.distance_before, 2),
@@ -420,7 +420,7 @@ def untested_rows(d: Diagnosis) -> ShownTable:
     for u in d.untested:
         effects = groups.setdefault((printable(u.reason), printable(u.advice)), {})
         effects.setdefault(plain_name(u.effect), []).append(place(u.where))
-    rows: Rows = [
+    rows = [
         (", ".join(f"{name} ({', '.join(at)})" for name, at in effects.items()), *reason)
         for reason, effects in groups.items()
     ]

@@ -168,7 +168,7 @@ class ShownTable:
     """
 
     heads: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
     words: tuple[int, ...] = (0,)
     groups: dict[int, str] = field(default_factory=dict)
 
@@ -181,7 +181,7 @@ def faulty_rows(found: Sequence[tuple[Any, float, float]]) -> dict[str, Any]:
 
     `found`: each reading with its line and names, its error in m, and that over the noise.
     """
-    rows: list[tuple[str, ...]] = [
+    rows = [
         (str(o.line), printable(o.configuration), printable(o.marker), length(error),
          significant(ratio))
         for o, error, ratio in found[:MOST_FAULTY]

@@ -615,7 +615,7 @@ def identification_contents(
         *held_lines(result),
         *([("Truth", coverage_line(result, truth))] if truth else []),
     ]
-    found = (*result.estimates, *result.combinations)
+    found: list[Estimate | Combination] = [*result.estimates, *result.combinations]
     endless = any(math.isinf(end) for e in found for end in e.ci95 or ())
     deviating = () if summary is None else summary.deviating
     scatter = None if summary is None else summary.whole.held_out_mean_square

@@ -176,7 +176,7 @@ def digests(inputs: Inputs) -> dict[str, str]:
     found = {}
     for path in inputs:
         with open_input(path, "input file") as handle:
-            found[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()
+            found[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()  # type: ignore[arg-type]
     return found
 
 

@@ -51,9 +51,7 @@ def force_text(plan: Plan, load: int) -> str:
 
 def reason_rows(plan: Plan) -> ShownTable:
     """What each pose is there for."""
-    rows: list[tuple[str, ...]] = [
-        (name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)
-    ]
+    rows = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
     return ShownTable(("pose", SERVES), rows, (1,))
 
 
@@ -86,7 +84,7 @@ def _partners(p: Predicted) -> str:
 def curve_rows(plan: Plan) -> ShownTable:
     """The criterion against the number of poses."""
     heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
-    rows: list[tuple[str, ...]] = [
+    rows = [
         (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
         for s in plan.curve
     ]

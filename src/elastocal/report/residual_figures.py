@@ -15,7 +15,15 @@ from elastocal.identification.result import Calibration
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.report.arm_view import Space, marker_positions, space_picture
-from elastocal.report.figures import FAINT, INK, SERIES, dots, drawn, waterfall_of_steps
+from elastocal.report.figures import (
+    FAINT,
+    INK,
+    SERIES,
+    dots,
+    drawn,
+    micrometre_axis,
+    waterfall_of_steps,
+)
 from elastocal.report.formatting import length, short_name, significant
 from elastocal.report.identification_view import budget_steps, rms_by_kind
 from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
@@ -124,10 +132,7 @@ def errors(result: Calibration) -> str:
             axes.margins(x=0.25)
         else:
             axes.set_xlim(0, 1.25e6 * max(sizes, default=1.0))
-        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g} µm" if x < 1e3 else f"{x / 1e3:g} mm")
-        axes.xaxis.set_minor_formatter(lambda x, _: "")
-        axes.set_xlabel("rms error")
-        axes.grid(axis="y", visible=False)
+        micrometre_axis(axes, "rms error")
 
     return drawn(draw, WIDTH / 2, 2.9, "Nominal, fitted, held-out and test error")
 

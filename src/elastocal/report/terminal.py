@@ -78,7 +78,7 @@ def _plain_text(printed: Callable[[Console], None]) -> str:
     return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
 
 
-def titled(title: str) -> Table:
+def titled(title: str | None) -> Table:
     """An empty table under a title, with a rule below its heads and no frame."""
     return Table(
         title=title,
@@ -90,7 +90,7 @@ def titled(title: str) -> Table:
     )
 
 
-def _table(title: str, shown: ShownTable, whole: bool = False) -> Table:
+def table_of(title: str | None, shown: ShownTable, whole: bool = False) -> Table:
     """For the terminal: words to the left, numbers to the right.
 
     Where numbers have to be `whole`, only joints and words may wrap.
@@ -198,7 +198,7 @@ def noise_tables(result: Calibration) -> list[Table]:
     heads = ("noise model", "variances", "criterion over best")
     tried = ShownTable(heads, candidate_rows(result.noise))
     named = (("Noise, standard deviations", sizes), ("Noise models tried", tried))
-    return [_table(title, table) for title, table in named if len(table.rows) > 1]
+    return [table_of(title, table) for title, table in named if len(table.rows) > 1]
 
 
 def print_result(console: Console, result: Calibration, truth: Truth | None = None) -> None:
@@ -233,7 +233,7 @@ def print_plan(console: Console, plan: Plan) -> None:
         tables["Number of poses"] = curve_rows(plan)
     console.print(_pose_table(plan, 2, reasons=True) if wide else _narrow_poses(console, plan))
     for title, table in tables.items():
-        console.print(_table(title, table, whole=True))
+        console.print(table_of(title, table, whole=True))
     console.print()
     _print_lines(console, plan_lines(plan))
 
@@ -249,7 +249,7 @@ def _narrow_poses(console: Console, plan: Plan) -> Table:
 
 
 def _pose_table(plan: Plan, decimals: int, reasons: bool = False) -> Table:
-    return _table("Poses", pose_rows(plan, reasons, decimals), whole=True)
+    return table_of("Poses", pose_rows(plan, reasons, decimals), whole=True)
 
 
 MOST_CANDIDATES_PRINTED = 8
@@ -260,14 +260,14 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> Non
     """The whole answer for an engineer; `kinds` of the joints ("revolute" or "prismatic")."""
     _print_told(console, diagnosis_lines(d))
     console.print()
-    console.print(_table("Gap budget (3-D rms error on held-out poses)", gap_rows(d)))
+    console.print(table_of("Gap budget (3-D rms error on held-out poses)", gap_rows(d)))
     if (parameters := added_parameter_rows(d)).rows:
-        console.print(_table("Parameters of the effects found", parameters))
+        console.print(table_of("Parameters of the effects found", parameters))
     best = hypothesis_rows(d, MOST_CANDIDATES_PRINTED)
     title = f"Candidates, the best {len(best.rows) - 2} of {len(d.candidates)}"
     if console.width < NARROW_FOR_SETTINGS or not any(row[-1] for row in best.rows):
         best = ShownTable(best.heads[:-1], [row[:-1] for row in best.rows])
-    console.print(_table(title, best))
+    console.print(table_of(title, best))
     console.print(
         Text(
             "evidence: log marginal likelihood over that of no further effect. d: standard "
@@ -278,7 +278,7 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> Non
     )
     for title, table in (("Rivals", pair_rows(d)), ("Not tested", untested_rows(d))):
         if table.rows:
-            console.print(_table(title, table))
+            console.print(table_of(title, table))
     console.print()
     told = [("Alike here", f"{text}: these data cannot tell them apart.") for text in alike(d)]
     told += [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
