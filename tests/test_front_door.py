@@ -216,7 +216,8 @@ def test_diagnose_is_that_of_the_command_line(model):
     why = ec.diagnose(model, "data.csv", seed=1)
     done = command("diagnose", "cell.toml", "data.csv", "-o", "line.json", "--seed", "1", "-q")
     assert done.exit_code == 0, done.output
-    why.save("front.json")
+    with options_as_flags():  # its remedies name options
+        why.save("front.json")
     assert Path("front.json").read_text() == Path("line.json").read_text()
     assert why.budget and why.verdict in ("explained", "unknown_effect", "ambiguous")
 
