@@ -22,7 +22,6 @@ with clock.step("import"):
     import numpy as np
 
     # What reading would import when first called.
-    from elastocal.cli.identify_command import load_inputs
     from elastocal.identification import Options, Problem, Weights, sizes_and_check, start_values
     from elastocal.identification.identify import identify
     from elastocal.identification.solve import settle
@@ -46,7 +45,9 @@ def main(how: str, folder: Path, out: Path) -> None:
     method, _, backend = how.partition("+")
     set_default_backend(backend or None)
     with clock.step("read"):
-        model, (table,) = load_inputs(folder / "cell.toml", [folder / "data.csv"])
+        model = Model(folder / "cell.toml")
+        table = model.read(folder / "data.csv")
+        model = model.with_markers_of(table)
     with clock.step("fit"):
         if method == "plain":
             x, p = plain(model, table)

@@ -18,9 +18,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from elastocal.cell.arm_description import Robot, Tool, Tracker
-    from elastocal.cell.work_cell import Cell, read_cell
-    from elastocal.cell.workspace_rules import Workspace
+    from elastocal.cell import Cell, Robot, Tool, Tracker, Workspace, read_cell
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError

@@ -6,8 +6,6 @@ calls the function of the kind.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,6 +16,7 @@ import numpy as np
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text
 from elastocal.model.arm import given_force
+from elastocal.tables import csv_text
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -39,21 +38,22 @@ def save(result: Any, path: str | Path, **how: Any) -> None:
     WRITERS[type(result).__name__](result, Path(path), **how)
 
 
+def write_json(path: Path, content: Any) -> None:
+    """Strict JSON, ending with a newline."""
+    atomic_write_text(path, json_text(content) + "\n")
+
+
 def save_calibration(fit: Calibration, path: Path) -> None:
     """The result as JSON (schema elastocal/identification/1), or its residuals as CSV."""
     if path.suffix.lower() == ".csv":
         return save_residuals(fit, path)
-    atomic_write_text(path, json_text(fit.to_json()) + "\n")
+    write_json(path, fit.to_json())
 
 
 def save_residuals(fit: Calibration, path: Path) -> None:
     """One row per observation: its residual and its held-out residual (CSV)."""
     rows = fit.residual_table()
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    atomic_write_text(path, text.getvalue())
+    atomic_write_text(path, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
 
 
 def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
@@ -76,8 +76,7 @@ def save_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
     from elastocal.diagnosis.diagnosis import publish
 
     assert diagnosis.model is not None  # `diagnose` states it
-    content = publish(diagnosis, diagnosis.model, diagnosis.data)
-    atomic_write_text(path, json_text(content) + "\n")
+    write_json(path, publish(diagnosis, diagnosis.model, diagnosis.data))
 
 
 def save_compensation(found: Compensation, path: Path, partial: bool = False) -> None:

@@ -46,8 +46,6 @@ Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
 Progress: TypeAlias = Callable[[str], None]
 T = TypeVar("T")
 
-OPEN = ("ambiguous", "unknown_effect")  # verdicts whose rivals more poses may tell apart
-
 
 def design(
     model: AnyModel,
@@ -139,17 +137,10 @@ def design(
         <Plan kuka_kr270_2: 6 poses by D, ...>
         >>> plan.save("six.csv")
     """
+    asked = {name: given for name, given in locals().items() if name not in ("model", "progress")}
     from elastocal.planning.design import design as run
 
-    cell, options = design_request(
-        model, poses=poses, criterion=criterion, target=target, curve=curve, fixed=fixed,
-        augment=augment, knowledge=knowledge, prior=prior, effort=effort, candidates=candidates,
-        repeats=repeats, loads=loads, load_choice=load_choice, repeatability=repeatability,
-        marker_sigma=marker_sigma, levels=levels, per_level=per_level, interest=interest,
-        combination=combination, robust=robust, robust_samples=robust_samples,
-        test_poses=test_poses, test_path=test_path, test_box=test_box, motion=motion, seed=seed,
-        jobs=jobs,
-    )  # fmt: skip
+    cell, options = design_request(model, **asked)
     return run(cell, options, progress=progress or _silent)
 
 
@@ -316,6 +307,24 @@ def simulate(
         >>> ec.identify("cell.toml", data)["joint3.compliance"].ci95
         (3.3...e-07, 3.4...e-07)
     """
+    return simulated(
+        _model(model), plan, values=values, draw=draw, load=load, repeats=repeats, noise=noise,
+        seed=seed,
+    )[0]  # fmt: skip
+
+
+def simulated(
+    made: Model,
+    plan: Plan | Table | ArrayLike,
+    *,
+    values: Mapping[str, float] | ArrayLike | None,
+    draw: float,
+    load: ArrayLike | None,
+    repeats: int,
+    noise: bool,
+    seed: int,
+) -> tuple[Measurements, NDArray[np.float64]]:
+    """What `simulate` gives, and the true values (parameters,) behind it."""
     from elastocal.identification.start import check_limits
     from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
     from elastocal.simulation.simulate import simulate as run
@@ -324,10 +333,10 @@ def simulate(
     factor = np.asarray(draw, dtype=float)
     require(
         factor.shape == () and bool(0 <= factor < np.inf),
-        f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw}",
+        f"{option('draw')} takes a factor of the typical sizes, 0 or more; found "
+        + (f"{factor[()]:g}" if factor.shape == () else str(draw)),
     )
     repeats = _whole("repeats", repeats, 1)
-    made = _model(model)
     poses = _poses(made, plan)
     check_limits(made, poses)
     rng = np.random.default_rng(_whole("seed", seed, 0))
@@ -342,7 +351,7 @@ def simulate(
             f"or some of them by name; found an array of shape {x.shape}",
         )
     rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)
-    return run(made, rows, x, rng, noise=noise)
+    return run(made, rows, x, rng, noise=noise), x
 
 
 def _poses(model: Model, plan: Plan | Table | ArrayLike) -> Measurements:
@@ -439,6 +448,8 @@ def identify(
         jobs=jobs,
     )
     known = knowledge_of(knowledge, physical)
+    tell = progress or _silent
+    tell("reading")
     made = _model(model)
     table = _table("data", made, data)
     kept_back = None if test is None else _table("test", made, test)
@@ -454,7 +465,7 @@ def identify(
         prior = prior or known_prior
     if prior is not None or constraints is not None:
         options = replace(options, constraints=constraints, prior=prior)
-    return run(made, table, options, kept_back, progress or _silent)
+    return run(made, table, options, kept_back, tell)
 
 
 def diagnose(
@@ -505,24 +516,18 @@ def diagnose(
     options = DiagnosisOptions(_whole("seed", seed, 0), _names("without", without), false_alarm)
     if extra_poses is not None:
         _whole("extra_poses", extra_poses, 1)
+    tell = progress or _silent
+    tell("reading")
     made = _model(model)
     table = _table("data", made, data)
     made = made.with_markers_of(table)
-    tell = progress or _silent
     found = run(made, table, options, tell)
-    if extra_poses is not None and found.verdict in OPEN:
-        found = with_extra_poses(made, table, found, extra_poses, seed, tell)
-    return found
-
-
-def with_extra_poses(
-    model: Model, table: Measurements, found: Diagnosis, most: int, seed: int, progress: Progress
-) -> Diagnosis:
-    """The diagnosis with the fewest of at most `most` poses that tell its rivals apart."""
+    if extra_poses is None or not found.open:
+        return found
     from elastocal.diagnosis.extra_poses import plan_extra
 
-    progress("looking for poses that tell the rivals apart")
-    extra = plan_extra(model, table, found, most=most, seed=seed, progress=progress)
+    tell("looking for poses that tell the rivals apart")
+    extra = plan_extra(made, table, found, most=extra_poses, seed=seed, progress=tell)
     return replace(found, extra=extra)
 
 
@@ -572,7 +577,6 @@ def compensate(
         (True, True)
     """
     from elastocal.compensation.compensate import compensate as run
-    from elastocal.compensation.tool_targets import FRAMES
     from elastocal.identification.result import Calibration
 
     if isinstance(arm, Calibration):
@@ -583,7 +587,7 @@ def compensate(
             f"found {type(arm).__name__}"
         )
     force = given_force(load)
-    _one_of("frame", frame, FRAMES)
+    check_frame(frame)
     chain = arm.model.chain
     start = None if near is None else np.asarray(near, dtype=float)
     require(
@@ -593,6 +597,14 @@ def compensate(
     where = _tool_point(arm.model.cell, point)
     wanted = _targets(targets, chain.kinds, frame, force)
     return run(arm, wanted, where, start, _whole("seed", seed, 0), progress or _silent)
+
+
+def check_frame(frame: str) -> None:
+    """Raise InputError for a frame that targets cannot stand in."""
+    from elastocal.compensation.tool_targets import FRAMES
+
+    told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
+    require(frame in FRAMES, told)
 
 
 def _tool_point(cell: Cell, point: str | ArrayLike | None) -> ToolPoint:

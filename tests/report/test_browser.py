@@ -24,7 +24,7 @@ from elastocal.diagnosis import Baseline
 from elastocal.model import Model
 from elastocal.planning import DesignOptions
 from elastocal.planning.design import design
-from elastocal.report.page import diagnosis_page, identification_page, plan_page
+from elastocal.report.page import page_of
 
 playwright = pytest.importorskip("playwright.sync_api")
 
@@ -71,9 +71,9 @@ def texts(hostile: Any) -> dict[str, str]:
     cell = replace(cell, tracker=Tracker(noise=CartesianNoise(np.full(3, 1e-5))), design=spec)
     planned = design(cell, DesignOptions(effort="quick"))
     return {
-        "identification": identification_page(hostile.result, command="elastocal identify"),
-        "diagnosis": diagnosis_page(replace(EXPLAINED, calibrated=base), arm, HOSTILE),
-        "plan": plan_page(planned),
+        "identification": page_of(hostile.result, command="elastocal identify"),
+        "diagnosis": page_of(replace(EXPLAINED, calibrated=base, model=arm, data=HOSTILE)),
+        "plan": page_of(planned),
     }
 
 

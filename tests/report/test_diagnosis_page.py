@@ -16,7 +16,7 @@ from elastocal.diagnosis import FaultyReading
 from elastocal.errors import InputError
 from elastocal.identification import BudgetStep
 from elastocal.model import Model
-from elastocal.report.page import diagnosis_page, write_diagnosis_report
+from elastocal.report.page import page_of, write_page
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,9 @@ def model() -> Model:
 @pytest.fixture(scope="module")
 def pages(model: Model) -> dict[str, str]:
     told = {"command": f"elastocal diagnose {HOSTILE}", "inputs": {HOSTILE: "0" * 64}, "seed": 7}
-    return {name: diagnosis_page(d, model, HOSTILE, **told) for name, d in VERDICTS.items()}
+    return {
+        name: page_of(replace(d, model=model, data=HOSTILE), **told) for name, d in VERDICTS.items()
+    }
 
 
 @pytest.mark.parametrize("name", VERDICTS)
@@ -109,29 +111,28 @@ def test_numbers_that_are_not_known_do_not_break_the_page(model):
         BudgetStep("a", 0.0, (0.0, 0.0)),
     )
     gap = replace(EXPLAINED.gap, noise_floor=float("nan"))
-    Page(diagnosis_page(replace(EXPLAINED, budget=steps, gap=gap), model, "data.csv"))
+    Page(page_of(replace(EXPLAINED, model=model, budget=steps, gap=gap)))
     bare = replace(EXPLAINED, budget=(), candidates=(), structure=(), untested=(), warnings=())
-    assert "<dt>Warnings" not in diagnosis_page(bare, model, "data.csv")
+    assert "<dt>Warnings" not in page_of(replace(bare, model=model))
 
 
 def test_long_lists_are_cut_and_say_so(model):
     faulty = tuple(FaultyReading(i, "7", "M1", 1e-3, 10.0 + i) for i in range(130))
     d = replace(TWO, noise=replace(TWO.noise, faulty=faulty))
-    page = Page(diagnosis_page(d, model, "data.csv"))
+    page = Page(page_of(replace(d, model=model)))
     assert "and 30 more" in page.text
     assert [row[0] for row in page.rows if row and row[0] in ("129", "3")] == ["129"]
 
 
 def test_same_diagnosis_same_page(model):
-    told = (EXPLAINED, model, "data.csv")
-    assert diagnosis_page(*told) == diagnosis_page(*told)
+    found = replace(EXPLAINED, model=model)
+    assert page_of(found) == page_of(found)
 
 
 def test_writing_is_whole_or_not_at_all(model, tmp_path):
+    found = replace(EXPLAINED, model=model)
     with pytest.raises(InputError, match="no such file"):
-        write_diagnosis_report(
-            EXPLAINED, model, tmp_path / "r.html", "d.csv", inputs=[tmp_path / "missing.csv"]
-        )
+        write_page(found, tmp_path / "r.html", inputs=[tmp_path / "missing.csv"])
     with pytest.raises(InputError, match="does not exist"):
-        write_diagnosis_report(EXPLAINED, model, tmp_path / "none" / "r.html", "d.csv")
+        write_page(found, tmp_path / "none" / "r.html")
     assert list(tmp_path.iterdir()) == []

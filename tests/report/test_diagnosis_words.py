@@ -160,7 +160,7 @@ def test_extra_poses_promise_or_say_that_none_helps():
 def test_the_same_advice_is_given_once():
     advice = [s for s in diagnosis_steps(EXPLAINED) if "direction of the last motion" in s]
     assert len(advice) == 1
-    (row,) = untested_rows(EXPLAINED)
+    (row,) = untested_rows(EXPLAINED).rows
     assert row[0] == "hysteresis (joint 1, joint 2)"
 
 
@@ -217,7 +217,7 @@ def test_lists():
 
 def test_budget_changes_add_up():
     """Change of every step, read back from its text, is the difference of the errors."""
-    table = gap_rows(EXPLAINED)
+    table = gap_rows(EXPLAINED).rows
     assert table[-1][:2] == ("noise alone", "19.0 µm")
     scale = {"mm": 1e-3, "µm": 1e-6}
 
@@ -230,7 +230,7 @@ def test_budget_changes_add_up():
 
 
 def test_candidates_seen_from_five_standard_deviations():
-    table = hypothesis_rows(EXPLAINED, 10)
+    table = hypothesis_rows(EXPLAINED, 10).rows
     for row, c in zip(table[:10], CANDIDATES, strict=True):
         if c.detectable:
             assert float(row[4]) * c.detectable == pytest.approx(5, rel=0.05)

@@ -11,7 +11,7 @@ import pytest
 from elastocal.identification import FaultyGroup, Outlier, OutlierReport
 from elastocal.report.identification_view import summary_lines
 from elastocal.report.method_and_noise import MOST_TOLD, fault_lines
-from elastocal.report.page import identification_page
+from elastocal.report.page import page_of
 
 BLOCK = FaultyGroup(
     "block", "142 to 507", "common", tuple(range(366)), tuple(range(142, 508)), 366, 8.8, 8.8,
@@ -86,9 +86,7 @@ def test_terminal_names_few_and_counts_the_rest(case: Any) -> None:
 
 def test_page_lists_every_group_beside_the_single_readings(case: Any, no_figures: None) -> None:
     groups = [replace(BLOCK, level="configuration", name=f"<b>{k}\x1b") for k in range(9)]
-    page = identification_page(
-        with_findings(case.result, *groups, excluded=outliers(range(142, 508)))
-    )
+    page = page_of(with_findings(case.result, *groups, excluded=outliers(range(142, 508))))
     section = page[page.index("<h2>Faulty readings") : page.index("<h2>To repeat")]
     assert section.count("<li>") == 9
     assert "at most 1 %" in section
@@ -101,7 +99,7 @@ def test_page_lists_every_group_beside_the_single_readings(case: Any, no_figures
 def test_group_without_a_reading_beyond_the_noise(case: Any, level: Any, no_figures: None) -> None:
     result = with_findings(case.result, replace(BLOCK, level=level, beyond=0))
     assert ", none of them beyond the noise alone" in fault_lines(result)[0]
-    page = identification_page(result)
+    page = page_of(result)
     assert "No single reading lies beyond" in page
 
 

@@ -16,12 +16,12 @@ from support.pages import Page
 
 from elastocal.model import observe
 from elastocal.report import residual_view
-from elastocal.report.page import identification_page, write_identification_report
+from elastocal.report.page import page_of, write_page
 
 
 @pytest.fixture(scope="module")
 def page(case: Any) -> str:
-    return identification_page(case.result, case.truth, "elastocal identify c.toml d.csv", None, 3)
+    return page_of(case.result, command="elastocal identify c.toml d.csv", seed=3, truth=case.truth)
 
 
 def test_every_parameter_is_on_the_page_and_no_number_where_none_is_known(
@@ -69,7 +69,7 @@ def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
 
 
 def test_names_from_files_are_text(hostile: Any) -> None:
-    page = identification_page(hostile.result, command="elastocal <b>", inputs={"<i>.csv": "<u>"})
+    page = page_of(hostile.result, command="elastocal <b>", inputs={"<i>.csv": "<u>"})
     structure = Page(page)
     structure.check_harmless(page)
     assert not {"b", "i", "u"} & set(structure.tags)
@@ -93,7 +93,7 @@ def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:
         held_out=np.tile(case.result.held_out, times),
         noise=replace(case.result.noise, kind="none"),
     )
-    write_identification_report(long, tmp_path / "r.html")
+    write_page(long, tmp_path / "r.html")
     assert (tmp_path / "r.html").stat().st_size < 6e6
     assert "a random choice of 5000 of" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
@@ -106,8 +106,8 @@ def test_small_tables_are_drawn_whole(page: str, case: Any) -> None:
 
 def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: str) -> None:
     with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30}):
-        again = identification_page(
-            case.result, case.truth, "elastocal identify c.toml d.csv", None, 3
+        again = page_of(
+            case.result, command="elastocal identify c.toml d.csv", seed=3, truth=case.truth
         )
     # What evaluated the model so far is another thing the second time.
     engine = re.compile(r"<td class=\"name\">model evaluated by</td><td>.*?</td>")
@@ -117,17 +117,17 @@ def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: st
 def test_configuration_without_held_out_error(case: Any) -> None:
     held_out = case.result.held_out.copy()
     held_out[:12] = np.inf  # 2 markers × 2 loads × 3 coordinates
-    page = identification_page(replace(case.result, held_out=held_out, heldout_rms=float("inf")))
+    page = page_of(replace(case.result, held_out=held_out, heldout_rms=float("inf")))
     Page(page)
     assert "1 without held-out error" in page
     assert "is not known" in page
 
 
 def test_other_observations(pose: Any, bare: Any) -> None:
-    text = identification_page(pose.result, pose.truth)
+    text = page_of(pose.result, truth=pose.truth)
     Page(text)
     assert "rz in µrad" in text
-    text = identification_page(bare.result)
+    text = page_of(bare.result)
     assert "No noise was stated" in text
     (faulty,) = bare.result.outliers
     (row,) = [row for row in Page(text).rows if len(row) == 5 and row[0] == str(faulty.line)]

@@ -38,7 +38,7 @@ from elastocal.report.method_and_noise import (
     shape_line,
     size_rows,
 )
-from elastocal.report.page import identification_page
+from elastocal.report.page import page_of
 from elastocal.report.terminal import print_result
 
 MISFIT = LackOfFit(F=9.31, p=2e-9, dof_between=30, dof_pure=200)
@@ -241,7 +241,7 @@ def test_terminal_has_tables_and_all_lines(noisy: Any, width: int) -> None:
 
 
 def test_page_has_a_section_on_noise(noisy: Any) -> None:
-    page = identification_page(noisy)
+    page = page_of(noisy)
     section = page[page.index("<h2>Noise</h2>") : page.index("<h2>Faulty readings")]
     for piece in ("restricted likelihood", "31.4 µm", "common to each configuration", "14.2",
                   "the intervals include it", "Kenward and Roger", "scatters unlike",
@@ -259,7 +259,7 @@ def test_names_from_the_result_are_text(noisy: Any, no_figures: None) -> None:
     sizes = (NoiseSize(script, 1e-6),)
     tried = tuple(Trial(script, 1, float(k)) for k in range(2))
     noise = {"sizes": sizes, "tried": tried, "description": script, "reason": script}
-    page = identification_page(changed(noisy, noise))
+    page = page_of(changed(noisy, noise))
     found = Page(page)
     found.check_harmless(page)
     assert script.replace("\x1b", "\N{REPLACEMENT CHARACTER}") in found.text
@@ -268,7 +268,7 @@ def test_names_from_the_result_are_text(noisy: Any, no_figures: None) -> None:
 
 def test_without_residuals_the_page_has_no_distribution(case: Any) -> None:
     nothing = changed(case.result, residual=np.zeros_like(case.result.residual), residual_rms=0.0)
-    page = identification_page(changed(nothing, residual_summary=None))
+    page = page_of(changed(nothing, residual_summary=None))
     assert page.count("<figure>") == 8
     assert "Histograms by group" not in page
     assert noise_model_line(changed(case.result, {"sizes": (), "reason": None})) is None
@@ -277,5 +277,5 @@ def test_without_residuals_the_page_has_no_distribution(case: Any) -> None:
 def test_interval_without_an_end_has_no_bar(case: Any) -> None:
     e = copy.copy(case.result.estimates[0])
     object.__setattr__(e, "ci95", (-np.inf, np.inf))
-    page = identification_page(changed(case.result, estimates=(e, *case.result.estimates[1:])))
+    page = page_of(changed(case.result, estimates=(e, *case.result.estimates[1:])))
     assert "nan" not in page[page.index("<h2>Parameters") : page.index("<h2>Combinations")]

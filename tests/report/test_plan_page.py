@@ -19,7 +19,7 @@ from elastocal.errors import InputError
 from elastocal.planning import Certificate, DesignOptions, PlanSize
 from elastocal.planning.design import design
 from elastocal.report.arm_view import plan_space
-from elastocal.report.page import plan_page, write_plan_report
+from elastocal.report.page import page_of, write_page
 from elastocal.report.plan_view import plan_headline, plan_steps, plan_tone
 
 SCRIPT = "<script>alert(1)</script>"
@@ -43,7 +43,7 @@ def plan() -> Any:
 @pytest.fixture(scope="module")
 def page(plan: Any) -> Page:
     told = {"command": f"elastocal design {SCRIPT}", "inputs": {SCRIPT: "0" * 64}}
-    text = plan_page(replace(plan, curve=(PlanSize(4, 6.5, 6.1), PlanSize(8, 4.5, None))), **told)
+    text = page_of(replace(plan, curve=(PlanSize(4, 6.5, 6.1), PlanSize(8, 4.5, None))), **told)
     found = Page(text)
     found.check_harmless(text)
     assert len(text) < 6e6
@@ -107,9 +107,9 @@ def test_the_verdict_says_how_far_from_the_best(
 
 def test_writing_is_whole_or_not_at_all(plan: Any, tmp_path: Any) -> None:
     with pytest.raises(InputError, match="no such file"):
-        write_plan_report(plan, tmp_path / "r.html", inputs=[tmp_path / "missing.toml"])
+        write_page(plan, tmp_path / "r.html", inputs=[tmp_path / "missing.toml"])
     with pytest.raises(InputError, match="does not exist"):
-        write_plan_report(plan, tmp_path / "none" / "r.html")
+        write_page(plan, tmp_path / "none" / "r.html")
     assert list(tmp_path.iterdir()) == []
 
 

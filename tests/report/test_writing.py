@@ -10,7 +10,7 @@ import pytest
 
 from elastocal.errors import InputError
 from elastocal.report import page as report_pages
-from elastocal.report.page import write_identification_report
+from elastocal.report.page import write_page
 
 # Writing does not depend on what the figures show, and drawing takes its time.
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -19,13 +19,11 @@ pytestmark = pytest.mark.usefixtures("no_figures")
 def test_inputs_are_hashed(case: Any, tmp_path: Path) -> None:
     data = tmp_path / "data.csv"
     data.write_bytes(b"q1_deg\n1\n")
-    write_identification_report(case.result, tmp_path / "r.html", inputs=[data])
+    write_page(case.result, tmp_path / "r.html", inputs=[data])
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert hashlib.sha256(data.read_bytes()).hexdigest() in text
     with pytest.raises(InputError, match="no such file"):
-        write_identification_report(
-            case.result, tmp_path / "other.html", inputs=[tmp_path / "missing.csv"]
-        )
+        write_page(case.result, tmp_path / "other.html", inputs=[tmp_path / "missing.csv"])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["data.csv", "r.html"]
 
 
@@ -37,7 +35,7 @@ def test_failure_while_writing_leaves_nothing(
 
     monkeypatch.setattr("os.replace", full_disk)
     with pytest.raises(InputError, match="cannot be written"):
-        write_identification_report(case.result, tmp_path / "r.html")
+        write_page(case.result, tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -51,10 +49,10 @@ def test_failure_while_drawing_keeps_the_old_page(
 
     monkeypatch.setattr(report_pages, "drawn_for", broken)
     with pytest.raises(RuntimeError):
-        write_identification_report(case.result, tmp_path / "r.html")
+        write_page(case.result, tmp_path / "r.html")
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("r.html", "old")]
 
 
 def test_missing_folder(case: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
-        write_identification_report(case.result, tmp_path / "none" / "r.html")
+        write_page(case.result, tmp_path / "none" / "r.html")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import os
+import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -22,7 +23,7 @@ from elastocal.errors import ElastocalError, InputError, options_as_flags
 if TYPE_CHECKING:
     from rich.console import Console
 
-# What all commands share: the app, errors and exit codes, progress, output checks.
+    from elastocal.cell.work_cell import Cell
 
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 
@@ -69,9 +70,18 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 
+# What several commands take.
 CellFile = Annotated[Path, typer.Argument(help="Cell file (TOML): robot, tool, tracker, model.")]
+DataFile = Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")]
+ReportFile = Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all random draws.")]
+
+
+def command(*name: str, **how: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register a command of the app, which ends with a message where the user can act on it."""
+    return lambda function: app.command(*name, **how)(reporting_errors(function))
 
 
 def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
@@ -147,19 +157,51 @@ def options(
     chosen_backend()
 
 
-def check_outputs(*paths: Path | None) -> None:
-    """Refuse an output that cannot be written before the work starts, not after it."""
-    for path in paths:
-        if path is None:
-            continue
+# The files that a command reads and writes: checked before the work, written after it.
+
+
+def repeated() -> str:
+    """The command line that repeats this run, as results name it."""
+    return shlex.join(["elastocal", *sys.argv[1:]])
+
+
+def check_outputs(*paths: Path | None) -> list[Path]:
+    """The outputs asked for; one that cannot be written is refused before the work starts."""
+    wanted = [path for path in paths if path is not None]
+    for path in wanted:
+        folder = path.absolute().parent
         if path.is_dir():
             raise InputError(f"{path} is a directory; name a file to write")
-        if not path.absolute().parent.is_dir():
-            raise InputError(
-                f"{path}: the folder {path.absolute().parent} does not exist; create it first"
-            )
-        if not os.access(path.absolute().parent, os.W_OK):
-            raise InputError(f"{path}: no permission to write in {path.absolute().parent}")
+        if not folder.is_dir():
+            raise InputError(f"{path}: the folder {folder} does not exist; create it first")
+        if not os.access(folder, os.W_OK):
+            raise InputError(f"{path}: no permission to write in {folder}")
+    return wanted
+
+
+def check_apart(written: list[Path], read: Iterable[Path | None], cell: Cell | None = None) -> None:
+    """Refuse to write over an input or a file that the `cell` names, or two outputs into one."""
+    inputs = {path.resolve() for path in read if path is not None}
+    inputs |= set() if cell is None else {path.resolve() for path in files_of(cell)}
+    taken: set[Path] = set()
+    for path in written:
+        if path.resolve() in inputs:
+            raise InputError(f"{path} is read and would be written over; name another output")
+        if path.resolve() in taken:
+            raise InputError(f"{path}: two outputs of the same name; name another one")
+        taken.add(path.resolve())
+
+
+def files_of(cell: Cell) -> list[Path]:
+    """Files that the cell names and its model or a plan depends on."""
+    from elastocal.plugin_loader import is_plugin_file
+
+    robot, targets = cell.robot, cell.design.test_path
+    solids = [*cell.workspace.obstacles, *(body.solid for body in cell.workspace.bodies)]
+    named = [robot.urdf, robot.dh, robot.masses, None if targets is None else targets.file]
+    named += [solid.mesh for solid in solids]
+    named += [Path(name) for name in cell.plugins if is_plugin_file(name)]
+    return [path for path in named if path is not None]
 
 
 # Ctrl-C, also where a library catches it.

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from elastocal.cli.app import (
     CellFile,
     Json,
+    Quiet,
     Seed,
-    app,
+    check_apart,
     check_outputs,
+    command,
     console,
     progress_line,
-    reporting_errors,
 )
-from elastocal.cli.design_command import check_apart, files_of
-from elastocal.errors import require
+from elastocal.errors import InputError, require
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
-    from elastocal.compensation.tool_targets import Targets
+    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation.correction_table import CorrectionGrid, CorrectionTable
     from elastocal.model.calibrated import CalibratedArm
     from elastocal.units import Array
 
 
-@app.command()
-@reporting_errors
+@command()
 def compensate(
     cell: CellFile,
     result: Annotated[Path, typer.Argument(help="Result of identify -o (JSON).")],
@@ -89,7 +89,7 @@ def compensate(
     ] = None,
     seed: Seed = 0,
     as_json: Json = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Which commands put the tool where it shall be?
 
@@ -98,39 +98,55 @@ def compensate(
 
     Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
     """
-    from elastocal.cli.outputs import commands_of, read_near, read_table_grid, table_of
-    from elastocal.compensation.tool_targets import tool_point
+    from elastocal import verbs
+    from elastocal.compensation.tool_targets import one_target, tool_point
     from elastocal.files import atomic_write_text
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
 
     # What can be wrong with the options is told before any file is read.
-    _check_targets(targets, target, frame, output, table)
-    _check_grid(table, grid, box, rotation)
+    verbs.check_frame(frame)
+    require(
+        targets is not None or target is not None or table is not None,
+        "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE",
+    )
+    require(
+        targets is None or target is None,
+        f"both {targets} and --target are given; drop one of them",
+    )
+    require(
+        output is None or targets is not None or target is not None,
+        "-o writes the commands of targets; name a table of them, or give --target",
+    )
+    require(
+        table is not None or (box is None and rotation is None and grid == "5"),
+        "--grid, --box and --rotation belong to a correction table; give --table FILE",
+    )
+    require(rotation is None or box is not None, "--rotation belongs to --box")
     force = given_force(load)
-    written = [path for path in (output, table) if path is not None]
-    check_outputs(*written)
+    written = check_outputs(output, table)
     content, texts = {}, {}
     with progress_line(quiet) as progress:
         progress("reading")
         arm = read_calibrated(cell, result)
-        check_apart(written, [cell, result, targets, *files_of(arm.model.cell)])
-        where = tool_point(arm.model.cell, point)
-        start = read_near(arm, near)
-        lines = read_table_grid(arm, grid, box, rotation) if table is not None else None
-        wanted = _targets(arm, targets, target, frame, force)
+        check_apart(written, [cell, result, targets], arm.model.cell)
+        start = _posture(arm, near)
+        lines = None if table is None else _grid(arm, grid, box, rotation)
+        wanted = targets if target is None else one_target(target, frame, force)  # type: ignore[arg-type]
         if wanted is not None:
-            from elastocal.compensation.compensate import compensate as run
-
-            found = run(arm, wanted, where, start, seed, progress)
-            content["commands"], text = commands_of(found, arm, output is None, partial)
+            found = verbs.compensate(
+                arm, wanted, load=load, frame=frame, point=point, near=start,  # type: ignore[arg-type]
+                seed=seed, progress=progress,
+            )  # fmt: skip
+            content["commands"], text = _commands(found, output is None, partial)
             if output is not None:
                 texts[output] = text
         if table is not None and lines is not None:
             from elastocal.compensation.correction_table import correction_table
 
+            where = tool_point(arm.model.cell, point)
             corrections = correction_table(arm, lines, where, force, start, seed, progress)
-            content["table"], texts[table] = table_of(corrections, arm, partial)
+            content["table"], texts[table] = _table(corrections, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
         for path, text in texts.items():
             atomic_write_text(path, text)
@@ -150,39 +166,113 @@ def compensate(
         )
 
 
-def _check_targets(
-    targets: Path | None, target: str | None, frame: str, output: Path | None, table: Path | None
-) -> None:
-    from elastocal.compensation.tool_targets import FRAMES
-
-    require(frame in FRAMES, f"--frame takes base or tracker; found '{frame}'")
-    require(
-        targets is not None or target is not None or table is not None,
-        "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE",
-    )
-    require(
-        targets is None or target is None,
-        f"both {targets} and --target are given; drop one of them",
-    )
-    require(
-        output is None or targets is not None or target is not None,
-        "-o writes the commands of targets; name a table of them, or give --target",
-    )
+GRID_REMEDIES = {
+    "limit": "joint limits prevent it: widen [limits], or give a smaller --box or another --near",
+    "not reached": "out of reach, or beside a singular posture: give a smaller --box, another "
+    "--rotation or another --near",
+    "no equilibrium": "no static equilibrium under this load: check --load",
+}
 
 
-def _check_grid(table: Path | None, grid: str, box: str | None, rotation: str | None) -> None:
-    require(
-        table is not None or (box is None and rotation is None and grid == "5"),
-        "--grid, --box and --rotation belong to a correction table; give --table FILE",
-    )
-    require(rotation is None or box is not None, "--rotation belongs to --box")
+def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
+    """--near as joints (n,) in rad or m."""
+    import numpy as np
+
+    from elastocal.compensation.compensate import in_file_units
+    from elastocal.compensation.tool_targets import numbers
+    from elastocal.model.chain import joint_limits
+
+    if text is None:
+        return None
+    chain = arm.model.chain
+    n = chain.n_joints
+    values = numbers("--near", text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
+    values = values / in_file_units(np.ones(n), chain.kinds)
+    lower, upper = joint_limits(arm.model.cell, chain)
+    if ((values < lower) | (values > upper)).any():
+        j = int(np.argmax((values < lower) | (values > upper)))
+        raise InputError(f"--near: joint {j + 1} is beyond its limits; give a posture within them")
+    return values
 
 
-def _targets(
-    arm: CalibratedArm, path: Path | None, target: str | None, frame: str, force: Array | None
-) -> Targets | None:
-    from elastocal.compensation.tool_targets import one_target, read_targets
+def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) -> CorrectionGrid:
+    """The grid that --grid, --box and --rotation ask for."""
+    import numpy as np
+    from scipy.spatial.transform import Rotation
 
-    if path is not None:
-        return read_targets(path, arm.model.chain.kinds, frame, force)  # type: ignore[arg-type]
-    return None if target is None else one_target(target, frame, force)  # type: ignore[arg-type]
+    from elastocal.compensation.correction_table import box_grid, joint_grid
+    from elastocal.compensation.tool_targets import numbers
+
+    try:
+        counts = tuple(int(part) for part in grid.split(","))
+    except ValueError:
+        raise InputError(
+            f"--grid takes whole numbers, as in 5 or 9,7,7,3,3,1; found '{grid}'"
+        ) from None
+    if box is None:
+        return joint_grid(arm, counts)
+    corners = numbers("--box", box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
+    turned = None
+    if rotation is not None:
+        vector = numbers("--rotation", rotation, (3,), "a rotation vector rx,ry,rz in degrees")
+        turned = Rotation.from_rotvec(np.radians(vector)).as_matrix()
+    return box_grid(corners[:3], corners[3:], counts, turned)
+
+
+def _commands(found: Compensation, listed: bool, partial: bool) -> tuple[dict[str, Any], str]:
+    """Summary of the commands, with each of them where `listed`, and their table as CSV.
+
+    Raises InsufficientDataError where rows are not reached and `partial` does not allow for that.
+    """
+    from elastocal.compensation.compensate import check_reached, commands_csv, summary
+
+    if not partial:
+        check_reached(found)
+    kinds = found.chain.kinds
+    return summary(found, kinds, commands=listed), commands_csv(found, kinds)
+
+
+def _table(found: CorrectionTable, arm: CalibratedArm, partial: bool) -> tuple[dict[str, Any], str]:
+    """Summary of the correction table, and the table as CSV; refused as `_commands` is."""
+    import numpy as np
+
+    from elastocal.compensation.compensate import check_status, in_file_units, joint_columns, spread
+    from elastocal.compensation.correction_table import EXACT, FIRST_ORDER
+    from elastocal.tables import csv_text
+
+    kinds = arm.model.chain.kinds
+    if found.grid.joints:
+        heads, points = joint_columns(kinds), in_file_units(found.points, kinds)
+    else:
+        heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
+    known = np.all(np.isfinite(found.correction), axis=1).tolist()
+    plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
+    # A grid point has no line in any file of the user's: it is named by where it lies.
+    named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
+    what = f"--table: %d of %d grid points ({', '.join(heads)})"
+    if not partial:
+        check_status(what, named, plain, EXACT, GRID_REMEDIES)
+    heads += ["dx_mm", "dy_mm", "dz_mm"]
+    columns = [found.correction[:, :3] * 1e3]
+    if found.oriented:
+        heads += ["drx_deg", "dry_deg", "drz_deg"]
+        columns.append(np.degrees(found.correction[:, 3:]))
+    order = np.lexsort(found.points.T[::-1])
+    rows = []
+    values = np.hstack(columns)
+    for i in order:
+        cells = [f"{v + 0.0:.7f}" if np.isfinite(v) else "" for v in values[i]]
+        rows.append([*(f"{v + 0.0:.9g}" for v in points[i]), *cells, found.status[i]])
+    content: dict[str, Any] = {
+        "points": len(found.status),
+        "exact": found.status.count(EXACT),
+        "first_order": found.status.count(FIRST_ORDER),
+        "levels": [len(axis) for axis in found.grid.axes],
+        "checked_between": len(found.between),
+        "error_without_um": spread(found.before[:, 0]),
+        "error_with_um": spread(found.between[:, 0]),
+    }
+    if found.oriented:
+        content["rotation_without_urad"] = spread(found.before[:, 1])
+        content["rotation_with_urad"] = spread(found.between[:, 1])
+    return content, csv_text([*heads, "status"], rows)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
-import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,12 +13,16 @@ from elastocal.cli.app import (
     CellFile,
     Interrupts,
     Json,
+    Quiet,
+    ReportFile,
     Seed,
-    app,
+    check_apart,
     check_outputs,
+    command,
     console,
+    files_of,
     progress_line,
-    reporting_errors,
+    repeated,
 )
 from elastocal.errors import ElastocalError, InputError, require
 
@@ -32,113 +33,8 @@ if TYPE_CHECKING:
     from elastocal.planning.plan import Plan
     from elastocal.units import Array
 
-# The files that `elastocal design` reads and writes: checked before the work, written after it.
-
 PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
 PICTURES = (".png", ".svg")
-
-
-def check_suffixes(programs: tuple[Path, ...], picture: Path | None) -> None:
-    """Refuse names that do not say which kind of file is wanted."""
-    for path in programs:
-        require(
-            path.suffix.lower() in PROGRAMS,
-            f"--program {path}: the suffix says the language, "
-            + " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items()),
-        )
-    require(
-        picture is None or picture.suffix.lower() in PICTURES,
-        f"--picture {picture}: name it {' or '.join(PICTURES)}",
-    )
-
-
-def check_programs(cell: Cell, programs: tuple[Path, ...]) -> None:
-    """Can these robot programs be written for this arm?  Told before the work, not after it."""
-    import numpy as np
-
-    from elastocal.cell.plan_wishes import Motion
-    from elastocal.model.choice import load_chain
-    from elastocal.planning.execution import Execution
-
-    if programs:
-        chain = load_chain(cell)
-        nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0.0, 0, 0)
-        for path in programs:
-            _program(path, nothing, chain)
-
-
-def check_apart(written: Iterable[Path | None], read: Iterable[Path | None]) -> None:
-    """Refuse to write over an input, or two outputs into one file; None where none was named."""
-    inputs = {path.resolve() for path in read if path is not None}
-    observed: set[Path] = set()
-    for path in written:
-        if path is None:
-            continue
-        require(
-            path.resolve() not in inputs,
-            f"{path} is read and would be written over; name another output",
-        )
-        require(
-            path.resolve() not in observed,
-            f"{path}: two outputs of the same name; name another one",
-        )
-        observed.add(path.resolve())
-
-
-def files_of(cell: Cell) -> tuple[Path | None, ...]:
-    """Files that the cell names and a plan depends on."""
-    from elastocal.plugin_loader import is_plugin_file
-
-    robot, path = cell.robot, cell.design.test_path
-    meshes = [s.mesh for s in cell.workspace.obstacles]
-    meshes += [body.solid.mesh for body in cell.workspace.bodies]
-    plugins = [Path(name) for name in cell.plugins if is_plugin_file(name)]
-    test_path = None if path is None else path.file
-    return (robot.urdf, robot.dh, robot.masses, test_path, *meshes, *plugins)
-
-
-def write_all(plan: Plan, output: Path, programs: tuple[Path, ...], picture: Path | None) -> None:
-    """plan.csv, plan.json, robot programs and picture, each whole or not at all."""
-    from elastocal.files import atomic_write_text
-    from elastocal.saving import save_plan
-
-    chain = plan.model.chain
-    save_plan(plan, output, shlex.join(["elastocal", *sys.argv[1:]]))
-    for path in programs:
-        text = _program(path, plan.execution, chain, plan.configurations, plan.forces)
-        atomic_write_text(path, text)
-    if picture is not None:
-        from elastocal.report.plan_picture import write_plan_picture
-
-        write_plan_picture(
-            picture, plan.model.cell, chain, plan.q,
-            names=plan.configurations, group=plan.group, group_names=plan.group_names,
-        )  # fmt: skip
-
-
-def write_page(plan: Plan, path: Path, read: list[Path]) -> None:
-    """The report of a plan; `read` are the files it depends on."""
-    from elastocal.report.page import write_plan_report
-
-    command = shlex.join(["elastocal", *sys.argv[1:]])
-    write_plan_report(plan, path, command=command, inputs=list(dict.fromkeys(read)))
-
-
-def _program(
-    path: Path, execution: Execution, chain: Chain,
-    configurations: tuple[str, ...] = (), forces: Array | None = None,
-) -> str:  # fmt: skip
-    """The robot program to write to `path`."""
-    from elastocal.planning.programs import krl_program, urscript_program
-
-    text = krl_program if path.suffix.lower() == ".src" else urscript_program
-    try:
-        return text(execution, chain, configurations, forces, name=path.stem)
-    except InputError as error:
-        raise InputError(f"--program {path}: {error}") from None
-
-
-# elastocal design: which poses to measure.
 
 
 def _criteria() -> list[str]:
@@ -157,8 +53,7 @@ class NamingCriteria(TyperCommand):
         super().format_help(*args)
 
 
-@app.command(cls=NamingCriteria)
-@reporting_errors
+@command(cls=NamingCriteria)
 def design(
     cell: CellFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="The plan to write (CSV).")],
@@ -206,11 +101,11 @@ def design(
     picture: Annotated[
         Path | None, typer.Option(help="Picture of the poses to write (PNG, SVG).")
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")] = None,
+    report: ReportFile = None,
     jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
     seed: Seed = 0,
     as_json: Json = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Which poses should I measure?
 
@@ -225,10 +120,9 @@ def design(
 
     summary = output.with_suffix(".json")
     require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
-    programs = tuple(program or ())
-    check_suffixes(programs, picture)
-    written = [p for p in (output, summary, *programs, picture, report) if p is not None]
-    check_outputs(*written)
+    programs = program or []
+    _check_suffixes(programs, picture)
+    written = check_outputs(output, summary, *programs, picture, report)
     asked: dict[str, Any] = {
         "poses": poses,
         "criterion": criterion,
@@ -243,15 +137,14 @@ def design(
 
         progress("reading")
         wanted, options = design_request(
-            cell, **asked, augment=augment, knowledge=knowledge, fixed=tuple(fix or ()),
+            cell, **asked, augment=augment, knowledge=knowledge, fixed=fix or (),
             curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
         )  # fmt: skip
-        check_programs(wanted, programs)
+        _check_programs(wanted, programs)
         files = [p for p in (cell, augment, knowledge, *files_of(wanted)) if p is not None]
         check_apart(written, files)
         told = asked | {"fix": fix, "curve": curve, "effort": effort}
-        key = key_of(files, seed=seed, **told)
-        checkpoint = Checkpoint.beside(output, key, interrupts.check)
+        checkpoint = Checkpoint.beside(output, key_of(files, seed=seed, **told), interrupts.check)
         if checkpoint.begun:
             progress("going on with the design that was interrupted")
         try:
@@ -263,10 +156,12 @@ def design(
                 checkpoint.drop()
             raise
         interrupts.check()
-        write_all(plan, output, programs, picture)
+        _write_all(plan, output, programs, picture)
         if report is not None:
+            from elastocal.report.page import write_page
+
             progress("writing the report")
-            write_page(plan, report, files)
+            write_page(plan, report, list(dict.fromkeys(files)), repeated())
         checkpoint.clear()
     if as_json:
         typer.echo(summary.read_text(encoding="utf-8"), nl=False)
@@ -293,12 +188,72 @@ def _target(target: float | None, poses: int | None) -> float | None:
     return target * 1e-6
 
 
-def _numbers(text: str | None) -> tuple[int, ...]:
-    if text is None:
-        return ()
+def _numbers(text: str | None) -> list[int]:
     try:
-        return tuple(sorted({int(part) for part in text.split(",")}))
+        return [] if text is None else [int(part) for part in text.split(",")]
     except ValueError:
         raise InputError(
             f"--curve takes numbers of poses, as in 10,15,20; found '{text}'"
         ) from None
+
+
+def _check_suffixes(programs: list[Path], picture: Path | None) -> None:
+    """Refuse names that do not say which kind of file is wanted."""
+    for path in programs:
+        require(
+            path.suffix.lower() in PROGRAMS,
+            f"--program {path}: the suffix says the language, "
+            + " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items()),
+        )
+    require(
+        picture is None or picture.suffix.lower() in PICTURES,
+        f"--picture {picture}: name it {' or '.join(PICTURES)}",
+    )
+
+
+def _check_programs(cell: Cell, programs: list[Path]) -> None:
+    """Can these robot programs be written for this arm?  Told before the work, not after it."""
+    import numpy as np
+
+    from elastocal.cell.plan_wishes import Motion
+    from elastocal.model.choice import load_chain
+    from elastocal.planning.execution import Execution
+
+    if programs:
+        chain = load_chain(cell)
+        nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0.0, 0, 0)
+        for path in programs:
+            _program(path, nothing, chain)
+
+
+def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | None) -> None:
+    """plan.csv, plan.json, robot programs and picture, each whole or not at all."""
+    from elastocal.files import atomic_write_text
+    from elastocal.saving import save_plan
+
+    chain = plan.model.chain
+    save_plan(plan, output, repeated())
+    for path in programs:
+        text = _program(path, plan.execution, chain, plan.configurations, plan.forces)
+        atomic_write_text(path, text)
+    if picture is not None:
+        from elastocal.report.plan_picture import write_plan_picture
+
+        write_plan_picture(
+            picture, plan.model.cell, chain, plan.q,
+            names=plan.configurations, group=plan.group, group_names=plan.group_names,
+        )  # fmt: skip
+
+
+def _program(
+    path: Path, execution: Execution, chain: Chain,
+    configurations: tuple[str, ...] = (), forces: Array | None = None,
+) -> str:  # fmt: skip
+    """The robot program to write to `path`."""
+    from elastocal.planning.programs import krl_program, urscript_program
+
+    text = krl_program if path.suffix.lower() == ".src" else urscript_program
+    try:
+        return text(execution, chain, configurations, forces, name=path.stem)
+    except InputError as error:
+        raise InputError(f"--program {path}: {error}") from None

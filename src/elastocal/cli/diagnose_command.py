@@ -2,39 +2,44 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from elastocal.cli.app import (
     CellFile,
+    DataFile,
     Json,
+    Quiet,
+    ReportFile,
     Seed,
-    app,
+    check_apart,
     check_outputs,
+    command,
     console,
     progress_line,
-    reporting_errors,
+    repeated,
 )
-from elastocal.cli.design_command import check_apart, files_of
-from elastocal.cli.identify_command import load_inputs
-from elastocal.cli.outputs import Outputs, write_diagnosis
 from elastocal.errors import require
 from elastocal.text import json_text
+
+if TYPE_CHECKING:
+    from elastocal.diagnosis.diagnosis import ExtraPlan
 
 MOST_POSES = 10
 
 
-@app.command()
-@reporting_errors
+@command()
 def diagnose(
     cell: CellFile,
-    data: Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")],
+    data: DataFile,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Write the diagnosis as JSON.")
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")] = None,
+    report: ReportFile = None,
     plan: Annotated[
         Path | None,
         typer.Option(help="Write extra poses (CSV) that tell the rivals apart, where there are."),
@@ -52,7 +57,7 @@ def diagnose(
     ] = None,
     seed: Seed = 0,
     as_json: Json = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Why does the real arm still differ from the model?
 
@@ -61,38 +66,61 @@ def diagnose(
 
     Example: elastocal diagnose cell.toml data.csv -o diagnosis.json --report diagnosis.html
     """
-    from elastocal.cell.work_cell import read_cell
-    from elastocal.diagnosis.diagnose import DiagnosisOptions
-    from elastocal.diagnosis.diagnose import diagnose as run
+    from elastocal import verbs
     from elastocal.diagnosis.diagnosis import publish
-    from elastocal.model.effects import CATALOGUE
-    from elastocal.verbs import with_extra_poses
+    from elastocal.diagnosis.extended_cell import write_extended_cell
+    from elastocal.model.choice import cell_of
+    from elastocal.saving import save_diagnosis
 
-    if not set(without or ()) <= set(CATALOGUE):
-        read_cell(cell)  # its plug-ins may have the effect
-    # What can be wrong with the options is told before any file is read.
-    options = DiagnosisOptions(seed=seed, without=tuple(without or ()))
     require(
         poses is None or plan is not None,
         f"--poses {poses} has no meaning without --plan; name the file for the extra poses",
     )
-    outputs = Outputs(output, report, plan, cell_out)
-    check_outputs(*outputs.wanted)
+    written = check_outputs(output, report, plan, cell_out)
+    known = cell_of(cell)  # its plug-ins may have the effect
+    check_apart(written, [cell, data], known)
     with progress_line(quiet) as progress:
-        progress("reading")
-        model, (table,) = load_inputs(cell, [data])
-        check_apart(outputs.wanted, [cell, data, *files_of(model.cell)])
-        found = run(model, table, options, progress)
-        if plan is not None and found.open:
-            most = MOST_POSES if poses is None else poses
-            found = with_extra_poses(model, table, found, most, seed, progress)
-        content = publish(found, model, str(data))
-        told = write_diagnosis(outputs, found, content, model, cell, data, seed)
+        found = verbs.diagnose(
+            known, data, without=without or (), seed=seed, progress=progress,
+            extra_poses=None if plan is None else poses or MOST_POSES,
+        )  # fmt: skip
+        assert found.model is not None  # `diagnose` states it
+        kinds = found.model.chain.kinds
+        told = []
+        if output is not None:
+            save_diagnosis(found, output)
+            told.append(f"wrote {output}")
+        if report is not None:
+            from elastocal.report.page import write_page
+
+            write_page(found, report, [cell, data], repeated(), seed)
+            told.append(f"wrote {report}")
+        if plan is not None:
+            told.append(_write_extra_poses(plan, found.extra, kinds))
+        if cell_out is not None:
+            write_extended_cell(cell, cell_out, found.effects, found.model_keys)
+            added = ", ".join(f"{f.effect}:{f.where}" for f in found.effects)
+            told.append(f"wrote {cell_out} with {added or 'no further effect'}")
+            if added:
+                again = shlex.join(["elastocal", "identify", str(cell_out), str(data)])
+                told.append(f"to go on: {again} -o result.json")
     if as_json:
-        typer.echo(json_text(content))
+        typer.echo(json_text(publish(found, found.model, found.data)))
         return
     from elastocal.report.terminal import print_diagnosis
 
-    print_diagnosis(console(), found, model.chain.kinds)
+    print_diagnosis(console(), found, kinds)
     for line in told:
         typer.echo(line)
+
+
+def _write_extra_poses(path: Path, extra: ExtraPlan | None, kinds: Sequence[str]) -> str:
+    """Write the extra poses, and say so; or why there are none to write."""
+    from elastocal.saving import save_extra_poses
+
+    if extra is None:
+        return f"{path} not written: there are no rivals to tell apart"
+    if extra.plan is None:
+        return f"{path} not written: no pose tells the rivals apart"
+    save_extra_poses(path, extra.plan, kinds)
+    return f"wrote {path}: {extra.n_poses} poses, {len(extra.plan)} visits"

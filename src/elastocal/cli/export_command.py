@@ -10,14 +10,14 @@ import typer
 from elastocal.cli.app import (
     CellFile,
     Json,
+    Quiet,
     Seed,
-    app,
+    check_apart,
     check_outputs,
+    command,
     console,
     progress_line,
-    reporting_errors,
 )
-from elastocal.cli.design_command import check_apart, files_of
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
 
 
-@app.command(short_help="How do others get the calibrated arm: URDF, MuJoCo, DH table?")
-@reporting_errors
+@command(short_help="How do others get the calibrated arm: URDF, MuJoCo, DH table?")
 def export(
     cell: CellFile,
     result: Annotated[Path, typer.Argument(help="Result of identify (JSON).")],
@@ -71,25 +70,23 @@ def export(
     ] = 500,
     seed: Seed = 0,
     as_json: Json = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write the calibrated arm as URDF, MJCF, DH table or parameters, and say what that loses.
 
     Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
     """
     from elastocal.export.export import export as run
-    from elastocal.export.export import format_of
     from elastocal.files import atomic_write_text
     from elastocal.model.calibrated import read_calibrated
     from elastocal.saving import wish_of
 
-    chosen = format_of(output, format)
-    check_outputs(output)
-    wish = wish_of(output, chosen, load, frames, base_frame, temperature_c, time_s, poses, seed)
+    written = check_outputs(output)
+    wish = wish_of(output, format, load, frames, base_frame, temperature_c, time_s, poses, seed)
     with progress_line(quiet) as progress:
         progress("reading")
         calibrated = read_calibrated(cell, result)
-        check_apart([output], [cell, result, *files_of(calibrated.model.cell)])
+        check_apart(written, [cell, result], calibrated.model.cell)
         done = run(calibrated, wish, progress)
     atomic_write_text(output, done.text)
     if as_json:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,37 +9,40 @@ import typer
 
 from elastocal.cli.app import (
     CellFile,
+    DataFile,
     Json,
+    Quiet,
+    ReportFile,
     Seed,
-    app,
+    check_apart,
     check_outputs,
+    command,
     console,
     progress_line,
-    reporting_errors,
+    repeated,
 )
-from elastocal.cli.design_command import check_apart, files_of
 from elastocal.errors import InputError
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
-    from elastocal.measurements import Measurements
-    from elastocal.model.manipulator import Model
+    from elastocal.identification.result import Calibration
+    from elastocal.report.identification_view import Truth
+    from elastocal.report.page import Published
 
 MOST_BYTES = 1_000_000_000  # of a covariance as text: 6000 rows
 
 
-@app.command()
-@reporting_errors
+@command()
 def identify(
     cell: CellFile,
-    data: Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")],
+    data: DataFile,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Write the result as JSON.")
     ] = None,
     test: Annotated[
         Path | None, typer.Option(help="Measurements never fitted, to test the result on.")
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")] = None,
+    report: ReportFile = None,
     residuals: Annotated[
         Path | None, typer.Option(help="Write residuals of every reading as CSV.")
     ] = None,
@@ -101,47 +103,27 @@ def identify(
     jobs: Annotated[int, typer.Option(help="Processes of a bootstrap; -1 for all cores.")] = 1,
     seed: Seed = 0,
     as_json: Json = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """What are the parameters of my arm, and how sure are we?
 
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
     """
-    from elastocal.cell.work_cell import read_cell
-    from elastocal.cli.outputs import write_results
-    from elastocal.identification.identify import identify as run
-    from elastocal.identification.noise_structure import noise_models
-    from elastocal.identification.options import Options
-    from elastocal.verbs import knowledge_of
+    from elastocal import verbs
+    from elastocal.model.choice import cell_of
 
-    if noise not in noise_models():
-        read_cell(cell)  # its plug-ins may have the model
-    # What can be wrong with the options is told before any file is read.
-    chosen = Options(
-        method=method,  # type: ignore[arg-type]
-        noise=noise,
-        weights=weights,  # type: ignore[arg-type]
-        covariance=None if covariance is None else _read_covariance(covariance),
-        intervals=intervals,  # type: ignore[arg-type]
-        fixed=tuple(fix or ()),
-        bounded=bounded,
-        faulty=outliers,  # type: ignore[arg-type]
-        seed=seed,
-        jobs=jobs,
-    )
-    known = knowledge_of(knowledge, physical)
-    check_outputs(output, report, residuals)
+    written = check_outputs(output, report, residuals)
     inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
-    written = [p for p in (output, report, residuals) if p is not None]
-    check_apart(written, inputs)
+    known = cell_of(cell)  # its plug-ins may have the noise model
+    check_apart(written, inputs, known)
     with progress_line(quiet) as progress:
-        progress("reading")
-        model, tables = load_inputs(cell, [data] if test is None else [data, test])
-        check_apart(written, files_of(model.cell))
-        if known is not None:
-            constraints, prior = known.of(model)
-            chosen = replace(chosen, constraints=constraints, prior=prior)
-        result = run(model, tables[0], chosen, None if test is None else tables[1], progress)
+        result = verbs.identify(
+            known, data, test=test, fixed=fix or (), method=method, noise=noise,  # type: ignore[arg-type]
+            weights=weights, intervals=intervals, outliers=outliers,  # type: ignore[arg-type]
+            covariance=None if covariance is None else _read_covariance(covariance),
+            bounded=bounded, physical=physical, knowledge=knowledge, seed=seed, jobs=jobs,
+            progress=progress,
+        )  # fmt: skip
         write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
         typer.echo(json_text(result.to_json()))
@@ -153,13 +135,31 @@ def identify(
         typer.echo(f"wrote {path}")
 
 
-def load_inputs(cell_path: Path, data: list[Path]) -> tuple[Model, list[Measurements]]:
-    """Model and tables; every file is checked before anything is computed."""
-    from elastocal.model.manipulator import Model
+def write_results(
+    result: Calibration,
+    output: Path | None,
+    report: Path | None,
+    residuals: Path | None,
+    inputs: list[Path],
+    seed: int,
+    truth: Truth | None = None,
+    published: Published | None = None,
+) -> None:
+    """Write what was asked for, each file whole or not at all.
 
-    model = Model(cell_path)
-    tables = [model.read(path) for path in data]
-    return model.with_markers_of(*tables), tables
+    `inputs` are named with their hashes in the report, where `truth` and `published` (SI) stand
+    beside the estimates.
+    """
+    from elastocal.saving import save_residuals, write_json
+
+    if output is not None:
+        write_json(output, result.to_json())
+    if residuals is not None:
+        save_residuals(result, residuals)
+    if report is not None:
+        from elastocal.report.page import write_page
+
+        write_page(result, report, inputs, repeated(), seed, truth=truth, published=published)
 
 
 def _read_covariance(path: Path) -> Any:

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import Json, app, check_outputs, console, reporting_errors
-from elastocal.cli.design_command import check_apart, files_of
+from elastocal.cli.app import Json, check_apart, check_outputs, command, console
 from elastocal.errors import InputError, require
 from elastocal.text import json_text
-
-if TYPE_CHECKING:
-    from elastocal.importing.import_files import Imported
 
 PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, kuka, abb, ros"
 
 
-@app.command("import", short_help="How do tracker exports and joint logs become the table?")
-@reporting_errors
+@command("import", short_help="How do tracker exports and joint logs become the table?")
 def import_(
     files: Annotated[
         list[Path] | None,
@@ -59,8 +54,11 @@ def import_(
     Example: elastocal import points.txt poses.dat --preset spatialanalyzer --preset kuka
     --cell cell.toml --preview -o data.csv
     """
-    from elastocal.cli.outputs import left_out, summary
+    from elastocal.cell.work_cell import read_cell
+    from elastocal.cli.import_preview import left_out, print_preview, summary
+    from elastocal.importing.import_files import import_files
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
+    from elastocal.model.effects import CATALOGUE
 
     if show_preset is not None:
         typer.echo(preset_text(show_preset), nl=False)
@@ -75,15 +73,17 @@ def import_(
         mapping is not None or bool(preset),
         f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}",
     )
-    check_outputs(output)
-    check_apart([output], [*paths, mapping, cell])
+    written = check_outputs(output)
+    check_apart(written, [*paths, mapping, cell])
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
-    found = _import(paths, read, cell, output)
+    known = None
+    if cell is not None:
+        known = read_cell(cell, known_effects=CATALOGUE)
+        check_apart(written, [], known)
+    found = import_files(paths, read, known, str(output or "the table"))
     if as_json:
         typer.echo(json_text(summary(found, output)))
     elif preview:
-        from elastocal.cli.outputs import print_preview
-
         print_preview(console(), found)
     else:
         for warning in found.warnings:
@@ -103,16 +103,3 @@ def import_(
             f"wrote {len(table)} readings of {len(table.configuration_labels)} configurations to "
             f"{output}"
         )
-
-
-def _import(paths: list[Path], read: Any, cell: Path | None, output: Path | None) -> Imported:
-    from elastocal.importing.import_files import import_files
-
-    known = None
-    if cell is not None:
-        from elastocal.cell.work_cell import read_cell
-        from elastocal.model.effects import CATALOGUE
-
-        known = read_cell(cell, known_effects=CATALOGUE)
-        check_apart([output], files_of(known))
-    return import_files(paths, read, known, str(output or "the table"))

@@ -1,4 +1,4 @@
-"""elastocal simulate and demo: campaigns that were never measured."""
+"""elastocal simulate and demo: measurements of a plan that were never made; the example."""
 
 from __future__ import annotations
 
@@ -10,22 +10,19 @@ import typer
 from elastocal.cli.app import (
     CellFile,
     Json,
+    Quiet,
     Seed,
-    app,
+    check_apart,
     check_outputs,
+    command,
     console,
     progress_line,
-    reporting_errors,
 )
-from elastocal.cli.design_command import check_apart, files_of
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError
 from elastocal.text import json_text
 
-# elastocal simulate: synthetic measurements of a plan.
 
-
-@app.command(short_help="What would I measure, if …?")
-@reporting_errors
+@command(short_help="What would I measure, if …?")
 def simulate(
     cell: CellFile,
     plan: Annotated[Path, typer.Argument(help="Poses (CSV): configuration, q1_deg, …")],
@@ -59,36 +56,23 @@ def simulate(
     Example: elastocal simulate cell.toml plan.csv -o data.csv --set joint2.compliance=3e-7
     --load 0 0 -2600 --repeats 6
     """
-    import numpy as np
-
-    from elastocal.files import atomic_write_text
-    from elastocal.identification.start import check_limits
     from elastocal.measurements import write_measurements
-    from elastocal.model.arm import given_force
     from elastocal.model.manipulator import Model
-    from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
-    from elastocal.simulation.simulate import simulate as run
+    from elastocal.saving import write_json
+    from elastocal.verbs import simulated
 
-    force = given_force(load)
-    require(
-        0 <= draw < float("inf"),
-        f"--draw takes a factor of the typical sizes, 0 or more; found {draw:g}",
-    )
-    check_outputs(output, truth)
+    written = check_outputs(output, truth)
     model = Model(cell)
-    check_apart([output, truth], [cell, plan, *files_of(model.cell)])
+    check_apart(written, [cell, plan], model.cell)
     poses = model.read_plan(plan)
-    check_limits(model, poses)
-    rng = np.random.default_rng(seed)
-    values = draw_errors(model, draw, rng) if draw else {}
-    values |= dict(_assignment(text) for text in set_ or ())
-    x = values_from(model, values)
-    rows = expand_plan(poses, tuple(model.cell.tool.markers), repeats, force)
-    table = run(model, rows, x, rng, noise=not no_noise)
+    table, x = simulated(
+        model, poses, values=dict(_assignment(text) for text in set_ or ()), draw=draw, load=load,
+        repeats=repeats, noise=not no_noise, seed=seed,
+    )  # fmt: skip
     write_measurements(table, output, model.chain.kinds)
-    named = dict(zip(model.names, (float(v) for v in x), strict=True))
+    named = dict(zip(model.names, x.tolist(), strict=True))
     if truth is not None:
-        atomic_write_text(truth, json_text(named) + "\n")
+        write_json(truth, named)
     if as_json:
         summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
         typer.echo(json_text(summary | {"seed": seed, "truth": named}))
@@ -106,24 +90,20 @@ def _assignment(text: str) -> tuple[str, float]:
         ) from None
 
 
-# elastocal demo: the worked example.
-
-
-@app.command(short_help="See a KR 270 simulated and calibrated (Klimchik et al. 2013).")
-@reporting_errors
+@command(short_help="See a KR 270 simulated and calibrated (Klimchik et al. 2013).")
 def demo(
     folder: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for the example's files.")
     ] = Path("demo_out"),
     seed: Seed = 2013,
     as_json: Json = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
 
     Example: elastocal demo -o demo_out
     """
-    from elastocal.cli.outputs import write_results
+    from elastocal.cli.identify_command import write_results
     from elastocal.demo import run_demo
 
     with progress_line(quiet) as progress:
@@ -131,7 +111,7 @@ def demo(
         report = folder / "report.html"
         inputs = [done.cell, done.plan, done.data]
         write_results(
-            done.result, folder / "result.json", report, None, inputs, done.truth, seed,
+            done.result, folder / "result.json", report, None, inputs, seed, done.truth,
             done.published,
         )  # fmt: skip
     if as_json:

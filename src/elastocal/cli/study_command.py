@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from elastocal.cli.app import app, console, reporting_errors
+from elastocal.cli.app import command, console
 from elastocal.errors import InputError, require
 
 if TYPE_CHECKING:
@@ -24,8 +24,7 @@ FLAGS = {
 }  # fmt: skip
 
 
-@app.command(short_help="What happens in a thousand simulated campaigns?")
-@reporting_errors
+@command(short_help="What happens in a thousand simulated campaigns?")
 def study(
     folder: Annotated[Path, typer.Argument(help="Folder with study.py and study.toml.")],
     jobs: Annotated[

@@ -27,8 +27,8 @@ from elastocal.planning.bodies import (
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, drawn
-from elastocal.report.formatting import length, printable, short_name
-from elastocal.report.plan_view import first_stops, joint_text
+from elastocal.report.formatting import joint_heads, joint_texts, length, printable, short_name
+from elastocal.report.plan_view import first_stops
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
@@ -537,15 +537,13 @@ def plan_space(plan: Plan) -> Space:
     frames, flange = frames_at(cell, chain, plan.q)
     names = tuple(cell.tool.markers)
     local = np.array(list(cell.tool.markers.values())).reshape(-1, 3)
-    order = first_stops(plan)
+    order, heads = first_stops(plan), joint_heads(chain.kinds)
     poses = []
     for k, T in enumerate(flange):
-        joints = [
-            f"q{i + 1} {joint_text(v, kind)}{' °' if kind == 'revolute' else ' mm'}"
-            for i, (v, kind) in enumerate(zip(plan.q[k], chain.kinds, strict=True))
-        ]
+        joints = zip(map(str.split, heads), joint_texts(plan.q[k], chain.kinds), strict=True)
+        told = ", ".join(f"{name} {text} {unit}" for (name, unit), text in joints)
         group = plan.group_names[plan.group[k]]
-        about = [f"stop {order[k]}", *([group] if plan.level_joint else []), ", ".join(joints)]
+        about = [f"stop {order[k]}", *([group] if plan.level_joint else []), told]
         poses.append(
             Posed(
                 name=plan.configurations[k],

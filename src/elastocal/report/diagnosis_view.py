@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,6 @@ from elastocal.diagnosis.diagnosis import (
     EffectAt,
     ExtraPlan,
     FoundEffect,
-    Interval,
     Location,
     NoiseFloor,
 )
@@ -23,11 +22,15 @@ from elastocal.identification.error_budget import BudgetStep
 from elastocal.report.formatting import (
     ShownTable,
     capital,
+    counted,
     display,
     estimate,
+    faulty_rows,
+    gap_table,
+    joint_heads,
+    joint_texts,
     length,
     printable,
-    signed_change,
     significant,
     together,
 )
@@ -172,8 +175,8 @@ MOST_NAMED = 6
 def diagnosis_headline(d: Diagnosis) -> str:
     """The verdict in one sentence."""
     if d.verdict == "explained":
-        named = [f"{effect_at(f)} (probability {probability(f.probability)})" for f in d.effects]
-        return f"{capital(together(named))} explain{'s' * (len(named) == 1)} the gap."
+        named = together(_likely(d))
+        return f"{capital(named)} explain{'s' * (len(d.effects) == 1)} the gap."
     if d.verdict == "ambiguous":
         return _ambiguous(d)
     if d.verdict == "unknown_effect":
@@ -182,6 +185,10 @@ def diagnosis_headline(d: Diagnosis) -> str:
         "No further effect shows above the noise: the probability that there is none is "
         f"{probability(d.probability_nothing)}."
     )
+
+
+def _likely(d: Diagnosis) -> list[str]:
+    return [f"{effect_at(f)} (probability {probability(f.probability)})" for f in d.effects]
 
 
 def _ambiguous(d: Diagnosis) -> str:
@@ -193,10 +200,11 @@ def _ambiguous(d: Diagnosis) -> str:
 def _unknown(d: Diagnosis) -> str:
     text = "Something that is not in the catalogue makes the gap"
     if d.effects:
-        each = [f"{effect_at(f)} (probability {probability(f.probability)})" for f in d.effects]
-        named = together(each)
-        verb = "make" if len(each) > 1 else "makes"
-        text = f"{capital(named)} {verb} part of the gap; beside it, something not in the catalogue"
+        verb = "make" if len(d.effects) > 1 else "makes"
+        text = (
+            f"{capital(together(_likely(d)))} {verb} part of the gap; beside it, something not in "
+        )
+        text += "the catalogue"
         return f"{text} acts {location_text(d.location)}." if d.location else f"{text} acts."
     if d.location is None:
         return f"{text}; the data do not show where it sits."
@@ -338,13 +346,6 @@ def extra_lines(extra: ExtraPlan) -> list[str]:
     return lines + [capital(printable(text)) for text in extra.advice]
 
 
-BUDGET_HEADS = ("model", "held-out rms", "95 %", "change")
-CANDIDATE_HEADS = ("candidate", "probability", "evidence", "d", "seen from", "settings")
-PARAMETER_HEADS = ("parameter", "value", "± 95 %", "unit")
-STRUCTURE_HEADS = ("depends on", "p", "p, all tests")
-FAULTY_HEADS = ("line", "configuration", "marker", "error", "error / noise")
-PAIR_HEADS = ("rivals", "d so far", "d with the extra poses")
-UNTESTED_HEADS = ("effect", "why", "record or measure")
 Rows = list[tuple[str, ...]]
 HALF_WIDTHS = 1.959964  # standard deviations in half a 95 % interval
 
@@ -354,24 +355,15 @@ def error_steps(d: Diagnosis) -> tuple[BudgetStep, ...]:
     return tuple(step for step in d.budget if step.step != "noise_floor")
 
 
-def gap_rows(d: Diagnosis) -> Rows:
+def gap_rows(d: Diagnosis) -> ShownTable:
     """The gap budget step by step, the noise floor last."""
-    rows: Rows = []
-    before: float | None = None
-    for step in error_steps(d):
-        change = "" if before is None else signed_change(step.heldout_rms - before)
-        rows.append((name_of(step.step), length(step.heldout_rms), _ends(step.ci95), change))
-        before = step.heldout_rms
-    return [*rows, ("noise alone", length(d.gap.noise_floor), "", "")]
+    steps = [(name_of(step.step), step.heldout_rms, step.ci95) for step in error_steps(d)]
+    return gap_table(steps, ("noise alone", d.gap.noise_floor))
 
 
-def _ends(ci95: Interval) -> str:
-    return " to ".join(length(end) for end in ci95)
-
-
-def hypothesis_rows(d: Diagnosis, most: int) -> Rows:
+def hypothesis_rows(d: Diagnosis, most: int) -> ShownTable:
     """The best `most` candidates; nothing and an unknown effect are candidates as well."""
-    rows: Rows = [
+    rows = [
         (
             effect_at(c),
             probability(c.probability),
@@ -382,70 +374,68 @@ def hypothesis_rows(d: Diagnosis, most: int) -> Rows:
         )
         for c in d.candidates[:most]
     ]
-    return [
-        *rows,
-        ("an effect outside the catalogue", probability(d.probability_unknown), "", "", "", ""),
-        ("no further effect", probability(d.probability_nothing), "", "", "", ""),
-    ]
+    for name, p in (
+        ("an effect outside the catalogue", d.probability_unknown),
+        ("no further effect", d.probability_nothing),
+    ):
+        rows.append((name, probability(p), "", "", "", ""))
+    heads = ("candidate", "probability", "evidence", "d", "seen from", "settings")
+    return ShownTable(heads, rows, (0, 5))
 
 
-def added_parameter_rows(findings: Sequence[FoundEffect]) -> Rows:
+def added_parameter_rows(d: Diagnosis) -> ShownTable:
     """Fitted parameters of the effects found, with 95 % half widths, and their settings."""
     rows: Rows = []
-    for f in findings:
+    for f in d.effects:
         for p in f.parameters:
-            value, half, unit = estimate(p.value, HALF_WIDTHS * p.std, p.unit)
-            rows.append((printable(p.name), value, half, unit))
+            rows.append((printable(p.name), *estimate(p.value, HALF_WIDTHS * p.std, p.unit)))
         if f.settings:
             rows.append((effect_at(f), settings_text(f.settings), "", ""))
-    return rows
+    return ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3))
 
 
-def structure_rows(d: Diagnosis, most: int) -> Rows:
+def structure_rows(d: Diagnosis, most: int) -> ShownTable:
     """Tests that name no effect, the most conspicuous first."""
-    tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))
-    return [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests[:most]]
+    tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))[:most]
+    rows: Rows = [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests]
+    return ShownTable(("depends on", "p", "p, all tests"), rows)
 
 
-def faulty_rows(d: Diagnosis, most: int) -> Rows:
-    """Readings left out, the worst first."""
-    worst = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
-    return [
-        (
-            str(f.line),
-            printable(f.configuration),
-            printable(f.marker),
-            length(f.error),
-            significant(f.sigmas),
-        )
-        for f in worst[:most]
-    ]
-
-
-def pair_rows(extra: ExtraPlan) -> Rows:
+def pair_rows(d: Diagnosis) -> ShownTable:
     """How far apart each pair of rivals is before and after the extra poses."""
-    return [
+    rows = [
         (
             f"{name_of(pair.first)} or {name_of(pair.second)}",
             significant(pair.distance_before, 2),
             significant(pair.distance_after, 2),
         )
-        for pair in extra.pairs
+        for pair in (() if d.extra is None else d.extra.pairs)
     ]
+    return ShownTable(("rivals", "d so far", "d with the extra poses"), rows)
 
 
-def untested_rows(d: Diagnosis) -> Rows:
+def untested_rows(d: Diagnosis) -> ShownTable:
     """Effects that could not be tested, those with the same reason and remedy in one row."""
     groups: dict[tuple[str, str], dict[str, list[str]]] = {}
     for u in d.untested:
         effects = groups.setdefault((printable(u.reason), printable(u.advice)), {})
         effects.setdefault(plain_name(u.effect), []).append(place(u.where))
-    return [
+    rows = [
         (", ".join(f"{name} ({', '.join(at)})" for name, at in effects.items()), *reason)
         for reason, effects in groups.items()
     ]
+    return ShownTable(("effect", "why", "record or measure"), rows, (0, 1, 2))
 
 
+def alike(d: Diagnosis) -> list[str]:
+    """Sets of effects that these data cannot tell apart."""
+    return [together([effect_at(e) for e in rivals]) for rivals in d.indistinguishable]
+
+
+# What only the page shows.
+
+MOST_CANDIDATES = 40
+MOST_TESTS = 12
 MOST_PLACES = 8
 MOST_VISITS = 200
 BOX_WIDTH, GAP = 118, 18  # width of a box of the chain and the room between two, in SVG units
@@ -484,19 +474,14 @@ def extra_visits(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any] | None:
     """The extra poses as a table, in the order of measuring; None where there are none."""
     if d.extra is None or d.extra.plan is None:
         return None
-    import numpy as np
-
     plan = d.extra.plan
-    heads = ["order", "pose"]
-    heads += [f"q{i + 1} {'°' if kind == 'revolute' else 'mm'}" for i, kind in enumerate(kinds)]
-    heads.append("force N")
+    heads = ["order", "pose", *joint_heads(kinds), "force N"]
     heads += ["approach"] if plan.approach is not None else []
     heads += ["time min"] if plan.time is not None else []
-    shown = np.where(np.array(kinds) == "revolute", np.degrees(plan.q), plan.q * 1e3)
     table: list[tuple[str, ...]] = []
     for i in range(min(len(plan), MOST_VISITS)):
         row = [str(i + 1), printable(plan.configuration_labels[plan.configuration[i]])]
-        row += [f"{v + 0.0:.2f}" for v in shown[i]]
+        row += joint_texts(plan.q[i] + 0.0, kinds)
         row.append(" ".join(significant(f) for f in plan.force[i]))
         if plan.approach is not None:
             row.append(" ".join("+" if a > 0 else "−" if a < 0 else "0" for a in plan.approach[i]))
@@ -504,3 +489,34 @@ def extra_visits(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any] | None:
             row.append(f"{plan.time[i] / 60:.1f}")
         table.append(tuple(row))
     return {"table": ShownTable(tuple(heads), table, ()), "more": len(plan) - len(table)}
+
+
+def diagnosis_contents(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any]:
+    """Words and tables of the page, by the names that its template has for them."""
+    faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
+    return {
+        "headline": diagnosis_headline(d),
+        "tone": d.findings[0].severity,
+        "verdict": [(label, capital(text)) for label, text in diagnosis_lines(d)[1:]],
+        "steps": diagnosis_steps(d),
+        "warnings": [capital(printable(w)) for w in d.warnings],
+        "readings": f"{counted(d.n_readings, 'reading')} in "
+        f"{counted(d.n_configurations, 'configuration')}",
+        "data": printable(d.data),
+        "boxes": chain_boxes(d),
+        "box": BOX_WIDTH,
+        "places": likeliest_places(d),
+        "budget": gap_rows(d),
+        "parameters": added_parameter_rows(d),
+        "candidates": hypothesis_rows(d, MOST_CANDIDATES),
+        "n_candidates": len(d.candidates),
+        "alike": [capital(text) for text in alike(d)],
+        "structure": structure_rows(d, MOST_TESTS),
+        "n_structure": len(d.structure),
+        "noise": noise_floor_lines(d.noise, kinds),
+        "faulty": faulty_rows([(f, f.error, f.sigmas) for f in faulty]),
+        "untested": untested_rows(d),
+        "extra": [] if d.extra is None else extra_lines(d.extra),
+        "pairs": pair_rows(d),
+        "visits": extra_visits(d, kinds),
+    }

@@ -23,6 +23,7 @@ from elastocal.report.diagnosis_view import (
     probability,
 )
 from elastocal.report.formatting import display, length, short_name, significant
+from elastocal.report.plan_view import removed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -183,18 +184,25 @@ def waterfall_of_steps(
             axes.margins(x=0.1)
         else:
             axes.set_xlim(0, 1.15e6 * max(known, default=1.0))
-        axes.xaxis.set_major_formatter(lambda x, _: _tick(x))
-        axes.xaxis.set_minor_formatter(lambda x, _: "")
-        axes.set_xlabel("3-D rms error on held-out poses")
-        axes.grid(axis="y", visible=False)
+        micrometre_axis(axes, "3-D rms error on held-out poses")
         figure.legend(loc="outside upper right", ncols=4, fontsize=8)
 
     return drawn(draw, WIDTH, 1.1 + STEP_HEIGHT * len(rms), "Gap budget, step by step")
 
 
-def _tick(micrometres: float) -> str:
-    """ "50 µm", "2 mm"."""
-    return f"{micrometres:g} µm" if micrometres < 1e3 else f"{micrometres / 1e3:g} mm"
+def micrometre_axis(axes: Axes, label: str) -> None:
+    """Lengths in µm across, ticked as "50 µm" or "2 mm"."""
+    axes.xaxis.set_major_formatter(lambda x, _: f"{x:g} µm" if x < 1e3 else f"{x / 1e3:g} mm")
+    axes.xaxis.set_minor_formatter(lambda x, _: "")
+    axes.set_xlabel(label)
+    axes.grid(axis="y", visible=False)
+
+
+def _name_rows(axes: Axes, names: Sequence[str]) -> None:
+    """A row for each name, the first on top."""
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.grid(axis="y", visible=False)
 
 
 BAR_HEIGHT = 0.34  # inches per bar
@@ -228,12 +236,10 @@ def candidate_bars(d: Diagnosis) -> str:
             axes.barh(k, p, height=0.62, facecolor=colour if not hatch else "none",
                       edgecolor=colour, hatch=hatch)  # fmt: skip
             axes.text(p + 0.012, k, probability(p), va="center", fontsize=8)
-        axes.set_yticks(range(len(rows)), [_axis_name(name) for name, *_ in rows])
-        axes.set_ylim(len(rows) - 0.4, -0.6)
+        _name_rows(axes, [_axis_name(name) for name, *_ in rows])
         axes.set_xlim(0, 1.1)
         axes.set_xticks(np.linspace(0, 1, 6))
         axes.set_xlabel("probability")
-        axes.grid(axis="y", visible=False)
 
     return drawn(draw, WIDTH, 0.7 + BAR_HEIGHT * len(rows), "Probability of every candidate")
 
@@ -291,11 +297,9 @@ def plan_intervals(plan: Plan) -> str:
                 axes.plot([0, half], [k, k], color=SERIES[0], linewidth=5, solid_capstyle="butt")
                 axes.annotate(significant(half, 2), (half, k), (5, 0), va="center", fontsize=8,
                               textcoords="offset points")  # fmt: skip
-            axes.set_yticks(range(len(rows)), [name for name, _ in rows])
-            axes.set_ylim(len(rows) - 0.4, -0.6)
+            _name_rows(axes, [name for name, _ in rows])
             axes.set_xlim(0, 1.12 * max(half for _, half in rows))
             axes.set_xlabel(f"half width of the 95 % interval in {unit}")
-            axes.grid(axis="y", visible=False)
 
     return drawn(
         draw, WIDTH, 0.5 + PLAN_ROW * sum(heights) + 0.3 * len(units), "Predicted intervals"
@@ -305,9 +309,7 @@ def plan_intervals(plan: Plan) -> str:
 def plan_removed(plan: Plan) -> str:
     """How many candidates each rule of the cell removed, and how many are feasible."""
     c = plan.candidates
-    rows = [(name.replace("_", " "), n) for name, n in c.removed_by.items() if n]
-    rows.sort(key=lambda row: -row[1])
-    rows.append(("feasible", c.feasible))
+    rows = [*removed(plan), ("feasible", c.feasible)]
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -318,11 +320,9 @@ def plan_removed(plan: Plan) -> str:
             axes.barh(k, n, height=0.62, **look)
             axes.annotate(f"{n}", (n, k), (5, 0), textcoords="offset points", va="center",
                           fontsize=8)  # fmt: skip
-        axes.set_yticks(range(len(rows)), [name for name, _ in rows])
-        axes.set_ylim(len(rows) - 0.4, -0.6)
+        _name_rows(axes, [name for name, _ in rows])
         axes.set_xlim(0, 1.15 * max(n for _, n in rows) + 1)
         axes.set_xlabel(f"of {c.tried} poses tried")
-        axes.grid(axis="y", visible=False)
 
     return drawn(draw, WIDTH, 0.7 + 1.2 * PLAN_ROW * len(rows), "What removed candidates")
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 # SI unit → (factor, unit shown).
 SHOWN = {
@@ -168,6 +168,48 @@ class ShownTable:
     """
 
     heads: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
     words: tuple[int, ...] = (0,)
     groups: dict[int, str] = field(default_factory=dict)
+
+
+MOST_FAULTY = 100  # rows of the table of faulty readings
+
+
+def faulty_rows(found: Sequence[tuple[Any, float, float]]) -> dict[str, Any]:
+    """Readings beyond the noise as a table, and how many `more` there are than it holds.
+
+    `found`: each reading with its line and names, its error in m, and that over the noise.
+    """
+    rows = [
+        (str(o.line), printable(o.configuration), printable(o.marker), length(error),
+         significant(ratio))
+        for o, error, ratio in found[:MOST_FAULTY]
+    ]  # fmt: skip
+    heads = ("line", "configuration", "marker", "error", "error / noise")
+    return {"table": ShownTable(heads, rows, (1, 2)), "more": len(found) - len(rows)}
+
+
+def gap_table(
+    steps: Sequence[tuple[str, float, tuple[float, float]]], floor: tuple[str, float] | None
+) -> ShownTable:
+    """Steps (name, held-out rms in m, its 95 % interval) and what each changes; `floor` last."""
+    rows: list[tuple[str, ...]] = []
+    for k, (name, rms, ci95) in enumerate(steps):
+        change = signed_change(rms - steps[k - 1][1]) if k else ""
+        rows.append((name, length(rms), " to ".join(map(length, ci95)), change))
+    if floor is not None:
+        rows.append((floor[0], length(floor[1]), "", ""))
+    return ShownTable(("model", "held-out rms", "95 %", "change"), rows)
+
+
+def joint_heads(kinds: Sequence[str]) -> list[str]:
+    return [f"q{i + 1} {'°' if kind == 'revolute' else 'mm'}" for i, kind in enumerate(kinds)]
+
+
+def joint_texts(q: Iterable[float], kinds: Sequence[str], decimals: int = 2) -> list[str]:
+    """Joints q (n,) in rad or m as texts in ° or mm."""
+    return [
+        f"{math.degrees(v) if kind == 'revolute' else v * 1e3:.{decimals}f}"
+        for v, kind in zip(q, kinds, strict=True)
+    ]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from elastocal.errors import option
 from elastocal.identification.error_budget import ErrorBudget, stage_of
 from elastocal.identification.findings import (
     ABSORBED,
@@ -18,6 +20,7 @@ from elastocal.identification.findings import (
     next_steps,
     standings,
 )
+from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import (
     LOPSIDED,
     Calibration,
@@ -29,34 +32,41 @@ from elastocal.identification.result import (
 from elastocal.report.formatting import (
     ShownTable,
     Tone,
+    capital,
     counted,
     display,
     estimate,
+    faulty_rows,
+    gap_table,
     length,
-    minus,
     plain,
     printable,
     resolution,
     rounded_alike,
-    signed_change,
     significant,
     with_ends,
 )
 from elastocal.report.method_and_noise import (
     MOST_TOLD,
+    candidate_rows,
     constraints_line,
     does_noise_explain_it,
+    false_alarm_line,
     fault_lines,
+    group_name,
     intervals_line,
     method_and_weights,
     noise_model_line,
     prior_line,
+    ratio,
     repeats_line,
     shape_line,
+    size_rows,
 )
 
 LARGEST_TERMS = 4
 Truth = dict[str, float]
+Published = Mapping[str, tuple[float, float]]
 
 
 def names_of(result: Calibration, standing: str) -> list[str]:
@@ -348,9 +358,7 @@ class ParameterRow:
 
 
 def parameter_rows(
-    result: Calibration,
-    truth: Truth | None,
-    published: Mapping[str, tuple[float, float]] | None = None,
+    result: Calibration, truth: Truth | None, published: Published | None = None
 ) -> list[ParameterRow]:
     """One row per parameter, all of them, in the model's order.
 
@@ -360,15 +368,13 @@ def parameter_rows(
     effects = {p.name: p.effect.replace("_", " ") for p in result.model.parameters}
     for e in result.estimates:
         true = None if truth is None else truth.get(e.name)
-        value, half, unit, known = texts(e, true)
         nominal = e.nominal if nominal_known(result, e.name) else None
-        shown = "–" if nominal is None else minus(plain(display(nominal, e.unit)[0]))
         rows.append(
             ParameterRow(
-                printable(e.name), e.identifiable, minus(value), minus(half), unit, minus(known),
-                inside(true, e.ci95), shown, minus(short_note(result, e)),
-                bar=_bar(e, true, nominal, truth is not None), effect=effects[e.name],
-                published=_published((published or {}).get(e.name), e.unit),
+                printable(e.name), e.identifiable, *texts(e, true), inside(true, e.ci95),
+                nominal="–" if nominal is None else plain(display(nominal, e.unit)[0]),
+                note=short_note(result, e), bar=_bar(e, true, nominal, truth is not None),
+                effect=effects[e.name], published=_published((published or {}).get(e.name), e.unit),
             )
         )  # fmt: skip
     return rows
@@ -376,10 +382,22 @@ def parameter_rows(
 
 def _published(found: tuple[float, float] | None, unit: str) -> str:
     """ "0.287 ± 0.003", in the unit of the row."""
-    if found is None:
-        return "–"
-    value, half, _ = estimate(*found, unit)
-    return f"{minus(value)} ± {half}"
+    return "–" if found is None else " ± ".join(estimate(*found, unit)[:2])
+
+
+def combination_rows(result: Calibration, truth: Truth | None) -> list[ParameterRow]:
+    """One row per sum of parameters that the data determine although its members they do not."""
+    rows = []
+    for c in result.combinations:
+        true = None if truth is None else combination_truth(result, c, truth)
+        short, whole = shortened(c), shortened(c, len(c.terms))
+        rows.append(
+            ParameterRow(
+                short, True, *texts(c, true), inside(true, c.ci95),
+                whole=whole if whole != short else "", bar=_bar(c, true, None, truth is not None),
+            )
+        )  # fmt: skip
+    return rows
 
 
 def budget_steps(
@@ -392,31 +410,8 @@ def budget_steps(
 
 def budget_table(result: Calibration, budget: ErrorBudget) -> ShownTable:
     """The steps with their intervals and what each changes; noise alone last."""
-    rows: list[tuple[str, ...]] = []
-    before: float | None = None
-    for name, rms, ci95 in budget_steps(result, budget):
-        change = "" if before is None else signed_change(rms - before)
-        rows.append((name, length(rms), " to ".join(map(length, ci95)), change))
-        before = rms
-    if budget.floor is not None:
-        rows.append((budget.floor_name, length(budget.floor), "", ""))
-    return ShownTable(("model", "held-out rms", "95 %", "change"), rows)
-
-
-def combination_rows(result: Calibration, truth: Truth | None) -> list[ParameterRow]:
-    rows = []
-    for c in result.combinations:
-        true = None if truth is None else combination_truth(result, c, truth)
-        value, half, unit, known = texts(c, true)
-        short, whole = shortened(c), shortened(c, len(c.terms))
-        rows.append(
-            ParameterRow(
-                minus(short), True, minus(value), minus(half), unit, minus(known),
-                inside(true, c.ci95), whole=minus(whole) if whole != short else "",
-                bar=_bar(c, true, None, truth is not None),
-            )
-        )  # fmt: skip
-    return rows
+    floor = None if budget.floor is None else (budget.floor_name, budget.floor)
+    return gap_table(budget_steps(result, budget), floor)
 
 
 def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str, str]:
@@ -518,6 +513,12 @@ class Judgement:
     headline: str
     steps: tuple[str, ...]
 
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """Label and sentence of the verdict and of each step."""
+        steps = [("Next", printable(step)) for step in self.steps]
+        return [("Verdict", printable(self.headline)), *steps]
+
 
 def judgement(result: Calibration, sections: bool = False) -> Judgement:
     """How good the calibration is and what follows from it, as the result's findings say.
@@ -591,3 +592,70 @@ def _accuracy(result: Calibration) -> str:
     if math.isfinite(gain):
         text += f", {significant(gain, 2)} times better than by the nominal arm"
     return text
+
+
+# What the page shows, by the names that its template has for it.
+
+MOST_CORRELATIONS_LISTED = 30
+
+
+def identification_contents(
+    result: Calibration,
+    summary: ResidualSummary | None,
+    budget: ErrorBudget | None,
+    truth: Truth | None,
+    published: Published | None,
+) -> dict[str, Any]:
+    """Words and tables of the page."""
+    sentences = [text for label, text in noise_lines(result) if label != "Residuals"]
+    verdict = [
+        ("Identified", what_was_identified(result)),
+        ("Prediction", how_well_it_predicts(result)),
+        ("Noise", does_noise_explain_it(result)),
+        *held_lines(result),
+        *([("Truth", coverage_line(result, truth))] if truth else []),
+    ]
+    found: list[Estimate | Combination] = [*result.estimates, *result.combinations]
+    endless = any(math.isinf(end) for e in found for end in e.ci95 or ())
+    deviating = () if summary is None else summary.deviating
+    scatter = None if summary is None else summary.whole.held_out_mean_square
+    return {
+        "judgement": judgement(result, sections=True),
+        "compared": truth is not None,
+        "published": bool(published),
+        "lopsided": any_lopsided(found),
+        "verdict": verdict,
+        "readings": readings(result),
+        "method": _sentence(method_and_weights(result)),
+        "intervals": _sentence(f"intervals are {intervals_line(result)}"),
+        "dof": result.dof,
+        "noise_sentences": sentences,
+        "shape": None if summary is None else shape_line(summary),
+        "sizes": size_rows(result.noise),
+        "candidates": candidate_rows(result.noise),
+        "deviating": [(group_name(by, g), g.n, ratio(g), f"{g.p_holm:.1g}") for by, g in deviating],
+        "held_out_scatter": "" if scatter is None else (
+            f"In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
+            "the noise model."
+        ),
+        "error_line": _sentence(error_line(result)),
+        "warnings": [printable(w) for w in result.warnings],
+        "budget": None if budget is None else budget_table(result, budget),
+        "floor": "Nothing says how large the noise alone is."
+        if budget is None or budget.floor is None
+        else f"The dashed line is what noise alone gives ({budget.floor_name}).",
+        "parameters": parameter_rows(result, truth, published),
+        "combinations": combination_rows(result, truth),
+        "endless": " An interval without an end runs to the edge." if endless else "",
+        "undetermined": [_sentence(line) for line in undetermined_lines(result)],
+        "correlations": correlation_lines(result, MOST_CORRELATIONS_LISTED),
+        "faults": fault_lines(result),
+        "false_alarm": false_alarm_line(result),
+        "outliers": faulty_rows([(o, o.residual, o.ratio) for o in result.outliers]),
+        "excluded": faulty_rows([(o, o.residual, o.ratio) for o in result.excluded]),
+        "drop": option("outliers", "drop"),
+    }  # fmt: skip
+
+
+def _sentence(text: str) -> str:
+    return f"{capital(text)}."

@@ -12,14 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elastocal.compensation.compensate import Compensation, commands_csv, joint_columns, summary
+from elastocal.compensation.compensate import (
+    Compensation,
+    commands_csv,
+    in_file_units,
+    joint_columns,
+    summary,
+)
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import InputError
 from elastocal.identification.result import Calibration
 from elastocal.planning.plan import Plan
 from elastocal.report.diagnosis_view import (
-    BUDGET_HEADS,
-    CANDIDATE_HEADS,
     diagnosis_lines,
     diagnosis_steps,
     effect_at,
@@ -28,7 +32,7 @@ from elastocal.report.diagnosis_view import (
     hypothesis_rows,
     name_of,
 )
-from elastocal.report.formatting import display, length, printable
+from elastocal.report.formatting import display, length, minus, printable
 from elastocal.report.identification_view import (
     combination_rows,
     judgement,
@@ -36,7 +40,7 @@ from elastocal.report.identification_view import (
     summary_lines,
 )
 from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
-from elastocal.report.plan_view import plan_lines
+from elastocal.report.plan_view import first_stops, plan_lines
 from elastocal.report.residual_view import residuals_of
 from elastocal.report.terminal import (
     compensation_text,
@@ -51,17 +55,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_BARS = 40
-
-
-@dataclass(frozen=True)
-class Bars:
-    """Horizontal intervals: `value`, and `low` to `high` where they are finite."""
-
-    names: tuple[str, ...]
-    value: Array
-    low: Array
-    high: Array
-    axis: str
 
 
 def residuals(result: Calibration, interactive: bool) -> Any:
@@ -119,12 +112,9 @@ def parameters(result: Calibration, interactive: bool) -> Any:
     ends = np.array([e.ci95 for e in kept], dtype=float).reshape(-1, 2)
     nominal = np.array([e.nominal for e in kept])
     half = np.maximum((ends[:, 1] - ends[:, 0]) / 2, np.finfo(float).tiny)
-    bars = Bars(
-        tuple(e.name for e in kept), value / half, (ends[:, 0] - nominal) / half,
-        (ends[:, 1] - nominal) / half,
-        "deviation from nominal, in half widths of the 95 % interval",
-    )  # fmt: skip
-    return _bars(bars, interactive)
+    axis = "deviation from nominal, in half widths of the 95 % interval"
+    ends = (ends - nominal[:, None]) / half[:, None]
+    return _bars([e.name for e in kept], value / half, axis, interactive, ends)
 
 
 def intervals(plan: Plan, interactive: bool) -> Any:
@@ -132,11 +122,7 @@ def intervals(plan: Plan, interactive: bool) -> Any:
     shown = [display(p.half_width, p.unit) for p in plan.predicted[:MOST_BARS]]
     names = [f"{p.name} ({unit})" for p, (_, unit) in zip(plan.predicted, shown, strict=False)]
     value = np.array([v for v, _ in shown])
-    nothing = np.full(len(value), np.nan)
-    return _bars(
-        Bars(tuple(names), value, nothing, nothing, "half width of the 95 % interval"), interactive,
-        logarithmic=True,
-    )  # fmt: skip
+    return _bars(names, value, "half width of the 95 % interval", interactive, logarithmic=True)
 
 
 def budget(d: Diagnosis, interactive: bool) -> Any:
@@ -145,10 +131,9 @@ def budget(d: Diagnosis, interactive: bool) -> Any:
     ends = np.array([s.ci95 for s in steps]).reshape(-1, 2) * 1e6
     names = [*(name_of(s.step) for s in steps), "noise alone"]
     value = np.array([*(s.heldout_rms for s in steps), d.gap.noise_floor]) * 1e6
-    low, high = (np.append(ends[:, k], np.nan) for k in (0, 1))
-    positive = bool((value > 0).all())
-    bars = Bars(tuple(names), value, low, high, "rms error on held-out poses in µm")
-    return _bars(bars, interactive, logarithmic=positive and value.max() > 8 * value.min())
+    ends = np.vstack([ends, [np.nan, np.nan]])
+    wide = bool((value > 0).all()) and value.max() > 8 * value.min()
+    return _bars(names, value, "rms error on held-out poses in µm", interactive, ends, wide)
 
 
 def candidates(d: Diagnosis, interactive: bool) -> Any:
@@ -156,8 +141,7 @@ def candidates(d: Diagnosis, interactive: bool) -> Any:
     best = d.candidates[:10]
     names = [*map(effect_at, best), "an effect outside the catalogue", "no further effect"]
     value = np.array([*(c.probability for c in best), d.probability_unknown, d.probability_nothing])
-    nothing = np.full(len(value), np.nan)
-    return _bars(Bars(tuple(names), value, nothing, nothing, "probability"), interactive)
+    return _bars(names, value, "probability", interactive)
 
 
 def errors(c: Compensation, interactive: bool) -> Any:
@@ -173,9 +157,8 @@ def uncertainties(c: Compensation, interactive: bool) -> Any:
 def _of_targets(c: Compensation, metres: Array, axis: str, interactive: bool) -> Any:
     rows = np.flatnonzero(c.reached)[:MOST_BARS]
     table = c.targets.table
-    names = tuple(table.configuration_labels[table.configuration[i]] for i in rows)
-    nothing = np.full(len(rows), np.nan)
-    return _bars(Bars(names, metres[rows] * 1e6, nothing, nothing, axis), interactive)
+    names = [table.configuration_labels[table.configuration[i]] for i in rows]
+    return _bars(names, metres[rows] * 1e6, axis, interactive)
 
 
 def poses(plan: Plan, interactive: bool) -> Any:
@@ -219,19 +202,24 @@ def poses(plan: Plan, interactive: bool) -> Any:
     return figure.update_layout(scene={"aspectmode": "data", **axes}, height=640)
 
 
-def _bars(bars: Bars, interactive: bool, logarithmic: bool = False) -> Any:
-    n = len(bars.names)
-    below, above = (np.abs(bars.value - end) for end in (bars.low, bars.high))
+def _bars(
+    names: Sequence[str], value: Array, axis: str, interactive: bool, ends: Array | None = None,
+    logarithmic: bool = False,
+) -> Any:  # fmt: skip
+    """Dots at `value` (n,), with intervals to both `ends` (n, 2) where these are finite."""
+    n = len(names)
+    ends = np.full((n, 2), np.nan) if ends is None else ends
+    below, above = np.abs(value[:, None] - ends).T
     if interactive:
         import plotly.graph_objects as go
 
         error = {"type": "data", "symmetric": False, "array": np.nan_to_num(above),
                  "arrayminus": np.nan_to_num(below)}  # fmt: skip
         figure = go.Figure(
-            go.Scatter(x=bars.value, y=[_plain(name) for name in bars.names], mode="markers",
+            go.Scatter(x=value, y=[_plain(name) for name in names], mode="markers",
                        marker={"color": COLOURS[0], "size": 9}, error_x=error)
         )  # fmt: skip
-        figure.update_xaxes(title_text=bars.axis, type="log" if logarithmic else "linear")
+        figure.update_xaxes(title_text=axis, type="log" if logarithmic else "linear")
         figure.update_yaxes(autorange="reversed")
         return figure.update_layout(height=140 + 28 * n, template="plotly_white")
 
@@ -239,14 +227,14 @@ def _bars(bars: Bars, interactive: bool, logarithmic: bool = False) -> Any:
         axes = figure.subplots()
         at = np.arange(n)
         widths = np.nan_to_num(np.vstack([below, above]))
-        axes.errorbar(bars.value, at, xerr=widths, fmt="o", color=COLOURS[0], elinewidth=1.6)
-        axes.set_yticks(at, [_axis_label(printable(name)) for name in bars.names])
+        axes.errorbar(value, at, xerr=widths, fmt="o", color=COLOURS[0], elinewidth=1.6)
+        axes.set_yticks(at, [_axis_label(printable(name)) for name in names])
         axes.set_ylim(n - 0.4, -0.6)
         if logarithmic:
             axes.set_xscale("log")
-        elif not (bars.value < 0).any():
-            axes.set_xlim(left=min(0.0, *np.nan_to_num(bars.low)) if n else 0.0)
-        axes.set_xlabel(bars.axis)
+        elif not (value < 0).any():
+            axes.set_xlim(left=min(0.0, *np.nan_to_num(ends[:, 0])) if n else 0.0)
+        axes.set_xlabel(axis)
         axes.grid(axis="x")
 
     return _figure(draw, (8.0, 0.9 + 0.32 * max(n, 1)))
@@ -320,14 +308,14 @@ def view_of(result: object) -> View:
 
 def _identification_html(result: Calibration) -> str:
     known = [row for row in parameter_rows(result, None) if row.determined]
-    rows = [(r.name, r.value, r.interval, r.unit, r.nominal) for r in known]
-    rows += [(r.name, r.value, r.interval, r.unit, "") for r in combination_rows(result, None)]
+    rows = [
+        (r.name if r.effect else minus(r.name), minus(r.value), minus(r.interval), r.unit,
+         minus(r.nominal))
+        for r in (*known, *combination_rows(result, None))
+    ]  # fmt: skip
     heads = ("parameter", "value", "95 %", "unit", "nominal")
     lines = [(label, text) for label, _, text in (x.partition(": ") for x in summary_lines(result))]
-    judged = judgement(result)
-    lines += [("Verdict", printable(judged.headline))]
-    lines += [("Next", printable(step)) for step in judged.steps]
-    return _table("Identification", heads, rows) + _lines(lines)
+    return _table("Identification", heads, rows) + _lines(lines + judgement(result).lines)
 
 
 def _plan_html(plan: Plan) -> str:
@@ -337,10 +325,11 @@ def _plan_html(plan: Plan) -> str:
 
 
 def _diagnosis_html(d: Diagnosis) -> str:
+    budget, best = gap_rows(d), hypothesis_rows(d, MOST_CANDIDATES_SHOWN)
     return (
         _lines(diagnosis_lines(d) + [("Next", step) for step in diagnosis_steps(d)])
-        + _table("Gap budget (3-D rms error on held-out poses)", BUDGET_HEADS, gap_rows(d))
-        + _table("Candidates", CANDIDATE_HEADS, hypothesis_rows(d, MOST_CANDIDATES_SHOWN))
+        + _table("Gap budget (3-D rms error on held-out poses)", budget.heads, budget.rows)
+        + _table("Candidates", best.heads, best.rows)
     )
 
 
@@ -421,15 +410,11 @@ def _plan_frame(plan: Plan) -> pd.DataFrame:
     import pandas as pd
 
     columns: dict[str, Any] = {"configuration": list(plan.configurations)}
-    for j, kind in enumerate(plan.model.chain.kinds):
-        q = plan.q[:, j]
-        if kind == "revolute":
-            columns[f"q{j + 1}_deg"] = np.degrees(q)
-        else:
-            columns[f"q{j + 1}_mm"] = q * 1e3
+    kinds = plan.model.chain.kinds
+    columns |= dict(zip(joint_columns(kinds), in_file_units(plan.q, kinds).T, strict=True))
     if plan.level_joint is not None:
         columns["level"] = plan.group + 1
-    order = {stop.pose: k + 1 for k, stop in reversed(list(enumerate(plan.execution.stops)))}
+    order = first_stops(plan)
     columns["order"] = [order.get(k) for k in range(len(plan.q))]
     if (plan.load >= 0).any():
         for k, axis in enumerate("xyz"):

@@ -15,7 +15,7 @@ from elastocal.errors import require
 from elastocal.files import atomic_writer
 from elastocal.model.chain import Chain
 from elastocal.planning.bodies import CORNERS, mesh_hull
-from elastocal.planning.collision import Kinematics
+from elastocal.report.arm_view import frames_at
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
@@ -157,14 +157,10 @@ def draw_plan(
 
 def pose_lines(cell: Cell, chain: Chain, q: Array) -> tuple[Array, Array]:
     """Polylines (N, n + 2, 3) base – joints – flange, and markers (N, M, 3), of the data."""
-    kinematics = Kinematics(cell, chain)
-    poses = kinematics.poses(q, np.zeros(3))
-    base = np.broadcast_to(kinematics.T_data_base[:3, 3], (len(q), 1, 3))
-    arms = np.concatenate(
-        [base, poses.frames[:, : chain.n_joints, :3, 3], poses.flange[:, None, :3, 3]], axis=1
-    )
+    frames, flange = frames_at(cell, chain, q)
+    arms = np.concatenate([frames[:, :, :3, 3], flange[:, None, :3, 3]], axis=1)
     local = np.array(list(cell.tool.markers.values())).reshape(-1, 3)
-    at = local @ poses.flange[:, :3, :3].transpose(0, 2, 1) + poses.flange[:, None, :3, 3]
+    at = local @ flange[:, :3, :3].transpose(0, 2, 1) + flange[:, None, :3, 3]
     return arms, at
 
 

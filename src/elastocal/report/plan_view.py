@@ -3,35 +3,37 @@
 from __future__ import annotations
 
 import math
-
-import numpy as np
+from typing import Any
 
 from elastocal.errors import option
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.plan import Plan, Predicted, Reason
-from elastocal.report.formatting import ShownTable, Tone, counted, display, printable, significant
+from elastocal.report.formatting import (
+    ShownTable,
+    Tone,
+    capital,
+    counted,
+    display,
+    joint_heads,
+    joint_texts,
+    printable,
+    significant,
+)
 
 TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "serves (standard deviation without it)"
-
-
-def joint_text(value: float, kind: str, decimals: int = 2) -> str:
-    """A joint's position in ° or mm."""
-    return f"{np.degrees(value) if kind == 'revolute' else value * 1e3:.{decimals}f}"
 
 
 def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable:
     """Joint values, load, place in the order of execution, and what the pose is there for."""
     kinds = plan.model.chain.kinds
     loads = len(plan.forces) > 1 and bool((plan.load >= 0).any())
-    heads = ["pose"]
-    heads += [f"q{i + 1} {'°' if kind == 'revolute' else 'mm'}" for i, kind in enumerate(kinds)]
-    heads += [*(["load N"] if loads else []), "order", *([SERVES] if reasons else [])]
+    heads = ["pose", *joint_heads(kinds), *(["load N"] if loads else []), "order"]
+    heads += [SERVES] if reasons else []
     order = first_stops(plan)
     rows: list[tuple[str, ...]] = []
     for k, reason in enumerate(plan.reasons):
-        row = [plan.configurations[k]]
-        row += [joint_text(v, kind, decimals) for v, kind in zip(plan.q[k], kinds, strict=True)]
+        row = [plan.configurations[k], *joint_texts(plan.q[k], kinds, decimals)]
         if loads:
             row.append(force_text(plan, int(plan.load[k])))
         rows.append((*row, str(order[k]), *([served(reason)] if reasons else [])))
@@ -49,9 +51,7 @@ def force_text(plan: Plan, load: int) -> str:
 
 def reason_rows(plan: Plan) -> ShownTable:
     """What each pose is there for."""
-    rows: list[tuple[str, ...]] = [
-        (name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)
-    ]
+    rows = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
     return ShownTable(("pose", SERVES), rows, (1,))
 
 
@@ -84,23 +84,24 @@ def _partners(p: Predicted) -> str:
 def curve_rows(plan: Plan) -> ShownTable:
     """The criterion against the number of poses."""
     heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
-    rows: list[tuple[str, ...]] = [
+    rows = [
         (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
         for s in plan.curve
     ]
     return ShownTable(heads, rows, ())
 
 
+def removed(plan: Plan) -> list[tuple[str, int]]:
+    """How many candidates each rule of the cell removed, the hardest rule first."""
+    items = sorted(plan.candidates.removed_by.items(), key=lambda item: -item[1])
+    return [(name.replace("_", " "), n) for name, n in items if n]
+
+
 def removal_rows(plan: Plan) -> ShownTable:
-    """Which rule of the cell removed how many candidates, the hardest rule first."""
-    c = plan.candidates
-    removed = sorted(c.removed_by.items(), key=lambda item: -item[1])
-    rows: list[tuple[str, ...]] = [
-        (name.replace("_", " "), str(n), f"{100 * n / max(c.tried, 1):.1f} %")
-        for name, n in removed
-        if n
-    ]
-    rows.append(("feasible", str(c.feasible), f"{100 * c.feasible / max(c.tried, 1):.1f} %"))
+    """What became of the candidates, rule by rule."""
+    tried = max(plan.candidates.tried, 1)
+    counts = [*removed(plan), ("feasible", plan.candidates.feasible)]
+    rows: list[tuple[str, ...]] = [(name, str(n), f"{100 * n / tried:.1f} %") for name, n in counts]
     return ShownTable(("rule", "candidates", "share"), rows)
 
 
@@ -117,12 +118,11 @@ def stop_rows(plan: Plan) -> ShownTable:
                 "by hand" if stop.change_after is not None else "",
                 str(len(stop.via)),
                 f"{stop.travel:.1f}",
-                *(joint_text(v, kind) for v, kind in zip(stop.q, kinds, strict=True)),
+                *joint_texts(stop.q, kinds),
             )
         )
-    joints = tuple(f"q{i + 1} {'°' if k == 'revolute' else 'mm'}" for i, k in enumerate(kinds))
-    heads = ("stop", "pose", "load N", "load change", "points in between", "travel s", *joints)
-    return ShownTable(heads, rows, (2, 3))
+    heads = ("stop", "pose", "load N", "load change", "points in between", "travel s")
+    return ShownTable((*heads, *joint_heads(kinds)), rows, (2, 3))
 
 
 CLOSE = 0.95  # efficiency from which a plan is called near the best
@@ -233,8 +233,7 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
 
 def _candidate_line(plan: Plan) -> tuple[str, str]:
     c = plan.candidates
-    removed = sorted(c.removed_by.items(), key=lambda item: -item[1])
-    told = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in removed if n)
+    told = ", ".join(f"{name} {n}" for name, n in removed(plan))
     text = f"{c.feasible} feasible of {c.tried} tried"
     return "Candidates", text + (f"; removed by {told}." if told else "; no rule removed any.")
 
@@ -276,3 +275,22 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     if via:
         text += f", {via} points in between to get around obstacles"
     return "Execution", f"{text}, {e.total / 60:.0f} min in all; every move checked."
+
+
+def plan_contents(plan: Plan) -> dict[str, Any]:
+    """Words and tables of the page, by the names that its template has for them."""
+    lines = plan_lines(plan)
+    return {
+        "lead": plan_lead(plan),
+        "headline": plan_headline(plan),
+        "tone": plan_tone(plan),
+        "verdict": [(label, capital(text)) for label, text in lines if label != "Warning"],
+        "warnings": [text for label, text in lines if label == "Warning"],
+        "steps": plan_steps(plan),
+        "poses": pose_rows(plan, reasons=False),
+        "reasons": reason_rows(plan),
+        "stops": stop_rows(plan),
+        "intervals": interval_rows(plan),
+        "removed": removal_rows(plan),
+        "curve": curve_rows(plan),
+    }

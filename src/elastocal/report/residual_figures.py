@@ -12,11 +12,20 @@ from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.estimates import CORRELATED
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.report.arm_view import Space
-from elastocal.report.figures import FAINT, INK, SERIES, dots, drawn
+from elastocal.report.arm_view import Space, marker_positions, space_picture
+from elastocal.report.figures import (
+    FAINT,
+    INK,
+    SERIES,
+    dots,
+    drawn,
+    micrometre_axis,
+    waterfall_of_steps,
+)
 from elastocal.report.formatting import length, short_name, significant
-from elastocal.report.identification_view import rms_by_kind
+from elastocal.report.identification_view import budget_steps, rms_by_kind
 from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
 from elastocal.units import Array
 
@@ -123,10 +132,7 @@ def errors(result: Calibration) -> str:
             axes.margins(x=0.25)
         else:
             axes.set_xlim(0, 1.25e6 * max(sizes, default=1.0))
-        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g} µm" if x < 1e3 else f"{x / 1e3:g} mm")
-        axes.xaxis.set_minor_formatter(lambda x, _: "")
-        axes.set_xlabel("rms error")
-        axes.grid(axis="y", visible=False)
+        micrometre_axis(axes, "rms error")
 
     return drawn(draw, WIDTH / 2, 2.9, "Nominal, fitted, held-out and test error")
 
@@ -417,6 +423,19 @@ def correlations(result: Calibration) -> tuple[list[str], Array]:
     return names, np.clip(r, -1.0, 1.0)
 
 
+def residual_figures(
+    model: Model, observed: Observations, x: Array, residuals: Residuals, space: Space, title: str
+) -> dict[str, str]:
+    """Where, when and in which poses an arm at parameter values x (parameters,) errs, as SVG."""
+    positions = marker_positions(model, observed, x)
+    return {
+        "against_joints": against_joints(model.chain.kinds, residuals),
+        "over_time": over_time(observed, residuals),
+        "by_region": by_region(positions, residuals.value[:, : residuals.positions]),
+        "space": space_picture(space, title),
+    }
+
+
 def drawn_for(
     result: Calibration,
     residuals: Residuals,
@@ -424,29 +443,23 @@ def drawn_for(
     budget: ErrorBudget | None,
     space: Space,
 ) -> dict[str, str]:
-    """Name → SVG."""
-    from elastocal.report.arm_view import marker_positions, space_picture
-    from elastocal.report.figures import waterfall_of_steps
-    from elastocal.report.identification_view import budget_steps
-
-    distribution = {} if summary is None else {
-        "histogram": histogram(summary),
-        "scores": scores(summary),
-        "groups": scatter_by_group(summary),
-        "histograms": histograms_by_group(summary),
-    }  # fmt: skip
-    positions = marker_positions(result.model, result.observations, result.x)
-    return {
-        **distribution,
-        "waterfall": "" if budget is None else waterfall_of_steps(
-            budget_steps(result, budget), budget.floor, budget.floor_name
-        ),
+    """Every figure of an identification's page: name → SVG, empty where nothing is to be drawn."""
+    found = residual_figures(
+        result.model, result.observations, result.x, residuals, space,
+        "Residuals as arrows on the posed arm",
+    ) | {
         "errors": errors(result),
         "held_out": held_out(result, residuals),
         "by_configuration": by_configuration(residuals),
-        "against_joints": against_joints(result.model.chain.kinds, residuals),
-        "over_time": over_time(result.observations, residuals),
-        "by_region": by_region(positions, residuals.value[:, : residuals.positions]),
         "matrix": correlation_matrix(result),
-        "space": space_picture(space, "Residuals as arrows on the posed arm"),
+        "waterfall": "",
     }  # fmt: skip
+    if budget is not None:
+        steps = budget_steps(result, budget)
+        found["waterfall"] = waterfall_of_steps(steps, budget.floor, budget.floor_name)
+    if summary is not None:
+        found["histogram"] = histogram(summary)
+        found["scores"] = scores(summary)
+        found["groups"] = scatter_by_group(summary)
+        found["histograms"] = histograms_by_group(summary)
+    return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
 from typing import Any
 
@@ -14,48 +14,30 @@ from rich.text import Text
 from elastocal.compensation.compensate import Compensation, summary
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.identification.findings import ALONE
-from elastocal.identification.result import Calibration, Combination, Estimate
+from elastocal.identification.result import Calibration
 from elastocal.planning.plan import Plan
 from elastocal.report.diagnosis_view import (
-    BUDGET_HEADS,
-    CANDIDATE_HEADS,
-    PAIR_HEADS,
-    PARAMETER_HEADS,
-    UNTESTED_HEADS,
-    Rows,
     added_parameter_rows,
+    alike,
     diagnosis_lines,
     diagnosis_steps,
-    effect_at,
     gap_rows,
     hypothesis_rows,
     noise_floor_lines,
     pair_rows,
     untested_rows,
 )
-from elastocal.report.formatting import (
-    ShownTable,
-    capital,
-    display,
-    length,
-    plain,
-    printable,
-    together,
-)
+from elastocal.report.formatting import ShownTable, capital, length, printable
 from elastocal.report.identification_view import (
+    ParameterRow,
     Truth,
     any_lopsided,
-    combination_truth,
+    combination_rows,
     half_head,
-    inside,
     judgement,
     names_of,
-    nominal_known,
-    short_note,
-    shortened,
-    signed_half,
+    parameter_rows,
     summary_lines,
-    texts,
     undetermined_lines,
 )
 from elastocal.report.method_and_noise import candidate_rows, size_rows
@@ -96,7 +78,7 @@ def _plain_text(printed: Callable[[Console], None]) -> str:
     return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
 
 
-def titled(title: str) -> Table:
+def titled(title: str | None) -> Table:
     """An empty table under a title, with a rule below its heads and no frame."""
     return Table(
         title=title,
@@ -106,6 +88,28 @@ def titled(title: str) -> Table:
         pad_edge=False,
         collapse_padding=True,
     )
+
+
+def table_of(title: str | None, shown: ShownTable, whole: bool = False) -> Table:
+    """For the terminal: words to the left, numbers to the right.
+
+    Where numbers have to be `whole`, only joints and words may wrap.
+    """
+    table = titled(title)
+    for k, head in enumerate(shown.heads):
+        words = k in shown.words
+        wraps = not whole or (words and head != "unit") or head.startswith("q")
+        table.add_column(head, justify="left" if words else "right",
+                         overflow="fold" if wraps else "ellipsis")  # fmt: skip
+    for row in shown.rows:
+        table.add_row(*map(Text, row))
+    return table
+
+
+def _print_lines(console: Console, lines: Iterable[tuple[str, str]]) -> None:
+    for label, text in lines:
+        style = "bold yellow" if label == "Warning" else "bold"
+        console.print(Text.assemble((f"{label}: ", style), text))
 
 
 NARROW = 80  # columns; below, each number shares one column with its interval and unit
@@ -130,23 +134,17 @@ def parameter_table(
     """
     notes = undetermined or any(e.note for e in result.estimates if e.identifiable)
     lopsided = any_lopsided(result.estimates)
-    table = _table("Parameters", "parameter", truth, brief, lopsided)
+    table = _numbers_table("Parameters", "parameter", truth is not None, brief, lopsided)
     if not brief:
         table.add_column("nominal", justify="right", overflow="fold")
     if notes:
         table.add_column("note", overflow="fold")
-    for e in result.estimates:
-        if not (e.identifiable or undetermined):
-            continue
-        true = None if truth is None else truth.get(e.name)
-        row = [Text(printable(e.name))]
-        row += _numbers(e, true, truth is not None, brief, lopsided)
-        if not brief:
-            known = nominal_known(result, e.name)
-            row.append(Text(plain(display(e.nominal, e.unit)[0]) if known else "–"))
-        if notes:
-            row.append(Text(short_note(result, e), style="dim"))
-        table.add_row(*row)
+    for row in parameter_rows(result, truth):
+        if row.determined or undetermined:
+            cells = _numbers(row, truth is not None, brief, lopsided)
+            cells += [] if brief else [Text(row.nominal)]
+            cells += [Text(row.note, style="dim")] if notes else []
+            table.add_row(*cells)
     return table
 
 
@@ -154,13 +152,41 @@ def combination_table(
     result: Calibration, truth: Truth | None = None, brief: bool = False
 ) -> Table:
     """Sums of parameters that the data determine although their members they do not."""
-    lopsided = any_lopsided(result.combinations)
-    table = _table("Combinations (factors in SI units)", "combination", truth, brief, lopsided)
-    for c in result.combinations:
-        true = None if truth is None else combination_truth(result, c, truth)
-        numbers = _numbers(c, true, truth is not None, brief, lopsided)
-        table.add_row(Text(shortened(c)), *numbers)
+    lopsided, compared = any_lopsided(result.combinations), truth is not None
+    title = "Combinations (factors in SI units)"
+    table = _numbers_table(title, "combination", compared, brief, lopsided)
+    for row in combination_rows(result, truth):
+        table.add_row(*_numbers(row, compared, brief, lopsided))
     return table
+
+
+def _numbers_table(title: str, first: str, compared: bool, brief: bool, lopsided: bool) -> Table:
+    half = half_head(lopsided)
+    table = titled(title)
+    table.add_column(first, overflow="fold")
+    for name in (f"value {half}",) if brief else ("value", half):
+        table.add_column(name, justify="left" if brief else "right", overflow="fold")
+    if not brief:
+        table.add_column("unit", overflow="fold")
+    if compared and not brief:
+        table.add_column("truth", justify="right", overflow="fold")
+    if compared:
+        table.add_column("in 95 %", overflow="fold")
+    return table
+
+
+def _numbers(row: ParameterRow, compared: bool, brief: bool, lopsided: bool) -> list[Text]:
+    """Cells of name, value, interval and unit and, where `compared`, true value and verdict.
+
+    `lopsided` says whether the column's head has no "±", which then stands with the number.
+    """
+    tail = [Text(row.verdict, style=STYLE.get(row.verdict, ""))] if compared else []
+    if brief:
+        text = row.value if row.value == "–" else f"{row.value} {row.interval} {row.unit}"
+        return [Text(row.name), Text(text), *tail]
+    half = row.interval if lopsided else row.half
+    cells = [row.name, row.value, half, row.unit, *([row.truth] if compared else [])]
+    return [*map(Text, cells), *tail]
 
 
 def noise_tables(result: Calibration) -> list[Table]:
@@ -168,21 +194,11 @@ def noise_tables(result: Calibration) -> list[Table]:
 
     A table that would have a single row is left out: the summary says it.
     """
-    tables = []
-    if len(sizes := size_rows(result.noise)) > 1:
-        table = _plain("Noise, standard deviations", "part")
-        table.add_column("size", justify="right", overflow="fold")
-        for row in sizes:
-            table.add_row(*map(Text, row))
-        tables.append(table)
-    if len(candidates := candidate_rows(result.noise)) > 1:
-        table = _plain("Noise models tried", "noise model")
-        table.add_column("variances", justify="right", overflow="fold")
-        table.add_column("criterion over best", justify="right", overflow="fold")
-        for candidate in candidates:
-            table.add_row(*map(Text, candidate))
-        tables.append(table)
-    return tables
+    sizes = ShownTable(("part", "size"), size_rows(result.noise))
+    heads = ("noise model", "variances", "criterion over best")
+    tried = ShownTable(heads, candidate_rows(result.noise))
+    named = (("Noise, standard deviations", sizes), ("Noise models tried", tried))
+    return [table_of(title, table) for title, table in named if len(table.rows) > 1]
 
 
 def print_result(console: Console, result: Calibration, truth: Truth | None = None) -> None:
@@ -199,52 +215,9 @@ def print_result(console: Console, result: Calibration, truth: Truth | None = No
     for table in noise_tables(result):
         console.print(table)
     console.print()
-    for line in summary_lines(result, truth):
-        label, colon, rest = line.partition(": ")
-        style = "bold yellow" if label == "Warning" else "bold"
-        console.print(Text.assemble((label + colon, style), rest))
-    judged = judgement(result)
-    console.print(Text.assemble(("Verdict: ", "bold"), printable(judged.headline)))
-    for step in judged.steps:
-        console.print(Text.assemble(("Next: ", "bold"), printable(step)))
-
-
-def _table(title: str, first: str, truth: Truth | None, brief: bool, lopsided: bool) -> Table:
-    table = _plain(title, first)
-    if brief:
-        table.add_column(f"value {half_head(lopsided)}", overflow="fold")
-    else:
-        for name in ("value", half_head(lopsided)):
-            table.add_column(name, justify="right", overflow="fold")
-        table.add_column("unit", overflow="fold")
-    if truth is not None:
-        if not brief:
-            table.add_column("truth", justify="right", overflow="fold")
-        table.add_column("in 95 %", overflow="fold")
-    return table
-
-
-def _plain(title: str, first: str) -> Table:
-    table = titled(title)
-    table.add_column(first, overflow="fold")
-    return table
-
-
-def _numbers(
-    e: Estimate | Combination, true: float | None, compared: bool, brief: bool, lopsided: bool
-) -> list[Text]:
-    """Cells of value, interval and unit and, where `compared`, true value and verdict.
-
-    `lopsided` says whether the column's head has no "±", which then stands with the number.
-    """
-    value, half, unit, known = texts(e, true)
-    verdict = inside(true, e.ci95)
-    tail = [Text(verdict, style=STYLE.get(verdict, ""))] if compared else []
-    if brief:
-        text = value if e.value is None else f"{value} {signed_half(half)} {unit}"
-        return [Text(text), *tail]
-    half = signed_half(half) if lopsided else half
-    return [Text(value), Text(half), Text(unit), *([Text(known), *tail] if compared else [])]
+    lines = (line.partition(": ") for line in summary_lines(result, truth))
+    _print_lines(console, ((label, text) for label, _, text in lines))
+    _print_lines(console, judgement(result).lines)
 
 
 WIDE_FOR_REASONS = 110  # columns, from which on the reasons stand beside the poses
@@ -253,82 +226,48 @@ WIDE_FOR_REASONS = 110  # columns, from which on the reasons stand beside the po
 def print_plan(console: Console, plan: Plan) -> None:
     """Poses in the order of the plan, predicted intervals, and what the plan is worth in words."""
     wide = console.width >= WIDE_FOR_REASONS
-    console.print(pose_table(plan) if wide else _narrow_poses(console, plan))
+    tables = {"Predicted intervals": interval_rows(plan)}
     if not wide:
-        console.print(reason_table(plan))
-    console.print(interval_table(plan))
+        tables = {"Why each pose": reason_rows(plan)} | tables
     if plan.curve:
-        console.print(curve_table(plan))
+        tables["Number of poses"] = curve_rows(plan)
+    console.print(_pose_table(plan, 2, reasons=True) if wide else _narrow_poses(console, plan))
+    for title, table in tables.items():
+        console.print(table_of(title, table, whole=True))
     console.print()
-    for label, text in plan_lines(plan):
-        style = "bold yellow" if label == "Warning" else "bold"
-        console.print(Text.assemble((f"{label}: ", style), text))
+    _print_lines(console, plan_lines(plan))
 
 
 def _narrow_poses(console: Console, plan: Plan) -> Table:
     """The poses with as many decimals as there is room for; plan.csv has all of them."""
     room = console.options.update(max_width=WIDE_FOR_REASONS)
     for decimals in (2, 1):
-        table = pose_table(plan, reasons=False, decimals=decimals)
+        table = _pose_table(plan, decimals)
         if console.measure(table, options=room).maximum <= console.width:
             return table
-    return pose_table(plan, reasons=False, decimals=0)
+    return _pose_table(plan, 0)
 
 
-def pose_table(plan: Plan, reasons: bool = True, decimals: int = 2) -> Table:
-    """Joint values, load, place in the order of execution, and what the pose is there for."""
-    return _printed("Poses", pose_rows(plan, reasons, decimals))
-
-
-def reason_table(plan: Plan) -> Table:
-    """What each pose is there for."""
-    return _printed("Why each pose", reason_rows(plan))
-
-
-def interval_table(plan: Plan) -> Table:
-    """Predicted half widths of the 95 % intervals."""
-    return _printed("Predicted intervals", interval_rows(plan))
-
-
-def curve_table(plan: Plan) -> Table:
-    """The criterion against the number of poses."""
-    return _printed("Number of poses", curve_rows(plan))
-
-
-def _printed(title: str, table: ShownTable) -> Table:
-    """For the terminal: joints and words may wrap, other numbers may not."""
-    shown = titled(title)
-    for k, head in enumerate(table.heads):
-        wraps = (k in table.words and head != "unit") or head.startswith("q")
-        shown.add_column(head, justify="left" if k in table.words else "right",
-                         overflow="fold" if wraps else "ellipsis")  # fmt: skip
-    for row in table.rows:
-        shown.add_row(*map(Text, row))
-    return shown
+def _pose_table(plan: Plan, decimals: int, reasons: bool = False) -> Table:
+    return table_of("Poses", pose_rows(plan, reasons, decimals), whole=True)
 
 
 MOST_CANDIDATES_PRINTED = 8
 NARROW_FOR_SETTINGS = 100  # columns; below, a candidate is told without its settings
-WORDS = ("settings", "unit", "why", "record or measure")  # columns that are not numbers
 
 
 def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> None:
     """The whole answer for an engineer; `kinds` of the joints ("revolute" or "prismatic")."""
-    _print_lines(console, diagnosis_lines(d))
+    _print_told(console, diagnosis_lines(d))
     console.print()
-    console.print(
-        _rows_table("Gap budget (3-D rms error on held-out poses)", BUDGET_HEADS, gap_rows(d))
-    )
-    if rows := added_parameter_rows(d.effects):
-        console.print(_rows_table("Parameters of the effects found", PARAMETER_HEADS, rows))
-    rows = hypothesis_rows(d, MOST_CANDIDATES_PRINTED)
-    heads = (
-        CANDIDATE_HEADS
-        if console.width >= NARROW_FOR_SETTINGS and any(r[-1] for r in rows)
-        else CANDIDATE_HEADS[:-1]
-    )
-    title = f"Candidates, the best {len(rows) - 2} of {len(d.candidates)}"
-    console.print(_rows_table(title, heads, rows))
+    console.print(table_of("Gap budget (3-D rms error on held-out poses)", gap_rows(d)))
+    if (parameters := added_parameter_rows(d)).rows:
+        console.print(table_of("Parameters of the effects found", parameters))
+    best = hypothesis_rows(d, MOST_CANDIDATES_PRINTED)
+    title = f"Candidates, the best {len(best.rows) - 2} of {len(d.candidates)}"
+    if console.width < NARROW_FOR_SETTINGS or not any(row[-1] for row in best.rows):
+        best = ShownTable(best.heads[:-1], [row[:-1] for row in best.rows])
+    console.print(table_of(title, best))
     console.print(
         Text(
             "evidence: log marginal likelihood over that of no further effect. d: standard "
@@ -337,38 +276,18 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> Non
             style="dim",
         )
     )
-    if d.extra is not None and d.extra.pairs:
-        console.print(_rows_table("Rivals", PAIR_HEADS, pair_rows(d.extra)))
-    if d.untested:
-        console.print(_rows_table("Not tested", UNTESTED_HEADS, untested_rows(d)))
+    for title, table in (("Rivals", pair_rows(d)), ("Not tested", untested_rows(d))):
+        if table.rows:
+            console.print(table_of(title, table))
     console.print()
-    _print_lines(console, [("Alike here", text) for text in _alike(d)])
-    _print_lines(console, [("Noise", text) for text in noise_floor_lines(d.noise, kinds)])
-    _print_lines(console, [("Next", text) for text in diagnosis_steps(d)])
-    _print_lines(console, [("Warning", printable(text)) for text in d.warnings])
+    told = [("Alike here", f"{text}: these data cannot tell them apart.") for text in alike(d)]
+    told += [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
+    told += [("Next", text) for text in diagnosis_steps(d)]
+    _print_told(console, [*told, *(("Warning", printable(text)) for text in d.warnings)])
 
 
-def _alike(d: Diagnosis) -> list[str]:
-    """Sets that these data cannot tell apart."""
-    sets = [together([effect_at(e) for e in rivals]) for rivals in d.indistinguishable]
-    return [f"{text}: these data cannot tell them apart." for text in sets]
-
-
-def _print_lines(console: Console, lines: Sequence[tuple[str, str]]) -> None:
-    for label, text in lines:
-        style = "bold yellow" if label == "Warning" else "bold"
-        console.print(Text.assemble((f"{label}: ", style), capital(text)))
-
-
-def _rows_table(title: str, heads: Sequence[str], rows: Rows) -> Table:
-    """The first `heads` columns of the rows; numbers to the right."""
-    table = titled(title)
-    for k, head in enumerate(heads):
-        words = k == 0 or head in WORDS
-        table.add_column(head, justify="left" if words else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*map(Text, row[: len(heads)]))
-    return table
+def _print_told(console: Console, lines: Iterable[tuple[str, str]]) -> None:
+    _print_lines(console, ((label, capital(text)) for label, text in lines))
 
 
 def print_compensation(console: Console, content: dict[str, Any]) -> None:
