@@ -11,7 +11,7 @@ ROOMS = {
     "constrained_solver": "ConstrainedObjective ResidualLoss",
     "covariance": "Covariance classical cluster_robust hc t_quantile",
     "error_budget": "BudgetStep gap_budget",
-    "faulty_readings": "FaultyGroup OutlierReport influence outlier_report",
+    "faulty_readings": "FaultyGroup OutlierReport outlier_report",
     "findings": "judged next_steps standings warning_sentences",
     "identifiability": "Problem Reduction reduce residual_sigma",
     "intervals": "cluster_by_parts profile_interval profile_of worth_clustering",
