@@ -39,7 +39,7 @@ ROOMS = {
     "robust": "asymptotic_covariance clustered_covariance robust_fit",
     "robust_core": (
         "Absolute Bisquare Huber StudentT bisquare breakdown_bisquare design efficiency huber "
-        "m_scale normal_mean normal_moments proposal_2"
+        "m_scale normal_mean normal_moments"
     ),
     "robust_fits": "log_likelihood m_estimate mm_estimate student_t",
     "solve": "Solution sizes_and_check",

@@ -254,8 +254,8 @@ def _weight(candidate: tuple[Group, GroupTest]) -> float:
 
 # Which readings, markers, configurations and runs of lines lie beyond the noise.
 #
-# All are judged against the fit to the good readings, those that agree with the majority.  A reading
-# is tested as if left out; a group by the error common to its readings, which shows long before any
+# All are judged against the fit to the good readings, those that agree with the majority.  One is
+# tested as if left out; a group by the error common to its readings, which shows long before any
 # one of them does, and by their errors whatever the direction.  Readings beyond the noise count for
 # their group only where they are most of it and far more frequent there than elsewhere: scattered
 # blunders make no bad marker.
@@ -343,7 +343,9 @@ def outlier_report(
     """What is wrong with the readings of y (n·size,) ≈ B (n·size, p) x, whitened.
 
     `good` (n,) says which observations to rely on; reported are the others, alone or as groups,
-    and groups of good ones that err together.  `marker` and `configuration` (n,) labels, `line` (n,) integer line of each observation (by
+    and groups of good ones that err together.
+
+    `marker` and `configuration` (n,) labels, `line` (n,) integer line of each observation (by
     default its number); a level without labels is not tested, and neither are groups of a single
     reading or of half the table.
 

@@ -62,12 +62,6 @@ class Design:
         """y − Q z (rows,)."""
         return self.y - self.Q @ z
 
-    @property
-    def cofactor(self) -> Array:
-        """(BᵀB)⁻¹ (p, p)."""
-        inverse = self.parameters(np.eye(self.p))
-        return inverse @ inverse.T
-
     def rows(self, weights: Array) -> Array:
         """Per-observation weights (n,) repeated for the rows (rows,)."""
         return np.repeat(weights, self.size)
@@ -364,28 +358,6 @@ def median_scale(length: Array, size: int) -> float:
     `length` (n,) of the observations' residuals.
     """
     return float(np.median(length)) / median_length(size)
-
-
-@lru_cache
-def _beta(loss: Huber) -> float:
-    return normal_moments(loss)[1]
-
-
-def proposal_2(length: Array, size: int, p: int = 0, c: float | None = None) -> float:
-    """Huber's proposal 2: σ with Σ ψ(|e_i|/σ)² = (n·size − p) E ψ²/size (Huber 1964, 1981).
-
-    `length` (n,), `p` fitted parameters, `c` of Huber's ψ, by default 2.5 for size 1 and the
-    same probability beyond it for other sizes.
-    """
-    tail = float(stats.chi.isf(stats.chi.sf(2.5, 1), size)) if c is None else c
-    loss = Huber(size, tail)
-    beta = _beta(loss) * (len(length) * size - p)
-
-    def excess(scale: float) -> float:
-        return float((loss.psi(length / scale) ** 2).sum()) - beta
-
-    # Σ min(d, c)² never exceeds n c²: with too few degrees of freedom there is no solution.
-    return _root(excess, length)
 
 
 def m_scale(length: Array, loss: Bisquare, p: int = 0) -> float:
