@@ -4,9 +4,9 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "bootstrap": "ParametricBootstrap parametric_bootstrap wild_cluster_bootstrap",
-    "constrained": "ActiveConstraint constrained_fit on_columns solve_constrained",
+    "constrained": "ActiveConstraint constrained_fit minimise objective_of",
     "constrained_intervals": (
-        "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_intervals"
+        "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_linear_interval"
     ),
     "constrained_solver": "ConstrainedObjective ResidualLoss",
     "covariance": "Covariance classical cluster_robust hc t_quantile",

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, require
@@ -19,11 +18,9 @@ from elastocal.identification.constrained import (
     fit_system,
     minimise,
     objective_of,
-    on_columns,
 )
 from elastocal.identification.constrained_solver import (
     ConstrainedObjective,
-    LossName,
     ResidualLoss,
     active_at,
     equality_space,
@@ -51,8 +48,8 @@ from elastocal.units import Array
 #
 # At a bound the estimate is not normal and the likelihood ratio not χ²: where the truth lies on one
 # bound, it is the mixture ½χ²₀ + ½χ²₁ (Chernoff 1954; Self and Liang 1987), whose 95 % point is
-# 2.71.  The intervals here keep the F quantile of an interior truth (3.84 for many readings).  Away
-# from bounds they are exact for a linear model with normal noise; at and near one bound they are
+# 2.71.  The intervals here keep the quantile of an interior truth, 3.84.  Away from bounds they are
+# exact for a linear model with normal noise of known size; at and near one bound they are
 # conservative (97.5 % for 95 %).  With the truth on two bounds at once the mixture depends on the
 # angle α > 90° between the two whitened columns of B: they then hold 97.5 % − 14.65 % (α −
 # 90°)/360°, which is 95 % at 150° and 93.8 % in the limit of 180°, two columns that nearly cancel.
@@ -60,50 +57,30 @@ from elastocal.units import Array
 INWARD = 1e-6  # of a standard deviation, from an end that only a linear program knows
 
 
-def profile_intervals(
-    B: ArrayLike,
-    y: ArrayLike,
-    names: Sequence[str],
-    constraints: Constraints,
-    which: Sequence[str] | None = None,
-    *,
-    prior: GaussianPrior | None = None,
-    sigma: float | None = None,
-    level: float = 0.95,
-) -> dict[str, ProfileInterval]:
-    """{v: (S(v) − Ŝ)/s² ≤ F_{1,dof}(level)} for each parameter of `which` (default all).
+def profile_linear_interval(
+    objective: ConstrainedObjective, system: System, name: str, sigma: float, level: float = 0.95
+) -> ProfileInterval:
+    """{v: (S(v) − Ŝ)/σ² ≤ χ²₁(level)} for the parameter `name`.
 
-    S(v) is the least objective of `solve_constrained` (squares, with the prior) with the parameter
-    at v and all constraints kept.  B (rows, p), y (rows,) whitened.  `sigma`, the standard
-    deviation of a row, is known (then F is χ²₁) or None: s² = Ŝ/(rows − p).  The interval ends
-    ("bound") where no x satisfies the constraints any more, so an active parameter has a
-    one-sided interval that starts at its bound.
+    S(v) is the least objective (squares and prior, whose rows have the standard deviation `sigma`)
+    with the parameter at v and all constraints kept.  The interval ends ("bound") where no x
+    satisfies the constraints any more, so an active parameter has a one-sided interval that starts
+    at its bound.
 
-    Raises InputError as `solve_constrained` does, and for a prior without `sigma`, which alone
-    says how data and prior weigh.
+    Raises InputError as `minimise` does, and for a name that is no parameter.
     """
-    _check_noise(prior, sigma)
-    objective = objective_of(B, y, names, prior, "squares", 1, sigma or 1.0)
-    system = constraints.resolve(names)
+    require(name in system.names, f"{name!r} is not a parameter; choose from {list(system.names)}")
+    i = system.names.index(name)
     best = minimise(objective, system)
     free = minimise(objective, _only_equalities(system))
-    rows, p = objective.B.shape
-    found = {}
-    for name in names if which is None else which:
-        require(name in system.names, f"{name!r} is not a parameter; choose from {list(names)}")
-        i = system.names.index(name)
 
-        def least(value: float, i: int = i) -> float:
-            if value == best.x[i]:
-                return best.objective
-            return minimise(objective, system.with_value(i, value)).objective
+    def least(value: float) -> float:
+        if value == best.x[i]:
+            return best.objective
+        return minimise(objective, system.with_value(i, value)).objective
 
-        std = float(np.sqrt(free.cofactor[i, i]))
-        found[name] = _interval(
-            least, float(best.x[i]), std, best.objective, _extent(objective, system, best.x, i),
-            rows - p, sigma, level,
-        )  # fmt: skip
-    return found
+    std, ends = float(np.sqrt(free.cofactor[i, i])), _extent(objective, system, best.x, i)
+    return _interval(least, float(best.x[i]), std, ends, sigma, level)
 
 
 def profile_fit_interval(
@@ -111,17 +88,16 @@ def profile_fit_interval(
     found: ConstrainedFit,
     name: str,
     constraints: Constraints,
+    sigma: float,
     *,
     prior: GaussianPrior | None = None,
-    sigma: float | None = None,
     level: float = 0.95,
 ) -> ProfileInterval:
     """The profile interval of one fitted parameter of the nonlinear model.
 
-    As `profile_intervals`, with S(v) the objective of `constrained_fit` (squares), which gave
+    As `profile_linear_interval`, with S(v) the objective of `constrained_fit` (squares), which gave
     `found` for the same problem, constraints, prior and sigma.
     """
-    _check_noise(prior, sigma)
     require(name in found.names, f"{name!r} was not fitted; choose from {list(found.names)}")
     k = found.names.index(name)
     c = int(found.columns[k])
@@ -139,39 +115,29 @@ def profile_fit_interval(
             return found.objective
         start = min(known, key=lambda x: abs(x[c] - value)).copy()
         start[c] = value
-        again = constrained_fit(
-            replace(problem, x=start),
-            constraints + Constraints(bounds=(Bounds(name, value, value),)),
-            prior=prior,
-            sigma=sigma or 1.0,
-        )
+        stated = constraints + Constraints(bounds=(Bounds(name, value, value),))
+        again = constrained_fit(replace(problem, x=start), stated, prior=prior, sigma=sigma)
         if not again.converged:
             raise ElastocalError(f"no fit with {name} at {value:g}: {again.reason}")
         known.append(again.x)
         return again.objective
 
     ends = _extent(linear, system, found.x[found.columns], k)
-    std = float(np.sqrt(free.cofactor[k, k]))
-    return _interval(least, float(found.x[c]), std, found.objective, ends, rows - p, sigma, level)
+    return _interval(
+        least, float(found.x[c]), float(np.sqrt(free.cofactor[k, k])), ends, sigma, level
+    )
 
 
 def _interval(
     least: Callable[[float], float],
     estimate: float,
     std: float,
-    best: float,
     ends: tuple[float, float],
-    dof: int,
-    sigma: float | None,
+    sigma: float,
     level: float,
 ) -> ProfileInterval:
     if std == 0 or ends[0] == ends[1]:  # equalities leave a single value
         return ProfileInterval(estimate, estimate, ("bound", "bound"))
-    require(dof > 0 or sigma is not None, "no degree of freedom is left; state the noise as sigma")
-    if sigma is None:
-        return profile_interval(
-            least, estimate, std * np.sqrt(best / dof), dof, level, ends[0], ends[1]
-        )
     return profile_interval(
         lambda v: least(v) / sigma**2, estimate, std * sigma, np.inf, level, ends[0], ends[1]
     )
@@ -195,53 +161,31 @@ def _only_equalities(system: System) -> System:
     return replace(system, lower=-free, upper=free, matrices=())
 
 
-def _check_noise(prior: GaussianPrior | None, sigma: float | None) -> None:
-    require(
-        prior is None or sigma is not None,
-        "with a prior the noise must be known: state sigma, the standard deviation of a whitened "
-        "row, or the weights of data and prior are arbitrary",
-    )
-
-
 # Parametric bootstrap of constrained estimates.
 
 
 def constrained_bootstrap(
-    B: ArrayLike,
-    y: ArrayLike,
-    names: Sequence[str],
-    constraints: Constraints,
+    objective: ConstrainedObjective,
+    system: System,
+    sigma: float,
     *,
-    prior: GaussianPrior | None = None,
-    loss: LossName = "squares",
-    size: int = 1,
-    sigma: float | None = None,
     draws: int = 999,
     seed: int = 0,
     jobs: int = 1,
 ) -> ParametricBootstrap:
-    """Fit B x̂ + s·N(0, 1) again `draws` times under the same constraints (see its `interval`).
+    """Fit B x̂ + σ·N(0, 1) again `draws` times under the same constraints (see its `interval`).
 
-    B (rows, p), y (rows,) whitened; s is `sigma` or, where None, from s² = rss/(rows − p).  The
-    prior's mean is drawn anew as well, about x̂ with its own covariance: like the data it is an
-    observation of the parameters, so the spread of the draws is the posterior's.
+    `sigma` is the standard deviation of a row.  The prior's mean is drawn anew as well, about x̂
+    with its own covariance: like the data it is an observation of the parameters, so the spread of
+    the draws is the posterior's.
 
     Draws pile up on an active bound, whose percentile interval is then one-sided.  With the truth
     on a bound the bootstrap is not consistent (Andrews 2000): there, prefer profile intervals.
-
-    Raises InputError as `solve_constrained` does, and for a prior without `sigma`.
     """
-    require(prior is None or sigma is not None, "with a prior the noise must be known: state sigma")
-    objective = objective_of(B, y, names, prior, loss, size, sigma or 1.0)
-    system = constraints.resolve(names)
     best = minimise(objective, system)
-    rows, p = objective.B.shape
-    residual = objective.y - objective.B @ best.x
-    require(rows > p or sigma is not None, "no degree of freedom is left; state the noise as sigma")
-    spread = float(np.sqrt(residual @ residual / (rows - p))) if sigma is None else sigma
     exact = np.concatenate([objective.B @ best.x, objective.P @ best.x])
     return parametric_bootstrap(
-        partial(_draw, exact, spread), partial(_refit, objective, system), draws, seed, jobs
+        partial(_draw, exact, sigma), partial(_refit, objective, system), draws, seed, jobs
     )
 
 
@@ -434,14 +378,14 @@ def intervals_with_knowledge(
         ci95 = covariance.interval(local.x, LEVEL)
         lower, upper = local.system.lower[:, None], local.system.upper[:, None]
         return Intervals(covariance, np.clip(ci95, lower, upper))
-    names = problem.model.names
-    held = {n: float(v) for n, v in zip(names, found.x, strict=True) if n not in local.names}
     if kind == "bootstrap":
-        drawn = constrained_bootstrap(
-            local.B, local.e + local.B @ local.x, local.names, on_columns(constraints, held),
-            prior=prior, loss="squares" if local.loss.quadratic else "huber",
-            size=local.loss.size, sigma=local.sigma, draws=DRAWS, seed=seed, jobs=jobs,
+        objective = objective_of(
+            local.B, local.e + local.B @ local.x, local.names, prior,
+            "squares" if local.loss.quadratic else "huber", local.loss.size, local.sigma,
         )  # fmt: skip
+        drawn = constrained_bootstrap(
+            objective, local.system, local.sigma, draws=DRAWS, seed=seed, jobs=jobs
+        )
         text = f"{drawn.description}, on the linearised model under the constraints, its noise kept"
         return Intervals(
             Covariance("constrained bootstrap", matrix, dof, text), drawn.interval(local.x, LEVEL)
@@ -451,12 +395,10 @@ def intervals_with_knowledge(
         wider = None if prior is None else replace(prior, covariance=prior.covariance * wide**2)
         sigma = local.sigma * wide
         if kind == "profile":
-            one = profile_fit_interval(problem, found, name, constraints, prior=wider, sigma=sigma)
+            one = profile_fit_interval(problem, found, name, constraints, sigma, prior=wider)
         else:
-            one = profile_intervals(
-                *local.r_factor, local.names, on_columns(constraints, held), [name],
-                prior=wider, sigma=sigma,
-            )[name]  # fmt: skip
+            linear = objective_of(*local.r_factor, local.names, wider, "squares", 1, sigma)
+            one = profile_linear_interval(linear, local.system, name, sigma)
         ends.append((one.lower, one.upper))
     model = "nonlinear" if kind == "profile" else "linearised"
     text = f"profile of the {model} fit under the constraints, {ONE_SIDED}; assumes normal noise"
