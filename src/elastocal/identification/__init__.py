@@ -16,10 +16,9 @@ ROOMS = {
     "identifiability": "Problem Reduction reduce residual_sigma",
     "intervals": "cluster_by_parts profile_interval profile_of worth_clustering",
     "knowledge": (
-        "Bounds Constraints GaussianPrior LinearEquality SemidefiniteMatrix equal "
-        "non_negative passivity physical_constraints share_of_prior"
+        "Bounds Constraints GaussianPrior Knowledge KnowledgeTable LinearEquality "
+        "SemidefiniteMatrix equal non_negative physical_constraints read_knowledge share_of_prior"
     ),
-    "knowledge_file": "Knowledge KnowledgeTable read_knowledge",
     "least_squares": "FitProblem SumOfSquares descend fit",
     "linear_solver": "solve_weighted",
     "noise_choice": "Trial beyond_noise estimate_noise own_noise screen",
