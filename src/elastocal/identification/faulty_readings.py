@@ -186,7 +186,6 @@ def accepted_groups(
     groups: list[Group],
     lines: NDArray[np.int64],
     adjust: dict[Level, int],
-    false_alarm: float,
 ) -> tuple[CleanFit, list[tuple[Group, GroupTest, int]]]:
     """Groups beyond the noise, with how many of their readings are so alone, and the fit to the
     good readings outside them.
@@ -200,8 +199,8 @@ def accepted_groups(
     while True:
         fit = CleanFit(problem, good & active)
         runs = _runs(fit, active, lines) if "block" in adjust else []
-        tested = _tested(fit, active, groups + runs, adjust, false_alarm)
-        significant = [t for t in tested if t[1].p_value * adjust[t[0].level] < false_alarm]
+        tested = _tested(fit, active, groups + runs, adjust)
+        significant = [t for t in tested if t[1].p_value * adjust[t[0].level] < FALSE_ALARM]
         if not significant:
             return fit, accepted
         group, test = max(significant, key=_weight)
@@ -223,11 +222,7 @@ def _runs(fit: CleanFit, active: BoolArray, lines: NDArray[np.int64]) -> list[Gr
 
 
 def _tested(
-    fit: CleanFit,
-    active: BoolArray,
-    groups: list[Group],
-    adjust: dict[Level, int],
-    false_alarm: float,
+    fit: CleanFit, active: BoolArray, groups: list[Group], adjust: dict[Level, int]
 ) -> Iterator[tuple[Group, GroupTest]]:
     """Tests of all groups still active, on all of their readings where most are beyond the noise
     and that is no chance, else on those that are not."""
@@ -238,7 +233,7 @@ def _tested(
         count, others = int(present.sum()), int((active & ~present).sum())
         rate = (outside + 1) / (others + 1)
         chance = float(special.bdtrc(inside - 1, count, rate)) if inside else 1.0
-        whole = 2 * inside >= count and chance * adjust[group.level] < false_alarm
+        whole = 2 * inside >= count and chance * adjust[group.level] < FALSE_ALARM
         if group.level == "block" and not whole:
             continue
         used = present if whole else present & fit.good
@@ -307,7 +302,7 @@ class OutlierReport:
     dof: int
     good: BoolArray
     tests: dict[str, int]
-    false_alarm: float
+    false_alarm: float = FALSE_ALARM
     names: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -338,7 +333,6 @@ def outlier_report(
     marker: ArrayLike | None = None,
     configuration: ArrayLike | None = None,
     line: ArrayLike | None = None,
-    false_alarm: float = FALSE_ALARM,
 ) -> OutlierReport:
     """What is wrong with the readings of y (n·size,) ≈ B (n·size, p) x, whitened.
 
@@ -351,7 +345,6 @@ def outlier_report(
 
     Raises InputError for wrong shapes or dependent columns.
     """
-    require(0 < false_alarm < 0.5, f"false_alarm lies between 0 and 0.5; found {false_alarm}")
     problem = design(B, y, size)
     n = problem.n
     lines = np.arange(n) if line is None else _labels("line", line, n)
@@ -368,7 +361,7 @@ def outlier_report(
         tests["block"] = n * (n + 1) // 2
     adjust = {level: count * len(tests) for level, count in tests.items()}
 
-    fit, accepted = accepted_groups(problem, good, groups, lines, adjust, false_alarm)
+    fit, accepted = accepted_groups(problem, good, groups, lines, adjust)
     findings = []
     active = np.ones(n, dtype=bool)
     for group, test, beyond in accepted:
@@ -386,7 +379,7 @@ def outlier_report(
     findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
     return OutlierReport(
         tuple(findings), problem.parameters(fit.z), fit.sigma, fit.dof, fit.good,
-        {str(level): count for level, count in tests.items()}, false_alarm,
+        {str(level): count for level, count in tests.items()},
     )  # fmt: skip
 
 
@@ -421,7 +414,7 @@ def _labels(name: str, given: ArrayLike, n: int) -> NDArray[Any]:
     return labels
 
 
-# What is wrong with the readings: single ones, a marker, a configuration, a block of lines.
+# The readings of an identification, under the noise that its method found.
 
 
 def report_faulty(

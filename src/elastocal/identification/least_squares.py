@@ -26,7 +26,7 @@ from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations
 from elastocal.units import Array
 
-# Least squares on triangles: Levenberg–Marquardt where one evaluation is a pass over the table.
+# Levenberg–Marquardt on R factors, where one evaluation is a pass over a large table.
 
 SETTLED = "the sum of squares no longer fell"
 NEGLIGIBLE = "the steps became negligible"
@@ -205,9 +205,9 @@ class FitProblem:
 
 @dataclass(frozen=True)
 class Fit:
-    """Values x (parameters,), raw and whitened residual (rows,), `triangle` of whitened B and it.
+    """Values x (parameters,), raw and whitened residual (rows,), R factor of whitened B and it.
 
-    `columns` (fitted,) index the parameters; `wide`, where there is one, is the triangle of the
+    `columns` (fitted,) index the parameters; `wide`, where there is one, is the R factor of the
     columns that these were chosen among.
     """
 
@@ -227,7 +227,7 @@ class Fit:
 
     @cached_property
     def B(self) -> Array:
-        """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `triangle`."""
+        """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `r_factor`."""
         return _regression(self.problem, self.x).B
 
     def cofactor(self) -> Array:
@@ -256,62 +256,49 @@ def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLER
     return _fit_whole(problem, max_steps)
 
 
-class _Points:
-    """The regression at one point after another: residual and B come from one evaluation.
-
-    It lives as long as one descent, whose rows do not change.
-    """
-
-    def __init__(self, problem: FitProblem) -> None:
-        self.problem = problem
-        self._u: Array | None = None
-        self._at: Regression | None = None
-
-    def at(self, u: Array) -> Regression:
-        """The regression at u (columns,).  Raises ElastocalError for poses without one."""
-        if self._at is None or self._u is None or not np.array_equal(u, self._u):
-            self._at = _regression(self.problem, self.problem.values(u))
-            self._u = u.copy()
-        return self._at
-
-    def residual(self, u: Array) -> Array:
-        """Predicted minus observed (rows,), NaN where a pose has no equilibrium."""
-        try:
-            return -self.at(u).residual
-        except ElastocalError:
-            observed, x = self.problem.observations, self.problem.values(u)
-            return self.problem.model.predict(observed.table, x, observed) - observed.value
-
-
 def _regression(problem: FitProblem, x: Array) -> Regression:
     observed = problem.observations
     return problem.model.regressor(observed.table, x, problem.columns, observed)
 
 
 def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
-    size, weights, points = problem.sizes[problem.columns], problem.weights, _Points(problem)
+    size, weights, observed = problem.sizes[problem.columns], problem.weights, problem.observations
+    last: dict[bytes, Regression] = {}  # residual and B come from one evaluation
+
+    def regression_at(u: Array) -> Regression:
+        if u.tobytes() not in last:
+            at = _regression(problem, problem.values(u))
+            last.clear()
+            last[u.tobytes()] = at
+        return last[u.tobytes()]
 
     def residual(u: Array) -> Array:
-        r = weights.apply(points.residual(u))
+        """Predicted minus observed, NaN where a pose has no equilibrium."""
+        try:
+            raw = -regression_at(u).residual
+        except ElastocalError:
+            predicted = problem.model.predict(observed.table, problem.values(u), observed)
+            raw = predicted - observed.value
+        r = weights.apply(raw)
         if problem.tie is None:
             return r
         x = problem.values(u)
         return np.concatenate([r, (x[problem.columns] - problem.tied_to) / problem.tie])
 
     def jacobian(u: Array) -> Array:
-        B = weights.apply(points.at(u).B * size)
+        B = weights.apply(regression_at(u).B * size)
         return B if problem.tie is None else np.vstack([B, np.diag(size / problem.tie)])
 
     lower, upper = problem.limits
     start = np.clip(np.zeros(len(problem.columns)), lower, upper)
     if not np.isfinite(residual(start)).all():
-        points.at(start)  # names the row
+        regression_at(start)  # names the row
         raise ElastocalError("the model has no finite prediction at the start values")
     found = least_squares(
         residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
         ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
     )  # fmt: skip
-    x, final = problem.values(found.x), points.at(found.x)
+    x, final = problem.values(found.x), regression_at(found.x)
     if problem.tie is None and not problem.bounded and found.status > 0:
         x, final = _polished(problem, x, final)
     whitened = weights.apply(final.residual)

@@ -184,5 +184,3 @@ def test_wrong_input_is_refused(arm):
         outlier_report(arm.B, y, good, size=3, marker=np.zeros(810))
     with pytest.raises(InputError, match="line must hold integers"):
         outlier_report(arm.B, y, good, size=3, line=np.linspace(0, 1, 270))
-    with pytest.raises(InputError, match="false_alarm"):
-        outlier_report(arm.B, y, good, size=3, false_alarm=2.0)
