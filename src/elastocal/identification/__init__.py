@@ -5,9 +5,6 @@ from elastocal import loaded_on_demand
 ROOMS = {
     "bootstrap": "ParametricBootstrap parametric_bootstrap wild_cluster_bootstrap",
     "constrained": "ActiveConstraint constrained_fit minimise objective_of",
-    "constrained_intervals": (
-        "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_linear_interval"
-    ),
     "constrained_solver": "ConstrainedObjective ResidualLoss",
     "covariance": "Covariance classical cluster_robust hc t_quantile",
     "error_budget": "BudgetStep gap_budget",
@@ -18,6 +15,9 @@ ROOMS = {
     "knowledge": (
         "Bounds Constraints GaussianPrior Knowledge KnowledgeTable LinearEquality "
         "SemidefiniteMatrix equal non_negative physical_constraints read_knowledge share_of_prior"
+    ),
+    "knowledge_fit": (
+        "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_linear_interval"
     ),
     "least_squares": "FitProblem SumOfSquares descend fit",
     "linear_solver": "solve_weighted",

@@ -51,7 +51,7 @@ class Descent:
 class SumOfSquares:
     """|e(u)|² + |(u − centre)/tie|² over lower ≤ u ≤ upper, B = −∂e/∂u.
 
-    `evaluate` gives the triangle of e and of B per unit of u, (p,) in typical sizes; it raises
+    `evaluate` gives the R factor of e and of B per unit of u, (p,) in typical sizes; it raises
     ElastocalError where the model has no prediction.  A `tie` (p,) of infinity is none.
     `evaluate_last`, where given, evaluates in its place where the descent means to end: for what
     else is wanted there.
@@ -153,7 +153,7 @@ class FitProblem:
     `sizes` (parameters,) scale the variables.  `tie` (columns,), where given, adds
     ((X − centre)/tie)² per column, in units of the noise: a weak tie, used only to keep
     undetermined directions still before they are known to be undetermined.  `among` (ascending)
-    are columns of which those fitted are a choice: a large table's fit leaves their triangle too,
+    are columns of which those fitted are a choice: a large table's fit leaves their R factor too,
     which else would take another pass.
     """
 
@@ -233,7 +233,7 @@ class Fit:
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13).
 
-        Exact to working precision for tables of ordinary size; of a large one from the triangle,
+        Exact to working precision for tables of ordinary size; of a large one from the R factor,
         exact to working precision times condition number.
         """
         scale = self.problem.sizes[self.columns]
@@ -246,7 +246,7 @@ class Fit:
 def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLERANCE) -> Fit:
     """Levenberg–Marquardt from the problem's x, derivatives exact.
 
-    A large table is fitted on triangles, with the cost and the gradient of all rows, until a step
+    A large table is fitted on R factors, with the cost and the gradient of all rows, until a step
     promises less than `tolerance` of the cost.
 
     Raises ElastocalError where the start has poses without equilibrium.
