@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NoReturn
 
 import numpy as np
@@ -156,8 +156,11 @@ class Minimum:
     kkt: float
 
 
-def minimise(objective: ConstrainedObjective, system: System) -> Minimum:
-    """Minimise the objective over the system's x.
+def minimise(
+    objective: ConstrainedObjective, system: System, stated: System | None = None
+) -> Minimum:
+    """Minimise the objective over the system's x; `active` in the terms of `stated`, if given,
+    where x is a step and `stated` the constraints on the parameters themselves.
 
     Squares under bounds and equalities are solved by Lawson and Hanson's LDP; matrices and
     Huber's loss by an interior-point method (Clarabel); both end with Newton steps on the active
@@ -190,7 +193,7 @@ def minimise(objective: ConstrainedObjective, system: System) -> Minimum:
     cofactor = _cofactor(scaled, limits, active, z) * np.outer(unit, unit)
     return Minimum(
         x, objective.y - objective.B @ x, objective.value(x),
-        _named(system, limits, active, at, z, unit), cofactor,
+        _named(stated or system, limits, active, at, z, unit), cofactor,
         share_of_prior(cofactor, objective.P), at.residual,
     )  # fmt: skip
 
@@ -380,15 +383,13 @@ def constrained_fit(
     Raises InputError as `minimise` does, and where a held parameter alone breaks a
     constraint; ElastocalError where the start has poses without equilibrium.
     """
-    columns = np.asarray(problem.columns, dtype=np.int64)
+    columns = problem.columns
     names = tuple(problem.model.names[c] for c in columns)
     system = fit_system(problem, constraints or Constraints())
     P, target = _prior_rows(problem, columns, prior, sigma)
-    nonlinear = _Nonlinear(
-        problem, columns, P, target, loss_of(loss, problem.observations.size, sigma)
-    )
+    nonlinear = _Nonlinear(problem, P, target, loss_of(loss, problem.observations.size, sigma))
     size, zero = problem.sizes[columns], np.zeros(len(columns))
-    x = nonlinear.moved(problem.x, _nearest(zero, size, system.moved(problem.x[columns], zero + 1)))
+    x = nonlinear.moved(problem.x, _nearest(size, system.moved(problem.x[columns], zero + 1)))
     at, objective = nonlinear.linearised(x)
     value, radius = objective.value(zero), FIRST_RADIUS
     reason, converged, steps = "the step limit was reached; the start may be far off", False, 0
@@ -412,9 +413,9 @@ def constrained_fit(
             at, objective = nonlinear.linearised(x)
             value = objective.value(zero)
     limits = system.moved(x[columns], zero + 1)
-    final = minimise(objective, limits)
+    final = minimise(objective, limits, system)
     return ConstrainedFit(
-        x, at.residual, objective.y, at.B, columns, names, value, _in_place(final, system),
+        x, at.residual, objective.y, at.B, columns, names, value, final.active,
         final.cofactor, final.prior_share, _kkt(objective, limits), converged,
         reason, steps,
     )  # fmt: skip
@@ -422,7 +423,7 @@ def constrained_fit(
 
 def fit_system(problem: FitProblem, constraints: Constraints) -> System:
     """The constraints on the problem's columns, with the effects' own bounds where `bounded`."""
-    columns = np.asarray(problem.columns, dtype=np.int64)
+    columns = problem.columns
     own = [problem.model.parameters[c] for c in columns] if problem.bounded else []
     stated = constraints + Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in own))
     return stated.resolve(problem.model.names).restricted(columns, problem.x)
@@ -433,7 +434,6 @@ class _Nonlinear:
     """The objective as a function of all parameters, and its linearisation in a step."""
 
     problem: FitProblem
-    columns: NDArray[np.int64]
     P: Array
     target: Array
     loss: ResidualLoss
@@ -441,20 +441,21 @@ class _Nonlinear:
     def moved(self, x: Array, step: Array) -> Array:
         """x (parameters,) with `step` (columns,) added."""
         trial = x.astype(float)
-        trial[self.columns] += step
+        trial[self.problem.columns] += step
         return trial
 
     def linearised(self, x: Array) -> tuple[Regression, ConstrainedObjective]:
-        observed, apply = self.problem.observations, self.problem.weights.apply
-        at = self.problem.model.regressor(observed.table, x, self.columns, observed)
-        lack = self.target - self.P @ x[self.columns]
+        problem, apply = self.problem, self.problem.weights.apply
+        observed, columns = problem.observations, problem.columns
+        at = problem.model.regressor(observed.table, x, columns, observed)
+        lack = self.target - self.P @ x[columns]
         return at, ConstrainedObjective(apply(at.B), apply(at.residual), self.P, lack, self.loss)
 
     def value(self, x: Array) -> float:
         """The objective at x; NaN where a pose has no equilibrium."""
         observed = self.problem.observations
         misfit = observed.value - self.problem.model.predict(observed.table, x, observed)
-        lack = self.target - self.P @ x[self.columns]
+        lack = self.target - self.P @ x[self.problem.columns]
         return self.loss.value(self.problem.weights.apply(misfit)) + float(lack @ lack)
 
 
@@ -474,31 +475,11 @@ def _prior_rows(
     return P, target
 
 
-def _nearest(x: Array, size: Array, system: System) -> Array:
-    """The point nearest to x, in typical sizes, that satisfies the constraints."""
-    none = np.zeros((0, len(x)))
-    return minimise(
-        ConstrainedObjective(np.diag(1 / size), x / size, none, none[:, 0], ResidualLoss()), system
-    ).x
-
-
-def _in_place(found: Minimum, system: System) -> tuple[ActiveConstraint, ...]:
-    """Active constraints of a step, told as constraints on the parameters."""
-    lower, upper = (
-        dict(zip(system.names, side, strict=True)) for side in (system.lower, system.upper)
-    )
-    equalities = dict(zip(system.equality_labels, system.b, strict=True))
-    told = []
-    for a in found.active:
-        if a.kind == "equality":
-            told.append(replace(a, value=float(equalities[a.label])))
-        elif a.kind == "semidefinite":
-            told.append(a)
-        else:
-            value = float((lower if a.kind == "lower" else upper)[a.names[0]])
-            sign = ">=" if a.kind == "lower" else "<="
-            told.append(replace(a, value=value, label=f"{a.names[0]} {sign} {value:.6g}"))
-    return tuple(told)
+def _nearest(size: Array, system: System) -> Array:
+    """The shortest step, in typical sizes, to where the constraints hold."""
+    P, target = np.zeros((0, len(size))), np.zeros(0)
+    distance = ConstrainedObjective(np.diag(1 / size), 0 * size, P, target, ResidualLoss())
+    return minimise(distance, system).x
 
 
 def _kkt(objective: ConstrainedObjective, limits: System) -> float:

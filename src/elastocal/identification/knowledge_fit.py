@@ -369,9 +369,7 @@ def intervals_with_knowledge(
     constraints: Constraints,
     prior: GaussianPrior | None,
     of_readings: Array,
-    kind: str,
-    seed: int,
-    jobs: int,
+    options: Options,
 ) -> Intervals:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
@@ -382,7 +380,7 @@ def intervals_with_knowledge(
     The covariance takes equalities for exact and leaves inequalities out: knowing more than it
     says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
     """
-    dof = degrees_of_freedom(of_readings, local.prior_share)
+    kind, dof = options.intervals, degrees_of_freedom(of_readings, local.prior_share)
     matrix, inside = local.covariance, not any(a.kind != "equality" for a in found.active)
     if kind == "auto" and inside:
         name, text = _posterior(prior, local)
@@ -396,7 +394,7 @@ def intervals_with_knowledge(
             "squares" if local.loss.quadratic else "huber", local.loss.size, local.sigma,
         )  # fmt: skip
         drawn = constrained_bootstrap(
-            objective, local.system, local.sigma, draws=DRAWS, seed=seed, jobs=jobs
+            objective, local.system, local.sigma, draws=DRAWS, seed=options.seed, jobs=options.jobs
         )
         text = f"{drawn.description}, on the linearised model under the constraints, its noise kept"
         return Intervals(
@@ -460,8 +458,8 @@ def fit_with_knowledge(
     """Minimise Σ ρ(W (y − h(X))) + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
 
     W and the readings are those of the method's `solution`, σ the noise of a whitened row under
-    it, ρ squares or, for the method huber, Huber's loss.  `knowledge_columns` says what is fitted,
-    `knowledge_intervals` what the intervals are; t intervals have the degrees of freedom of
+    it, ρ squares or, for the method huber, Huber's loss.  `fitted_columns` says what is fitted,
+    `intervals_with_knowledge` what the intervals are; t intervals have the degrees of freedom of
     `before`, the method's own.
 
     Raises InputError for constraints that contradict each other or held values, names that are no
@@ -486,9 +484,8 @@ def fit_with_knowledge(
     local = LinearisedFit.at(posed, found, constraints, prior, loss, sigma)
     progress("intervals under constraints" if prior is None else "intervals with the prior")
     intervals = intervals_with_knowledge(
-        posed, found, local, constraints, prior, _dof(solution, before, columns),
-        options.intervals, options.seed, options.jobs,
-    )  # fmt: skip
+        posed, found, local, constraints, prior, _dof(solution, before, columns), options
+    )
     shares = {} if prior is None else dict(zip(found.names, local.prior_share, strict=True))
     known = replace(
         solution,

@@ -34,8 +34,6 @@ from elastocal.units import Array
 # normal (per row and for L1, nothing), several times too much with blunders, which s² counts.  And
 # variances e_i² taken one by one, as eq. (14) applied to each residual, hold almost nothing.
 
-Kind = Literal["H1", "H2", "H3"]
-
 UNDETERMINED = (
     "the loss rejects so many observations that the rest do not determine the parameters' "
     "covariance; use a monotone loss such as huber, or look for the cause of the outliers"
@@ -59,22 +57,19 @@ def curvature(found: RobustEstimate) -> tuple[Array, Array]:
     return np.zeros_like(d), np.where(met, 0.0, 1 / np.where(met, 1.0, d))
 
 
-def asymptotic_covariance(found: RobustEstimate, kind: Kind = "H2") -> Covariance:
+def asymptotic_covariance(found: RobustEstimate) -> Covariance:
     """Covariance (p, p) of x̂; t intervals with the rows that keep a weight less p as dof.
 
-    With â the mean eigenvalue of J_i, b̂ = Σψ²/(n·size − p), and Huber's small-sample factor
-    k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for L1):
+    Huber's H2, k σ² (b̂/â) W⁻¹, with â the mean eigenvalue of J_i, b̂ = Σψ²/(n·size − p), and his
+    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for L1).
 
-        H1   k² σ² (b̂/â²) (BᵀB)⁻¹,     H2   k σ² (b̂/â) W⁻¹,     H3   k⁻¹ σ² b̂ W⁻¹ BᵀB W⁻¹
+    His H1, k² σ² (b̂/â²) (BᵀB)⁻¹, and H3, k⁻¹ σ² b̂ W⁻¹ BᵀB W⁻¹, estimate the same for independent
+    errors that know nothing of B.  Where the wrong observations are also leverage points, H1
+    credits x̂ with information that the loss has rejected and H3 charges it for them; H2 leaves
+    them out of b̂/â and of W alike.  Under dependence or unequal spread use `clustered_covariance`.
 
-    All three estimate the same for independent errors that know nothing of B.  Where the wrong
-    observations are also leverage points, H1 credits x̂ with information that the loss has
-    rejected and H3 charges it for them; H2 leaves them out of b̂/â and of W alike, and is the
-    default.  Under dependence or unequal spread use `clustered_covariance`.
-
-    Raises InputError for another kind, InsufficientDataError where W is not positive definite.
+    Raises InsufficientDataError where W is not positive definite.
     """
-    require(kind in ("H1", "H2", "H3"), f"kind is H1, H2 or H3; found '{kind}'")
     problem, (along, across) = found.design, curvature(found)
     rows, p, size = len(problem.y), problem.p, problem.size
     a = float(np.mean(along + (size - 1) * across)) / size
@@ -86,15 +81,11 @@ def asymptotic_covariance(found: RobustEstimate, kind: Kind = "H2") -> Covarianc
         square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
         k = 1 + p / rows * (square - a**2) / a**2
     variance = found.scale**2 * b
-    if kind == "H1":
-        inner = np.eye(p) * (k**2 * variance / a**2)
-    else:
-        inverse = inverse_of(information(found, along, across).sum(axis=0))
-        inner = k * variance / a * inverse if kind == "H2" else variance / k * inverse @ inverse
+    inner = k * variance / a * inverse_of(information(found, along, across).sum(axis=0))
     P = problem.parameters(np.eye(p))
     dof = float(size * np.count_nonzero(found.weights) - p)
-    text = f"asymptotic covariance {kind} of the {found.loss.name} estimate, from ψ and ψ′"
-    return Covariance(kind, P @ inner @ P.T, np.full(p, dof), text)
+    text = f"asymptotic covariance H2 of the {found.loss.name} estimate, from ψ and ψ′"
+    return Covariance("H2", P @ inner @ P.T, np.full(p, dof), text)
 
 
 def information(
@@ -244,9 +235,9 @@ class RobustFit:
     def weights(self) -> Array:
         return self.linear.weights
 
-    def covariance(self, kind: Kind = "H2") -> Covariance:
+    def covariance(self) -> Covariance:
         """Covariance of the fitted columns for independent errors (`asymptotic_covariance`)."""
-        return asymptotic_covariance(self.linear, kind)
+        return asymptotic_covariance(self.linear)
 
     def clustered(self, cluster: NDArray[np.int64]) -> Covariance:
         """Covariance of the fitted columns under dependence within `cluster` (n,)."""

@@ -11,7 +11,6 @@ from scipy import linalg, optimize, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, require
 from elastocal.identification.robust_core import (
-    EFFICIENCY,
     Absolute,
     Bisquare,
     Design,
@@ -375,12 +374,11 @@ def mm_estimate(
     seed: int = 0,
     subsets: int = SUBSETS,
     start: ArrayLike | None = None,
-    efficient: float = EFFICIENCY,
 ) -> RobustEstimate:
     """MM-estimate (Yohai 1987): S-estimate with 50 % breakdown, then Tukey's bisquare.
 
     B (n·size, p) and y (n·size,) whitened, `size` rows per observation.  The S-estimate fixes
-    start and scale; the bisquare with efficiency `efficient` at the normal then descends from
+    start and scale; the bisquare with 95 % efficiency at the normal then descends from
     there at that scale, so almost half of the observations, leverage points among them, may be
     arbitrarily wrong.  `subsets` random subsets are tried (deterministic in `seed`), and `start`
     (p,) or (k, p) beside them, such as `least_trimmed_squares`; 0 subsets refine the
@@ -401,7 +399,7 @@ def mm_estimate(
         )
         starts = np.stack([problem.coordinates(x) for x in given])
     z, scale = s_estimate(problem, breakdown_bisquare(problem.size), seed, subsets, starts)
-    return reweighted(problem, bisquare(problem.size, efficient), z, scale)
+    return reweighted(problem, bisquare(problem.size), z, scale)
 
 
 # Maximum likelihood under multivariate Student-t errors, ν given or estimated.

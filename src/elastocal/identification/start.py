@@ -169,10 +169,9 @@ def check_enough(model: Model, observed: Observations, scaled: Array) -> None:
     lacking = -(-(rank + 1) // observed.size)
     raise InsufficientDataError(
         f"{observed.table.source}: {rows} equations from {len(observed.lead)} readings cannot "
-        "determine "
-        f"the model's {scaled.shape[1]} parameters and their uncertainty; measure more poses "
-        f"(more than {max(lacking, -(-scaled.shape[1] // observed.size))} readings) or fit fewer "
-        "effects"
+        f"determine the model's {scaled.shape[1]} parameters and their uncertainty; measure more "
+        f"poses (more than {max(lacking, -(-scaled.shape[1] // observed.size))} readings) or fit "
+        "fewer effects"
     )
 
 

@@ -29,7 +29,6 @@ def regression(seed, n=120, p=4):
     return B, B @ x + 0.1 * rng.standard_t(2.5, size=n)
 
 
-@pytest.mark.parametrize("kind", ["H1", "H2", "H3"])
 @pytest.mark.parametrize(
     ("ours", "theirs"),
     [
@@ -38,15 +37,15 @@ def regression(seed, n=120, p=4):
     ],
     ids=["huber", "tukey"],
 )
-def test_estimate_scale_and_covariance_are_those_of_statsmodels(ours, theirs, kind):
+def test_estimate_scale_and_covariance_are_those_of_statsmodels(ours, theirs):
     """Columns scaled to unit length for statsmodels, whose pseudo-inverse needs that."""
     B, y = regression(1)
     unit = np.linalg.norm(B, axis=0)
-    reference = sm.RLM(y, B / unit, M=theirs).fit(cov=kind, tol=1e-13, maxiter=2000)
+    reference = sm.RLM(y, B / unit, M=theirs).fit(cov="H2", tol=1e-13, maxiter=2000)
     found = m_estimate(B, y, ours)
     np.testing.assert_allclose(found.x * unit, reference.params, rtol=1e-8)
     assert found.scale == pytest.approx(reference.scale, rel=1e-8)
-    scaled = asymptotic_covariance(found, kind).matrix * np.outer(unit, unit)
+    scaled = asymptotic_covariance(found).matrix * np.outer(unit, unit)
     np.testing.assert_allclose(scaled, reference.bcov_scaled, rtol=1e-8, atol=1e-14)
 
 
