@@ -20,12 +20,12 @@ from elastocal.identification.robust_core import (
     bisquare,
     breakdown_bisquare,
     design,
+    estimate_at,
     expected_rho,
     lengths,
     m_scale,
     median_length,
     median_scale,
-    score_optimality,
 )
 from elastocal.units import Array
 
@@ -357,10 +357,7 @@ def reweighted(problem: Design, loss: Loss, z: Array, known: float | None = None
         still = moved <= 4 * np.finfo(float).eps * np.linalg.norm(z)  # no more digits in z
         settled = moved <= TOLERANCE * sigma and abs(sigma - before) <= TOLERANCE * sigma
         converged = bool(settled or still)
-    optimality = score_optimality(problem, loss, r, sigma)
-    return RobustEstimate(
-        problem, loss, problem.parameters(z), r, sigma, converged, count, optimality
-    )
+    return estimate_at(problem, loss, z, sigma, converged, count)
 
 
 # MM-estimates: the breakdown point of an S-estimate with the efficiency of an M-estimate.
@@ -476,7 +473,4 @@ def _estimate(problem: Design, loss: StudentT, z: Array, scale: float) -> Robust
         converged = bool(
             (moved <= TOLERANCE * scale or still) and abs(scale - before) <= TOLERANCE * scale
         )
-    optimality = score_optimality(problem, loss, r, scale)
-    return RobustEstimate(
-        problem, loss, problem.parameters(z), r, scale, converged, count, optimality
-    )
+    return estimate_at(problem, loss, z, scale, converged, count)
