@@ -239,12 +239,11 @@ def _constrained_start(
         size = max(size, objective.loss.threshold)
     for _ in range(1 + MAX_RESCALINGS):
         point = solve_conic(objective, system, basis, size)
-        if point is None:
-            raise_conflict(system)
-        length = float(np.linalg.norm(point.x))
-        if length <= FAR_OFF * size:
+        if point is None or (length := float(np.linalg.norm(point.x))) <= FAR_OFF * size:
             break
         size = length
+    if point is None:
+        raise_conflict(system)
     return point.x, active_from_duals(system, point)
 
 
