@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
-    from elastocal.identification.knowledge_file import Knowledge
+    from elastocal.identification.knowledge import Knowledge
     from elastocal.identification.result import Calibration
     from elastocal.measurements import Measurements
     from elastocal.model.arm import Parameter
@@ -62,7 +62,7 @@ ROOMS = {
     "planning.plan": "Plan",
     "diagnosis.diagnosis": "Diagnosis",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
-    "identification.knowledge_file": "Knowledge",
+    "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
     "model.calibrated": "CalibratedArm read_calibrated",
     "model.effects.base": "Effect",

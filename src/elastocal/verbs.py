@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from elastocal.compensation.tool_targets import Targets, ToolPoint
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.intervals import IntervalKind
-    from elastocal.identification.knowledge import Constraints, GaussianPrior
-    from elastocal.identification.knowledge_file import Knowledge
+    from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, Method
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
@@ -679,7 +678,7 @@ def _table(name: str, model: Model, given: Table) -> Measurements:
 
 def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:
     """What a file and the option `physical` state together; None where neither was given."""
-    from elastocal.identification.knowledge_file import Knowledge, read_knowledge
+    from elastocal.identification.knowledge import Knowledge, read_knowledge
 
     if given is None:
         return Knowledge(physical=True, source=option("physical", True)) if physical else None

@@ -26,7 +26,6 @@ from elastocal.identification import (
     degrees_of_freedom,
     equal,
     non_negative,
-    on_columns,
     physical_constraints,
     read_knowledge,
 )
@@ -401,8 +400,8 @@ def test_constraints_on_fitted_parameters_alone_say_the_same():
         (LinearEquality({"a": 1.0, "b": 2.0}, 5.0), LinearEquality({"b": 1.0}, 2.0)),
         (SemidefiniteMatrix("m", (("a", {"b": 0.5}), ({"b": 0.5}, "c"))),),
     )
-    left = on_columns(stated, {"b": 2.0})
-    system, whole = left.resolve(("a", "c")), stated.resolve(("a", "b", "c"))
+    whole = stated.resolve(("a", "b", "c"))
+    system = whole.restricted(np.array([0, 2]), np.array([np.nan, 2.0, np.nan]))
     np.testing.assert_array_equal(system.A, [[1.0, 0.0]])
     np.testing.assert_array_equal(system.b, [1.0])
     np.testing.assert_array_equal(system.lower, [0.0, -np.inf])

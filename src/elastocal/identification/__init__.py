@@ -4,22 +4,21 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "bootstrap": "ParametricBootstrap parametric_bootstrap wild_cluster_bootstrap",
-    "constrained": "ActiveConstraint constrained_fit on_columns solve_constrained",
-    "constrained_intervals": (
-        "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_intervals"
-    ),
+    "constrained": "ActiveConstraint constrained_fit minimise objective_of",
     "constrained_solver": "ConstrainedObjective ResidualLoss",
     "covariance": "Covariance cluster_robust hc t_quantile",
     "error_budget": "BudgetStep gap_budget",
-    "faulty_readings": "FaultyGroup OutlierReport influence outlier_report",
+    "faulty_readings": "FaultyGroup OutlierReport outlier_report",
     "findings": "judged next_steps standings warning_sentences",
     "identifiability": "Problem Reduction reduce residual_sigma",
     "intervals": "cluster_by_parts profile_interval profile_of worth_clustering",
     "knowledge": (
-        "Bounds Constraints GaussianPrior LinearEquality SemidefiniteMatrix equal "
-        "non_negative passivity physical_constraints share_of_prior"
+        "Bounds Constraints GaussianPrior Knowledge KnowledgeTable LinearEquality "
+        "SemidefiniteMatrix equal non_negative physical_constraints read_knowledge share_of_prior"
     ),
-    "knowledge_file": "Knowledge KnowledgeTable read_knowledge",
+    "knowledge_fit": (
+        "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_linear_interval"
+    ),
     "least_squares": "FitProblem SumOfSquares descend fit",
     "linear_solver": "solve_weighted",
     "noise_choice": "Trial estimate_noise outlier_screening own_noise unexplained_readings",
@@ -39,7 +38,7 @@ ROOMS = {
     "robust": "asymptotic_covariance clustered_covariance robust_fit",
     "robust_core": (
         "Absolute Bisquare Huber StudentT bisquare breakdown_bisquare design efficiency huber "
-        "m_scale normal_mean normal_moments proposal_2"
+        "m_scale normal_mean normal_moments"
     ),
     "robust_fits": "log_likelihood m_estimate mm_estimate student_t",
     "solve": "Solution sizes_and_check",

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NoReturn
 
 import numpy as np
@@ -15,7 +15,6 @@ from elastocal.errors import ElastocalError, InputError, InsufficientDataError, 
 from elastocal.identification.constrained_solver import (
     Active,
     Affine,
-    ConicPoint,
     ConstrainedObjective,
     Kkt,
     LossName,
@@ -37,13 +36,9 @@ from elastocal.identification.knowledge import (
     ROUND_OFF,
     Bounds,
     Constraints,
-    Entry,
     GaussianPrior,
-    LinearEquality,
     Matrix,
-    SemidefiniteMatrix,
     System,
-    combination,
     share_of_prior,
 )
 from elastocal.identification.least_squares import FitProblem
@@ -142,21 +137,38 @@ class ActiveConstraint:
 
 @dataclass(frozen=True)
 class Minimum:
-    """Minimiser x (p,), the objective there, active constraints, cofactor (p, p), KKT residual.
+    """Minimiser x (p,), residual y − B x (rows,) and objective there, and their optimality.
 
-    `cofactor` is the inverse of half the objective's Hessian within the active face, zero across
-    it: (BᵀB + PᵀP)⁻¹ for squares and no active constraint.
+    `cofactor` (p, p) is the inverse of half the objective's Hessian within the face of the active
+    constraints, zero across it: (BᵀB + PᵀP)⁻¹ for squares and no active constraint.  Times the
+    variance of a whitened row it is the (posterior) covariance with the active constraints taken
+    as equalities; for Huber's loss it is no covariance.  `prior_share` (p,) says what share of each
+    estimate's information is the prior's (0 without prior, NaN where constraints fix the value).
+    `kkt` is the relative KKT residual, about 1e-12 at a minimum.
     """
 
     x: Array
+    residual: Array
     objective: float
     active: tuple[ActiveConstraint, ...]
     cofactor: Array
+    prior_share: Array
     kkt: float
 
 
-def minimise(objective: ConstrainedObjective, system: System) -> Minimum:
-    """Minimise the objective over the system's x; raises as `solve_constrained` does."""
+def minimise(
+    objective: ConstrainedObjective, system: System, stated: System | None = None
+) -> Minimum:
+    """Minimise the objective over the system's x; `active` in the terms of `stated`, if given,
+    where x is a step and `stated` the constraints on the parameters themselves.
+
+    Squares under bounds and equalities are solved by Lawson and Hanson's LDP; matrices and
+    Huber's loss by an interior-point method (Clarabel); both end with Newton steps on the active
+    face, so that the result is good to rounding and not to a solver's tolerance.
+
+    Raises InputError where constraints contradict each other, which it names, and
+    InsufficientDataError where data, prior and equalities leave a direction undetermined.
+    """
     # Columns of unit length: x is then in units of the standard deviation a parameter would have
     # alone, whatever its physical unit, and so are slacks and tolerances.
     unit = 1 / objective.norms
@@ -178,13 +190,12 @@ def minimise(objective: ConstrainedObjective, system: System) -> Minimum:
         )
     x = unit * (centre + z)
     x[active.lower], x[active.upper] = system.lower[active.lower], system.upper[active.upper]
+    cofactor = _cofactor(scaled, limits, active, z) * np.outer(unit, unit)
     return Minimum(
-        x,
-        objective.value(x),
-        _named(system, limits, active, at, z, unit),
-        _cofactor(scaled, limits, active, z) * np.outer(unit, unit),
-        at.residual,
-    )
+        x, objective.y - objective.B @ x, objective.value(x),
+        _named(stated or system, limits, active, at, z, unit), cofactor,
+        share_of_prior(cofactor, objective.P), at.residual,
+    )  # fmt: skip
 
 
 def _least_squares(
@@ -226,28 +237,19 @@ def _constrained_start(
     size = system.distance(none.astype(float))
     if not objective.loss.quadratic:
         size = max(size, objective.loss.threshold)
-    point = _conic_point(objective, system, basis, size)
-    for _ in range(MAX_RESCALINGS):
-        length = float(np.linalg.norm(point.x))
-        if length <= FAR_OFF * size:
+    for _ in range(1 + MAX_RESCALINGS):
+        point = solve_conic(objective, system, basis, size)
+        if point is None or (length := float(np.linalg.norm(point.x))) <= FAR_OFF * size:
             break
         size = length
-        point = _conic_point(objective, system, basis, size)
-    return point.x, active_from_duals(system, point.x, point.lower, point.upper, point.matrices)
+    if point is None:
+        raise_conflict(system)
+    return point.x, active_from_duals(system, point)
 
 
 def _semidefinite(matrix: Matrix, x: Array) -> bool:
     values = np.linalg.eigvalsh(matrix.at(x))
     return bool(values[0] >= -ROUND_OFF * max(np.abs(values).max(), 0.0))
-
-
-def _conic_point(
-    objective: ConstrainedObjective, system: System, basis: Array, size: float
-) -> ConicPoint:
-    point = solve_conic(objective, system, basis, size)
-    if point is None:
-        raise_conflict(system)
-    return point
 
 
 def _cofactor(objective: ConstrainedObjective, system: System, active: Active, x: Array) -> Array:
@@ -292,80 +294,6 @@ def _named(
     return tuple(found)
 
 
-# Constrained and regularised linear least squares.
-
-
-@dataclass(frozen=True)
-class ConstrainedSolution:
-    """Estimates x (p,) of the parameters `names`, residual y − B x (rows,), and their optimality.
-
-    `objective` is Σ loss + prior, `rss` the residual's sum of squares.  `cofactor` (p, p) times
-    the variance of a whitened row is the (posterior) covariance with the active constraints taken
-    as equalities; for Huber's loss it is the inverse of half the Hessian, no covariance.
-    `prior_share` (p,) says what share of each estimate's information is the prior's (0 without
-    prior, NaN where constraints fix the value).  `kkt` is the relative KKT residual, about 1e-12
-    at a minimum.
-    """
-
-    names: tuple[str, ...]
-    x: Array
-    residual: Array
-    objective: float
-    rss: float
-    active: tuple[ActiveConstraint, ...]
-    cofactor: Array
-    prior_share: Array
-    kkt: float
-
-    @property
-    def mostly_prior(self) -> tuple[str, ...]:
-        """Parameters that owe more than half of their information to the prior."""
-        share = np.nan_to_num(self.prior_share)
-        return tuple(n for n, s in zip(self.names, share, strict=True) if s > 0.5)
-
-
-def solve_constrained(
-    B: ArrayLike,
-    y: ArrayLike,
-    names: Sequence[str],
-    constraints: Constraints | None = None,
-    *,
-    prior: GaussianPrior | None = None,
-    loss: LossName = "squares",
-    size: int = 1,
-    sigma: float = 1.0,
-) -> ConstrainedSolution:
-    """Minimise Σ ρ(y − B x) + σ² (x − m)ᵀ C⁻¹ (x − m) subject to the constraints.
-
-    B (rows, p) and y (rows,) are whitened with rows of standard deviation `sigma`; `names` (p,)
-    are the columns; m and C come from the prior (maximum a posteriori).  "squares" is ρ = |r|²;
-    "huber" is Huber's loss of the length of each observation of `size` rows, with the threshold
-    of 95 % efficiency.
-
-    Squares under bounds and equalities are solved by Lawson and Hanson's LDP; matrices and
-    Huber's loss by an interior-point method (Clarabel); both end with Newton steps on the active
-    face, so that the result is good to rounding and not to a solver's tolerance.
-
-    Raises InputError where names are unknown, numbers not finite, constraints contradict each
-    other (and names those), or Clarabel is needed and missing; InsufficientDataError where data,
-    prior and equalities leave a direction undetermined.
-    """
-    objective = objective_of(B, y, names, prior, loss, size, sigma)
-    found = minimise(objective, (constraints or Constraints()).resolve(names))
-    residual = objective.y - objective.B @ found.x
-    return ConstrainedSolution(
-        tuple(names),
-        found.x,
-        residual,
-        found.objective,
-        float(residual @ residual),
-        found.active,
-        found.cofactor,
-        share_of_prior(found.cofactor, objective.P),
-        found.kkt,
-    )
-
-
 def objective_of(
     B: ArrayLike,
     y: ArrayLike,
@@ -375,7 +303,15 @@ def objective_of(
     size: int,
     sigma: float,
 ) -> ConstrainedObjective:
-    """The checked objective of `solve_constrained`."""
+    """The checked objective Σ ρ(y − B x) + σ² (x − m)ᵀ C⁻¹ (x − m).
+
+    B (rows, p) and y (rows,) are whitened with rows of standard deviation `sigma`; `names` (p,)
+    are the columns; m and C come from the prior (maximum a posteriori).  "squares" is ρ = |r|²;
+    "huber" is Huber's loss of the length of each observation of `size` rows, with the threshold
+    of 95 % efficiency.
+
+    Raises InputError where names are unknown or numbers not finite.
+    """
     B, y = np.asarray(B, dtype=float), np.asarray(y, dtype=float)
     p = len(names)
     require(
@@ -404,7 +340,7 @@ class ConstrainedFit:
     """Values x (parameters,), raw and whitened residual (rows,), B (rows, columns), raw.
 
     `columns` are the fitted parameters; `cofactor` (columns, columns) and `prior_share`
-    (columns,) as in `ConstrainedSolution`, on the model linearised at x; multipliers of `active`
+    (columns,) as in `Minimum`, on the model linearised at x; multipliers of `active`
     are in units of the objective per unit of the constraint.  `kkt` is the relative KKT residual
     of the nonlinear problem at x.
     """
@@ -443,18 +379,16 @@ def constrained_fit(
     standard deviation of a whitened row; Huber's loss is of each reading's length.  The problem's
     `bounded` and `tie` hold as in `fit`.
 
-    Raises InputError as `solve_constrained` does, and where a held parameter alone breaks a
+    Raises InputError as `minimise` does, and where a held parameter alone breaks a
     constraint; ElastocalError where the start has poses without equilibrium.
     """
-    columns = np.asarray(problem.columns, dtype=np.int64)
+    columns = problem.columns
     names = tuple(problem.model.names[c] for c in columns)
     system = fit_system(problem, constraints or Constraints())
     P, target = _prior_rows(problem, columns, prior, sigma)
-    nonlinear = _Nonlinear(
-        problem, columns, P, target, loss_of(loss, problem.observations.size, sigma)
-    )
+    nonlinear = _Nonlinear(problem, P, target, loss_of(loss, problem.observations.size, sigma))
     size, zero = problem.sizes[columns], np.zeros(len(columns))
-    x = nonlinear.moved(problem.x, _nearest(zero, size, system.moved(problem.x[columns], zero + 1)))
+    x = nonlinear.moved(problem.x, _nearest(size, system.moved(problem.x[columns], zero + 1)))
     at, objective = nonlinear.linearised(x)
     value, radius = objective.value(zero), FIRST_RADIUS
     reason, converged, steps = "the step limit was reached; the start may be far off", False, 0
@@ -478,17 +412,17 @@ def constrained_fit(
             at, objective = nonlinear.linearised(x)
             value = objective.value(zero)
     limits = system.moved(x[columns], zero + 1)
-    final = minimise(objective, limits)
+    final = minimise(objective, limits, system)
     return ConstrainedFit(
-        x, at.residual, objective.y, at.B, columns, names, value, _in_place(final, system),
-        final.cofactor, share_of_prior(final.cofactor, P), _kkt(objective, limits), converged,
+        x, at.residual, objective.y, at.B, columns, names, value, final.active,
+        final.cofactor, final.prior_share, _kkt(objective, limits), converged,
         reason, steps,
     )  # fmt: skip
 
 
 def fit_system(problem: FitProblem, constraints: Constraints) -> System:
     """The constraints on the problem's columns, with the effects' own bounds where `bounded`."""
-    columns = np.asarray(problem.columns, dtype=np.int64)
+    columns = problem.columns
     own = [problem.model.parameters[c] for c in columns] if problem.bounded else []
     stated = constraints + Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in own))
     return stated.resolve(problem.model.names).restricted(columns, problem.x)
@@ -499,7 +433,6 @@ class _Nonlinear:
     """The objective as a function of all parameters, and its linearisation in a step."""
 
     problem: FitProblem
-    columns: NDArray[np.int64]
     P: Array
     target: Array
     loss: ResidualLoss
@@ -507,20 +440,21 @@ class _Nonlinear:
     def moved(self, x: Array, step: Array) -> Array:
         """x (parameters,) with `step` (columns,) added."""
         trial = x.astype(float)
-        trial[self.columns] += step
+        trial[self.problem.columns] += step
         return trial
 
     def linearised(self, x: Array) -> tuple[Regression, ConstrainedObjective]:
-        observed, apply = self.problem.observations, self.problem.weights.apply
-        at = self.problem.model.regressor(observed.table, x, self.columns, observed)
-        lack = self.target - self.P @ x[self.columns]
+        problem, apply = self.problem, self.problem.weights.apply
+        observed, columns = problem.observations, problem.columns
+        at = problem.model.regressor(observed.table, x, columns, observed)
+        lack = self.target - self.P @ x[columns]
         return at, ConstrainedObjective(apply(at.B), apply(at.residual), self.P, lack, self.loss)
 
     def value(self, x: Array) -> float:
         """The objective at x; NaN where a pose has no equilibrium."""
         observed = self.problem.observations
         misfit = observed.value - self.problem.model.predict(observed.table, x, observed)
-        lack = self.target - self.P @ x[self.columns]
+        lack = self.target - self.P @ x[self.problem.columns]
         return self.loss.value(self.problem.weights.apply(misfit)) + float(lack @ lack)
 
 
@@ -535,37 +469,16 @@ def _prior_rows(
         target = sigma * (target - P[:, held] @ problem.x[held])
         P = sigma * P[:, columns]
     if problem.tie is not None:
-        centre = (problem.x if problem.centre is None else problem.centre)[columns]
         P = np.vstack([P, np.diag(1 / problem.tie)])
-        target = np.concatenate([target, centre / problem.tie])
+        target = np.concatenate([target, problem.tied_to / problem.tie])
     return P, target
 
 
-def _nearest(x: Array, size: Array, system: System) -> Array:
-    """The point nearest to x, in typical sizes, that satisfies the constraints."""
-    none = np.zeros((0, len(x)))
-    return minimise(
-        ConstrainedObjective(np.diag(1 / size), x / size, none, none[:, 0], ResidualLoss()), system
-    ).x
-
-
-def _in_place(found: Minimum, system: System) -> tuple[ActiveConstraint, ...]:
-    """Active constraints of a step, told as constraints on the parameters."""
-    lower, upper = (
-        dict(zip(system.names, side, strict=True)) for side in (system.lower, system.upper)
-    )
-    equalities = dict(zip(system.equality_labels, system.b, strict=True))
-    told = []
-    for a in found.active:
-        if a.kind == "equality":
-            told.append(replace(a, value=float(equalities[a.label])))
-        elif a.kind == "semidefinite":
-            told.append(a)
-        else:
-            value = float((lower if a.kind == "lower" else upper)[a.names[0]])
-            sign = ">=" if a.kind == "lower" else "<="
-            told.append(replace(a, value=value, label=f"{a.names[0]} {sign} {value:.6g}"))
-    return tuple(told)
+def _nearest(size: Array, system: System) -> Array:
+    """The shortest step, in typical sizes, to where the constraints hold."""
+    P, target = np.zeros((0, len(size))), np.zeros(0)
+    distance = ConstrainedObjective(np.diag(1 / size), 0 * size, P, target, ResidualLoss())
+    return minimise(distance, system).x
 
 
 def _kkt(objective: ConstrainedObjective, limits: System) -> float:
@@ -670,29 +583,3 @@ def own_bounds(solution: Solution) -> Constraints:
             if np.isfinite(p.lower) or np.isfinite(p.upper)
         )
     )
-
-
-def on_columns(stated: Constraints, held: Mapping[str, float]) -> Constraints:
-    """The constraints on the other parameters where those in `held` have these values.
-
-    A constraint on held parameters alone is left out; `constrained_fit` has checked that it holds.
-    """
-    equalities = []
-    for e in stated.equalities:
-        terms = {n: c for n, c in e.terms.items() if n not in held}
-        if any(terms.values()):
-            value = e.value - sum(c * held[n] for n, c in e.terms.items() if n in held)
-            equalities.append(LinearEquality(terms, value, str(e)))
-    matrices = []
-    for m in stated.matrices:
-        rows = tuple(tuple(_entry(entry, held) for entry in row) for row in m.entries)
-        if any(name for row in rows for entry in row for name in combination(entry)):
-            matrices.append(SemidefiniteMatrix(m.label, rows))
-    bounds = tuple(b for b in stated.bounds if b.name not in held)
-    return Constraints(bounds, tuple(equalities), tuple(matrices))
-
-
-def _entry(entry: Entry, held: Mapping[str, float]) -> Entry:
-    terms = combination(entry)
-    constant = terms.pop("", 0.0) + sum(c * held[n] for n, c in terms.items() if n in held)
-    return {n: c for n, c in terms.items() if n not in held} | {"": constant}

@@ -236,16 +236,14 @@ class Kkt:
     residual: float
 
 
-def active_from_duals(
-    system: System, x: Array, lower: Array, upper: Array, duals: tuple[Array, ...]
-) -> Active:
+def active_from_duals(system: System, point: ConicPoint) -> Active:
     """Which constraints are active, by strict complementarity: slack < multiplier.
 
     M(x) and its multiplier Z share eigenvectors and M Z = 0, so the negative eigenvalues of
     M − Z are those of −Z, and belong to the null space.
     """
-    nulls = []
-    for matrix, Z in zip(system.matrices, duals, strict=True):
+    x, lower, upper, nulls = point.x, point.lower, point.upper, []
+    for matrix, Z in zip(system.matrices, point.matrices, strict=True):
         values, vectors = np.linalg.eigh(matrix.at(x) - (Z + Z.T) / 2)
         nulls.append(vectors[:, values < 0])
     return Active(

@@ -2,150 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special, stats
+from scipy import special
 
 from elastocal.errors import ElastocalError, require
 from elastocal.identification.noise_choice import NoiseFit, linearised, own_noise, weights_of
 from elastocal.identification.outliers import FALSE_ALARM, blocks
-from elastocal.identification.robust_core import Design, RobustEstimate, design, lengths
-from elastocal.identification.robust_fits import mm_of
+from elastocal.identification.robust_core import Design, design
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.units import Array, BoolArray
-
-# Influence in closed form: what the estimate would be without a row, marker, configuration.
-#
-# With whitened B = QR, whitened least-squares residual e, and group g of m_g rows,
-#
-#     x̂ − x̂₍₋g₎ = R⁻¹ (I − Q_gᵀQ_g)⁻¹ Q_gᵀ e_g,        held-out residual  (I − Q_g Q_gᵀ)⁻¹ e_g,
-#     Δ_g = e_gᵀ (I − Q_g Q_gᵀ)⁻¹ e_g                  (what leaving g out takes off the rss)
-#
-# exactly for a linear model (Cook and Weisberg 1982, chapter 3; Belsley, Kuh and Welsch 1980).
-
-ALONE = 1e-9  # smallest eigenvalue of I − H_gg below which a group alone determines something
-
-
-@dataclass(frozen=True)
-class Influence:
-    """One entry per group, in ascending order of `label` (G,).
-
-    `rows` (G,) rows of the group; `shift` (G, p) = x̂ − x̂₍₋g₎ in the parameters' units; `dfbetas`
-    (G, p) = shift over its standard deviation √(s₍₋g₎² (BᵀB)⁻¹_jj); `cook` (G,) =
-    shiftᵀ BᵀB shift/(p s²); `covratio` (G,) = det cov(x̂₍₋g₎)/det cov(x̂), above 1 where the group
-    helps; `F` and `p_value` (G,) = (Δ_g/m_g)/s₍₋g₎² against F(m_g, rows − m_g − p), the externally
-    studentised held-out residual; `held_out` (rows,).  A group that alone determines a parameter
-    has no held-out fit: its held-out residual is infinite and its other entries NaN.
-    """
-
-    label: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    shift: Array
-    dfbetas: Array
-    cook: Array
-    covratio: Array
-    F: Array
-    p_value: Array
-    held_out: Array
-
-
-def influence(
-    B: ArrayLike, y: ArrayLike, group: ArrayLike | None = None, *, size: int = 1
-) -> Influence:
-    """Leave-one-group-out influence on the least-squares fit of y (n·size,) on B (n·size, p).
-
-    `group` (n,) integer label of each observation of `size` rows: its marker, configuration or
-    any other; by default every observation by itself.  B and y are whitened.
-
-    Raises InputError for wrong shapes or dependent columns.
-    """
-    problem = design(B, y, size)
-    n, p, m = problem.n, problem.p, len(problem.y)
-    labels = np.arange(n) if group is None else np.asarray(group)
-    require(
-        labels.shape == (n,) and np.issubdtype(labels.dtype, np.integer),
-        f"group must hold one integer label per observation, ({n},); found {labels.dtype} "
-        f"{labels.shape}",
-    )
-    names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
-    e = problem.residual(problem.Q.T @ problem.y)
-    rows_of = np.argsort(np.repeat(code, size), kind="stable")
-    starts = np.cumsum(count * size) - count * size
-    G = len(names)
-    moved, drop, logdet = np.full((G, p), np.nan), np.full(G, np.nan), np.full(G, np.nan)
-    held = np.full(m, np.inf)
-    for length in np.unique(count) * size:
-        chosen = np.flatnonzero(count * size == length)
-        rows = rows_of[starts[chosen][:, None] + np.arange(length)]
-        found = _leave_out(problem.Q[rows], e[rows])
-        moved[chosen], drop[chosen], logdet[chosen] = found[:3]
-        held[rows] = found[3]
-    return _summary(problem.parameters(moved.T).T, problem.cofactor, moved, drop, logdet, held,
-                    names, count * size, float(e @ e))  # fmt: skip
-
-
-def _leave_out(Q: Array, e: Array) -> tuple[Array, Array, Array, Array]:
-    """Shift in z (k, p), Δ (k,), log det(I − H) (k,), held-out residual (k, m) of k equal groups.
-
-    Works with I − QᵀQ (p × p) for large groups and I − QQᵀ (m × m) for small ones; both have the
-    same determinant.
-    """
-    _, m, p = Q.shape
-    QT = Q.transpose(0, 2, 1)
-    wide = m > p
-    gap = np.eye(p) - QT @ Q if wide else np.eye(m) - Q @ QT
-    alone = np.linalg.eigvalsh(gap)[:, 0] < ALONE
-    gap[alone] = np.eye(gap.shape[1])
-    if wide:
-        shift = np.asarray(np.linalg.solve(gap, QT @ e[..., None]))[..., 0]
-        held = np.asarray(e + np.einsum("gij,gj->gi", Q, shift))
-    else:
-        held = np.asarray(np.linalg.solve(gap, e[..., None]))[..., 0]
-        shift = np.einsum("gij,gi->gj", Q, held)
-    drop = np.asarray((e * held).sum(axis=1))
-    logdet = np.asarray(np.linalg.slogdet(gap)[1])
-    shift[alone], drop[alone], logdet[alone], held[alone] = np.nan, np.nan, np.nan, np.inf
-    return shift, drop, logdet, held
-
-
-def _summary(
-    shift: Array,
-    cofactor: Array,
-    moved: Array,
-    drop: Array,
-    logdet: Array,
-    held: Array,
-    names: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    rss: float,
-) -> Influence:
-    m, p = int(rows.sum()), len(cofactor)
-    s2 = rss / (m - p)
-    dof = m - p - rows
-    possible = np.where(dof > 0, dof, np.nan)
-    without = np.maximum(rss - drop, 0.0) / possible
-    with np.errstate(divide="ignore", invalid="ignore"):
-        F = drop / rows / without
-        dfbetas = shift / np.sqrt(without[:, None] * np.diag(cofactor))
-        cook = (moved**2).sum(axis=1) / (p * s2)
-        covratio = np.exp(p * np.log(without / s2) - logdet)
-    return Influence(
-        names, rows, shift, dfbetas, cook, covratio, F, stats.f.sf(F, rows, possible), held
-    )
-
 
 # Tests of single readings and of groups against the fit to the readings held to be good.
 
 ABSORBED = 1e-6  # share of a group's error that must be left after the model has followed it
 NOTHING = 1e-9  # share of a direction's information below which it is undetermined
-ROUNDS = 30
-SUSPECT = 0.01  # share of clean readings that the first set, from the robust fit, leaves out
 
 
 @dataclass(frozen=True)
@@ -280,28 +156,6 @@ class CleanFit:
         return P @ moved / (self.sigma * np.linalg.norm(P, axis=1))
 
 
-def screened(found: RobustEstimate, active: BoolArray, limit: float) -> CleanFit:
-    """The fit to the `active` observations (n,) whose own p-value is not below `limit`.
-
-    Starts from those near the robust fit and repeats until the set stands; a set without a
-    majority of the active ones cannot judge, and its predecessor stands.
-    """
-    size = found.design.size
-    inside = lengths(found.residual, size) <= found.scale * stats.chi.isf(SUSPECT, size)
-    good = active & inside
-    if 2 * good.sum() <= active.sum():
-        good = active
-    fit = CleanFit(found.design, good)
-    visited = {good.tobytes()}
-    for _ in range(ROUNDS):
-        good = active & (fit.reading_p() >= limit)
-        if 2 * good.sum() <= active.sum() or good.tobytes() in visited:
-            break
-        visited.add(good.tobytes())
-        fit = CleanFit(found.design, good)
-    return fit
-
-
 # Groups of readings that may share an error: which of them to blame, and in what order.
 
 Level = Literal["reading", "marker", "configuration", "block"]
@@ -327,28 +181,26 @@ def groups_of(level: Level, labels: NDArray[Any]) -> list[Group]:
 
 
 def accepted_groups(
-    clean_fit: Callable[[BoolArray], CleanFit],
-    n: int,
+    problem: Design,
+    good: BoolArray,
     groups: list[Group],
     lines: NDArray[np.int64],
     adjust: dict[Level, int],
-    false_alarm: float,
 ) -> tuple[CleanFit, list[tuple[Group, GroupTest, int]]]:
     """Groups beyond the noise, with how many of their readings are so alone, and the fit to the
     good readings outside them.
 
     One at a time, the one that explains most first, as long as a majority is left.  `adjust`
     holds the number of tests that a p-value of each level is multiplied by; runs of `lines` (n,)
-    are tried where it has "block".  `clean_fit` makes the fit to the good ones among those (n,)
-    that are still in question.
+    are tried where it has "block".
     """
-    active = np.ones(n, dtype=bool)
+    n, active = problem.n, np.ones(problem.n, dtype=bool)
     accepted: list[tuple[Group, GroupTest, int]] = []
     while True:
-        fit = clean_fit(active)
+        fit = CleanFit(problem, good & active)
         runs = _runs(fit, active, lines) if "block" in adjust else []
-        tested = _tested(fit, active, groups + runs, adjust, false_alarm)
-        significant = [t for t in tested if t[1].p_value * adjust[t[0].level] < false_alarm]
+        tested = _tested(fit, active, groups + runs, adjust)
+        significant = [t for t in tested if t[1].p_value * adjust[t[0].level] < FALSE_ALARM]
         if not significant:
             return fit, accepted
         group, test = max(significant, key=_weight)
@@ -370,11 +222,7 @@ def _runs(fit: CleanFit, active: BoolArray, lines: NDArray[np.int64]) -> list[Gr
 
 
 def _tested(
-    fit: CleanFit,
-    active: BoolArray,
-    groups: list[Group],
-    adjust: dict[Level, int],
-    false_alarm: float,
+    fit: CleanFit, active: BoolArray, groups: list[Group], adjust: dict[Level, int]
 ) -> Iterator[tuple[Group, GroupTest]]:
     """Tests of all groups still active, on all of their readings where most are beyond the noise
     and that is no chance, else on those that are not."""
@@ -385,7 +233,7 @@ def _tested(
         count, others = int(present.sum()), int((active & ~present).sum())
         rate = (outside + 1) / (others + 1)
         chance = float(special.bdtrc(inside - 1, count, rate)) if inside else 1.0
-        whole = 2 * inside >= count and chance * adjust[group.level] < false_alarm
+        whole = 2 * inside >= count and chance * adjust[group.level] < FALSE_ALARM
         if group.level == "block" and not whole:
             continue
         used = present if whole else present & fit.good
@@ -401,11 +249,11 @@ def _weight(candidate: tuple[Group, GroupTest]) -> float:
 
 # Which readings, markers, configurations and runs of lines lie beyond the noise.
 #
-# All are judged against the fit of the majority: an MM-estimate, then least squares on what agrees
-# with it.  A reading is tested as if left out; a group by the error common to its readings, which
-# shows long before any one of them does, and by their errors whatever the direction.  Readings
-# beyond the noise count for their group only where they are most of it and far more frequent there
-# than elsewhere: scattered blunders make no bad marker.
+# All are judged against the fit to the good readings, those that agree with the majority.  One is
+# tested as if left out; a group by the error common to its readings, which shows long before any
+# one of them does, and by their errors whatever the direction.  Readings beyond the noise count for
+# their group only where they are most of it and far more frequent there than elsewhere: scattered
+# blunders make no bad marker.
 #
 # The false-alarm rate holds for the whole report: it is shared between the levels tested, and
 # within a level between its tests (Bonferroni; for blocks between all possible runs of lines).  The
@@ -454,7 +302,7 @@ class OutlierReport:
     dof: int
     good: BoolArray
     tests: dict[str, int]
-    false_alarm: float
+    false_alarm: float = FALSE_ALARM
     names: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -479,26 +327,24 @@ class OutlierReport:
 def outlier_report(
     B: ArrayLike,
     y: ArrayLike,
+    good: BoolArray,
     *,
     size: int = 1,
     marker: ArrayLike | None = None,
     configuration: ArrayLike | None = None,
     line: ArrayLike | None = None,
-    seed: int = 0,
-    good: BoolArray | None = None,
-    false_alarm: float = FALSE_ALARM,
 ) -> OutlierReport:
-    """Find what is beyond the noise in y (n·size,) ≈ B (n·size, p) x, whitened.
+    """What is wrong with the readings of y (n·size,) ≈ B (n·size, p) x, whitened.
+
+    `good` (n,) says which observations to rely on; reported are the others, alone or as groups,
+    and groups of good ones that err together.
 
     `marker` and `configuration` (n,) labels, `line` (n,) integer line of each observation (by
     default its number); a level without labels is not tested, and neither are groups of a single
-    reading or of half the table.  `seed` fixes the search of the MM-estimate, `good` (n,) says
-    which observations to rely on where that is known already; then nothing is searched for, and
-    what is reported are the others, alone or as groups.
+    reading or of half the table.
 
     Raises InputError for wrong shapes or dependent columns.
     """
-    require(0 < false_alarm < 0.5, f"false_alarm lies between 0 and 0.5; found {false_alarm}")
     problem = design(B, y, size)
     n = problem.n
     lines = np.arange(n) if line is None else _labels("line", line, n)
@@ -515,12 +361,7 @@ def outlier_report(
         tests["block"] = n * (n + 1) // 2
     adjust = {level: count * len(tests) for level, count in tests.items()}
 
-    if good is None:
-        found, limit = mm_of(problem, seed), false_alarm / adjust["reading"]
-        chosen = partial(screened, found, limit=limit)
-    else:
-        chosen = partial(_known, problem, good)
-    fit, accepted = accepted_groups(chosen, n, groups, lines, adjust, false_alarm)
+    fit, accepted = accepted_groups(problem, good, groups, lines, adjust)
     findings = []
     active = np.ones(n, dtype=bool)
     for group, test, beyond in accepted:
@@ -538,12 +379,8 @@ def outlier_report(
     findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
     return OutlierReport(
         tuple(findings), problem.parameters(fit.z), fit.sigma, fit.dof, fit.good,
-        {str(level): count for level, count in tests.items()}, false_alarm,
+        {str(level): count for level, count in tests.items()},
     )  # fmt: skip
-
-
-def _known(problem: Design, good: BoolArray, active: BoolArray) -> CleanFit:
-    return CleanFit(problem, good & active)
 
 
 def _finding(
@@ -577,7 +414,7 @@ def _labels(name: str, given: ArrayLike, n: int) -> NDArray[Any]:
     return labels
 
 
-# What is wrong with the readings: single ones, a marker, a configuration, a block of lines.
+# The readings of an identification, under the noise that its method found.
 
 
 def report_faulty(
@@ -613,7 +450,7 @@ def report_faulty(
         B, e = root @ B, root @ e
     try:
         report = outlier_report(
-            B, e, size=observed.size, good=good, line=table.row[observed.lead],
+            B, e, good, size=observed.size, line=table.row[observed.lead],
             marker=_reading_labels(table.marker_names, table.marker[observed.lead]),
             configuration=None if shared else _reading_labels(
                 table.configuration_labels, table.configuration[observed.lead]

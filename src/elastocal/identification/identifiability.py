@@ -155,7 +155,7 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
 
 
 def free_r_factor(problem: Problem, found: Fit) -> RFactor:
-    """The triangle of the free columns at the fitted values."""
+    """The R factor of the free columns at the fitted values."""
     if np.array_equal(found.columns, problem.free):
         return found.r_factor
     if found.wide is not None:
@@ -187,7 +187,7 @@ def fit_kept(
 ) -> Fit:  # fmt: skip
     """Fit of the kept parameters, the others held at the start; their share moves over first.
 
-    `again` says that there will be another choice at its end, by `free_triangle`.
+    `again` says that there will be another choice at its end, by `free_r_factor`.
     """
     kept, dropped = chosen.kept, chosen.dropped
     among = problem.free if again else None
@@ -224,7 +224,7 @@ def prefer_wider(
     """A wider set, up to full rank, where it predicts held-out configurations better.
 
     Typical sizes are prior knowledge and may be wrong for this arm; held-out data decide, first
-    on the linearised model, then on the refitted one.  `triangle` of the free columns at the fit.
+    on the linearised model, then on the refitted one.  `r_factor` is that of the free columns.
     """
     size = problem.observations.size
     for threshold in WIDER:

@@ -1,23 +1,22 @@
-"""What is known of the parameters besides the readings: constraints, physics and priors."""
+"""What is known of the parameters besides the readings: constraints, physics, priors, a file."""
 
 from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy import linalg
 
+from elastocal.config import Positive, Table, Text, checked, read_toml, required
 from elastocal.errors import InputError, require
-from elastocal.model.arm import Parameter
 from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array
@@ -357,17 +356,13 @@ def physical_constraints(model: Model) -> Constraints:
     A spring cannot give energy away, so a compliance matrix K, θ = K M, has xᵀKx ≥ 0.  Where an
     effect has no coupling terms its matrix is diagonal, which is semidefinite exactly where its
     entries are non-negative: bounds say that (`ParameterSpec.lower`), and are solved exactly.
+
+    With coupling terms there is a matrix for the family `PLACE.STEM_x`, `PLACE.STEM_xy`, … of one
+    effect: doubled axes (of x, y, z, rx, ry, rz) are off the diagonal.  At a joint, z is its own
+    axis: where the family has no `_z`, the diagonal there is the drive's `PLACE.compliance`.  An
+    entry that no parameter names is 0.
     """
-    return passivity(model.parameters)
-
-
-def passivity(parameters: Sequence[Parameter]) -> Constraints:
-    """Bounds, and a matrix for every family of parameters with coupling terms.
-
-    A family is `PLACE.STEM_x`, `PLACE.STEM_xy`, … of one effect: doubled axes (of x, y, z, rx,
-    ry, rz) are off the diagonal.  At a joint, z is its own axis: where the family has no `_z`,
-    the diagonal there is the drive's `PLACE.compliance`.  An entry that no parameter names is 0.
-    """
+    parameters = model.parameters
     names = {p.name for p in parameters}
     families: dict[tuple[str, str], dict[frozenset[str], str]] = defaultdict(dict)
     for p in parameters:
@@ -391,7 +386,8 @@ def passivity(parameters: Sequence[Parameter]) -> Constraints:
                 f"{entries[axes]} couples an axis that has no compliance of its own: "
                 f"{where}.{stem}_{''.join(missing[:1])} is not a parameter; add it to the effect",
             )
-        matrices.append(_inertia_matrix(f"{where}.{stem}", used, entries))
+        rows = tuple(tuple(entries.get(frozenset({a, b}), 0.0) for b in used) for a in used)
+        matrices.append(SemidefiniteMatrix(f"{where}.{stem}", rows))
     # A semidefinite matrix has a non-negative diagonal; saying it twice only blurs multipliers.
     implied = {str(m.entries[i][i]) for m in matrices for i in range(len(m.entries))}
     bounds = tuple(
@@ -401,18 +397,6 @@ def passivity(parameters: Sequence[Parameter]) -> Constraints:
         or np.isfinite(p.upper)
     )
     return Constraints(bounds=bounds, matrices=tuple(matrices))
-
-
-def _inertia_matrix(
-    label: str, axes: list[str], entries: dict[frozenset[str], str]
-) -> SemidefiniteMatrix:
-    n = len(axes)
-    cells: list[list[Entry]] = [[0.0] * n for _ in range(n)]
-    for i, a in enumerate(axes):
-        cells[i][i] = entries.get(frozenset({a}), 0.0)
-    for (i, a), (j, b) in combinations(enumerate(axes), 2):
-        cells[i][j] = cells[j][i] = entries.get(frozenset({a, b}), 0.0)
-    return SemidefiniteMatrix(label, tuple(tuple(row) for row in cells))
 
 
 # Prior knowledge of parameters: data sheets, an earlier calibration, a sister robot.
@@ -460,8 +444,7 @@ class GaussianPrior:
     def from_dict(cls, table: Mapping[str, Any]) -> GaussianPrior:
         """From {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}, …}, in SI units."""
         require(bool(table), "the prior is empty; name at least one parameter")
-        means: list[float] = []
-        stds: list[float] = []
+        stated: dict[str, list[float]] = {key: [] for key in KEYS}
         for name, entry in table.items():
             where = f"prior of {quoted(name)}"
             require(
@@ -472,29 +455,15 @@ class GaussianPrior:
             require(not nested, f"{where}: write the full name in quotes: {listed(nested)}")
             for key in entry:
                 require(key in KEYS, f"{where}: unknown key {quoted(key)}{did_you_mean(key, KEYS)}")
-            for key, target in (("mean", means), ("std", stds)):
+            for key, values in stated.items():
                 require(key in entry, f"{where}: '{key}' is missing")
                 value = entry[key]
                 require(
                     isinstance(value, int | float) and not isinstance(value, bool),
                     f"{where}: '{key}' must be a number, found {quoted(value)}",
                 )
-                target.append(float(value))
-        return cls.independent(tuple(table), means, stds)
-
-    @classmethod
-    def from_toml(cls, path: Path) -> GaussianPrior:
-        """From a file of lines `"joint2.compliance" = { mean = 2.9e-7, std = 3e-8 }`."""
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"{path}: cannot read the prior ({error.strerror})") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: not a TOML file: {error}") from None
-        try:
-            return cls.from_dict(table)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+                values.append(float(value))
+        return cls.independent(tuple(table), **stated)
 
     def rows(self, names: Sequence[str]) -> tuple[Array, Array]:
         """P (k, p) and target (k,) with |target − P x|² = (x − mean)ᵀ covariance⁻¹ (x − mean).
@@ -539,3 +508,126 @@ def share_of_prior(cofactor: Array, P: Array) -> Array:
     variance = np.diag(cofactor)
     share = np.full(len(variance), np.nan)
     return np.divide(passed, variance, out=share, where=variance > 0)
+
+
+# The knowledge file (TOML): its keys, and what they say of the parameters.
+
+Terms = Annotated[dict[Text, float], Field(min_length=1)]
+FACTORS = (
+    "factors by parameter, with names in quotes, as in "
+    '{ "joint2.compliance" = 1.0, "joint3.compliance" = -1.0 }'
+)
+
+
+class PriorTable(Table):
+    mean: float = required("a finite number in SI units")
+    std: Positive = required("a positive number in SI units")
+
+
+class BoundsTable(Table):
+    parameter: Text = required('the name of a parameter, as in "joint2.compliance"')
+    lower: float | None = Field(None, description="a finite number in SI units; without one, none")
+    upper: float | None = Field(None, description="a finite number in SI units; without one, none")
+
+
+class EqualityTable(Table):
+    terms: Terms = required(FACTORS)
+    value: float = Field(0.0, description="a finite number in SI units")
+    label: str = Field("", description="a text")
+
+
+class SemidefiniteTable(Table):
+    entries: Annotated[list[list[str | float | dict[str, float]]], Field(min_length=1)] = Field(
+        description="rows of parameter names, numbers or factors by parameter, as in "
+        '[["a", "b"], ["b", "c"]]'
+    )
+    label: str = Field("", description="a text")
+
+
+class KnowledgeTable(Table):
+    physical: bool = Field(False, description="true or false")
+    prior: dict[Text, PriorTable] = Field(
+        default_factory=dict, description='tables by parameter, as in [prior."joint2.compliance"]'
+    )
+    bounds: list[BoundsTable] = Field(default_factory=list, description="[[bounds]] tables")
+    equality: list[EqualityTable] = Field(default_factory=list, description="[[equality]] tables")
+    semidefinite: list[SemidefiniteTable] = Field(
+        default_factory=list, description="[[semidefinite]] tables"
+    )
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known of the parameters besides the readings, in SI units.
+
+    Attributes:
+        physical: Adds the constraints that physics puts on the model: no negative compliance.
+        constraints: Bounds, equalities and matrices.
+        prior: A Gaussian prior.
+        source: Where it was stated, for messages.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv", knowledge=ec.Knowledge(physical=True))
+        >>> fit["joint3.compliance"].ci95[0] > 0
+        True
+    """
+
+    physical: bool = False
+    constraints: Constraints = field(default_factory=Constraints)
+    prior: GaussianPrior | None = None
+    source: str = "knowledge"
+
+    def of(self, model: Model) -> tuple[Constraints, GaussianPrior | None]:
+        """Constraints and prior on the model's parameters.
+
+        Raises InputError where a name is no parameter of the model, or bounds exclude each other.
+        """
+        constraints = self.constraints
+        if self.physical:
+            constraints = physical_constraints(model) + constraints
+        try:
+            constraints.resolve(model.names)
+            if self.prior is not None:
+                self.prior.rows(model.names)
+        except InputError as error:
+            raise InputError(f"{self.source}: {error}") from None
+        return constraints, self.prior
+
+
+def read_knowledge(path: str | Path) -> Knowledge:
+    """What a knowledge file states (docs: file formats); names are checked by `Knowledge.of`.
+
+    Raises InputError that names file, key, what the key takes and the nearest valid key.
+    """
+    path = Path(path)
+    table = checked(KnowledgeTable, read_toml(path, "knowledge file"), path)
+    try:
+        return Knowledge(table.physical, _constraints(table), _prior(table), str(path))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _constraints(table: KnowledgeTable) -> Constraints:
+    bounds: list[Bounds] = []
+    for b in table.bounds:
+        require(
+            b.lower is not None or b.upper is not None,
+            f"the bounds of {quoted(b.parameter)} state neither lower nor upper; state one",
+        )
+        lower = -math.inf if b.lower is None else b.lower
+        bounds.append(Bounds(b.parameter, lower, math.inf if b.upper is None else b.upper))
+    equalities = [LinearEquality(e.terms, e.value, e.label) for e in table.equality]
+    matrices = [
+        SemidefiniteMatrix(m.label or f"matrix {k}", tuple(tuple(row) for row in m.entries))
+        for k, m in enumerate(table.semidefinite, start=1)
+    ]
+    return Constraints(tuple(bounds), tuple(equalities), tuple(matrices))
+
+
+def _prior(table: KnowledgeTable) -> GaussianPrior | None:
+    if not table.prior:
+        return None
+    stated = table.prior.values()
+    return GaussianPrior.independent(
+        tuple(table.prior), [p.mean for p in stated], [p.std for p in stated]
+    )

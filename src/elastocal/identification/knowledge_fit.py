@@ -1,26 +1,52 @@
-"""The method's fit again under constraints and with a prior: one more step on its weights."""
+"""The method's fit again under constraints and with a prior: its minimum, intervals and shares."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse, stats
+from scipy import linalg, sparse, stats
 
-from elastocal.errors import InputError, option
+from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.identification.bootstrap import ParametricBootstrap, parametric_bootstrap
 from elastocal.identification.constrained import (
     ActiveConstraint,
     ConstrainedFit,
     constrained_fit,
+    extent,
+    fit_system,
     fitted_columns,
+    minimise,
+    objective_of,
     own_bounds,
 )
-from elastocal.identification.constrained_intervals import LinearisedFit, intervals_with_knowledge
-from elastocal.identification.constrained_solver import ResidualLoss, loss_of
+from elastocal.identification.constrained_solver import (
+    ConstrainedObjective,
+    ResidualLoss,
+    active_at,
+    equality_space,
+    loss_of,
+    tangent_rows,
+)
+from elastocal.identification.covariance import Covariance, t_quantile
 from elastocal.identification.identifiability import Reduction, residual_sigma
-from elastocal.identification.intervals import Intervals
-from elastocal.identification.knowledge import Constraints
+from elastocal.identification.intervals import (
+    DRAWS,
+    LEVEL,
+    Intervals,
+    ProfileInterval,
+    profile_interval,
+)
+from elastocal.identification.knowledge import (
+    Bounds,
+    Constraints,
+    GaussianPrior,
+    System,
+    share_of_prior,
+)
 from elastocal.identification.least_squares import Fit, FitProblem
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import held_out_residual
@@ -29,6 +55,380 @@ from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import RFactor
 from elastocal.text import listed
 from elastocal.units import Array, Progress
+
+# Profile intervals under constraints.
+#
+# At a bound the estimate is not normal and the likelihood ratio not χ²: where the truth lies on one
+# bound, it is the mixture ½χ²₀ + ½χ²₁ (Chernoff 1954; Self and Liang 1987), whose 95 % point is
+# 2.71.  The intervals here keep the quantile of an interior truth, 3.84.  Away from bounds they are
+# exact for a linear model with normal noise of known size; at and near one bound they are
+# conservative (97.5 % for 95 %).  With the truth on two bounds at once the mixture depends on the
+# angle α > 90° between the two whitened columns of B: they then hold 97.5 % − 14.65 % (α −
+# 90°)/360°, which is 95 % at 150° and 93.8 % in the limit of 180°, two columns that nearly cancel.
+
+INWARD = 1e-6  # of a standard deviation, from an end that only a linear program knows
+
+
+def profile_linear_interval(
+    objective: ConstrainedObjective, system: System, name: str, sigma: float, level: float = 0.95
+) -> ProfileInterval:
+    """{v: (S(v) − Ŝ)/σ² ≤ χ²₁(level)} for the parameter `name`.
+
+    S(v) is the least objective (squares and prior, whose rows have the standard deviation `sigma`)
+    with the parameter at v and all constraints kept.  The interval ends ("bound") where no x
+    satisfies the constraints any more, so an active parameter has a one-sided interval that starts
+    at its bound.
+
+    Raises InputError as `minimise` does, and for a name that is no parameter.
+    """
+    require(name in system.names, f"{name!r} is not a parameter; choose from {list(system.names)}")
+    i = system.names.index(name)
+    best = minimise(objective, system)
+    free = minimise(objective, _only_equalities(system))
+
+    def least(value: float) -> float:
+        if value == best.x[i]:
+            return best.objective
+        return minimise(objective, system.with_value(i, value)).objective
+
+    std, ends = float(np.sqrt(free.cofactor[i, i])), _extent(objective, system, best.x, i)
+    return _interval(least, float(best.x[i]), std, ends, sigma, level)
+
+
+def profile_fit_interval(
+    problem: FitProblem,
+    found: ConstrainedFit,
+    name: str,
+    constraints: Constraints,
+    sigma: float,
+    *,
+    prior: GaussianPrior | None = None,
+    level: float = 0.95,
+) -> ProfileInterval:
+    """The profile interval of one fitted parameter of the nonlinear model.
+
+    As `profile_linear_interval`, with S(v) the objective of `constrained_fit` (squares), which gave
+    `found` for the same problem, constraints, prior and sigma.
+    """
+    require(name in found.names, f"{name!r} was not fitted; choose from {list(found.names)}")
+    k = found.names.index(name)
+    c = int(found.columns[k])
+    system = fit_system(problem, constraints)
+    weighted = problem.weights.apply(found.B)
+    rows, p = weighted.shape
+    linear = ConstrainedObjective(
+        weighted, np.zeros(rows), np.zeros((0, p)), np.zeros(0), ResidualLoss()
+    )
+    free = minimise(linear, _only_equalities(system.moved(found.x[found.columns], np.ones(p))))
+    known = [found.x]
+
+    def least(value: float) -> float:
+        if value == found.x[c]:
+            return found.objective
+        start = min(known, key=lambda x: abs(x[c] - value)).copy()
+        start[c] = value
+        stated = constraints + Constraints(bounds=(Bounds(name, value, value),))
+        again = constrained_fit(replace(problem, x=start), stated, prior=prior, sigma=sigma)
+        if not again.converged:
+            raise ElastocalError(f"no fit with {name} at {value:g}: {again.reason}")
+        known.append(again.x)
+        return again.objective
+
+    ends = _extent(linear, system, found.x[found.columns], k)
+    return _interval(
+        least, float(found.x[c]), float(np.sqrt(free.cofactor[k, k])), ends, sigma, level
+    )
+
+
+def _interval(
+    least: Callable[[float], float],
+    estimate: float,
+    std: float,
+    ends: tuple[float, float],
+    sigma: float,
+    level: float,
+) -> ProfileInterval:
+    if std == 0 or ends[0] == ends[1]:  # equalities leave a single value
+        return ProfileInterval(estimate, estimate, ("bound", "bound"))
+    return profile_interval(
+        lambda v: least(v) / sigma**2, estimate, std * sigma, np.inf, level, ends[0], ends[1]
+    )
+
+
+def _extent(
+    objective: ConstrainedObjective, system: System, x: Array, index: int
+) -> tuple[float, float]:
+    """How far the constraints let x[index] go from the solution x, kept inside by a hair."""
+    if not (len(system.b) or system.matrices):
+        return float(system.lower[index]), float(system.upper[index])
+    # In standard deviations from the solution; a linear program's tolerances are absolute.
+    unit = 1 / objective.norms
+    low, high = extent(system.moved(x, unit), index)
+    low, high = min(low + INWARD, 0.0), max(high - INWARD, 0.0)
+    return float(x[index] + unit[index] * low), float(x[index] + unit[index] * high)
+
+
+def _only_equalities(system: System) -> System:
+    free = np.full(len(system.names), np.inf)
+    return replace(system, lower=-free, upper=free, matrices=())
+
+
+# Parametric bootstrap of constrained estimates.
+
+
+def constrained_bootstrap(
+    objective: ConstrainedObjective,
+    system: System,
+    sigma: float,
+    *,
+    draws: int = 999,
+    seed: int = 0,
+    jobs: int = 1,
+) -> ParametricBootstrap:
+    """Fit B x̂ + σ·N(0, 1) again `draws` times under the same constraints (see its `interval`).
+
+    `sigma` is the standard deviation of a row.  The prior's mean is drawn anew as well, about x̂
+    with its own covariance: like the data it is an observation of the parameters, so the spread of
+    the draws is the posterior's.
+
+    Draws pile up on an active bound, whose percentile interval is then one-sided.  With the truth
+    on a bound the bootstrap is not consistent (Andrews 2000): there, prefer profile intervals.
+    """
+    best = minimise(objective, system)
+    exact = np.concatenate([objective.B @ best.x, objective.P @ best.x])
+    return parametric_bootstrap(
+        partial(_draw, exact, sigma), partial(_refit, objective, system), draws, seed, jobs
+    )
+
+
+def _draw(exact: Array, spread: float, rng: np.random.Generator) -> Array:
+    return exact + spread * rng.normal(size=len(exact))
+
+
+def _refit(objective: ConstrainedObjective, system: System, drawn: Array) -> Array:
+    rows = len(objective.y)
+    return minimise(replace(objective, y=drawn[:rows], target=drawn[rows:]), system).x
+
+
+# A constrained fit linearised at its minimum: covariance, shares of the prior, leverage.
+
+PINNED = 1e-12  # of unit columns: what equalities leave of a parameter that they fix
+
+
+@dataclass(frozen=True)
+class LinearisedFit:
+    """The constrained fit about its minimum x̂ (columns,): Σ ρ + |lack − P δ|² in δ = x − x̂.
+
+    `B` (rows, columns) and `e` (rows,) are the whitened regressor and residual there, `P` (k,
+    columns) and `lack` (k,) the prior in units of the noise `sigma` of a whitened row.
+    """
+
+    names: tuple[str, ...]
+    x: Array
+    B: Array
+    e: Array
+    P: Array
+    lack: Array
+    loss: ResidualLoss
+    sigma: float
+    system: System
+
+    @classmethod
+    def at(
+        cls,
+        problem: FitProblem,
+        found: ConstrainedFit,
+        constraints: Constraints,
+        prior: GaussianPrior | None,
+        loss: ResidualLoss,
+        sigma: float,
+    ) -> LinearisedFit:
+        """About the minimum that `constrained_fit` found."""
+        x, p = found.x[found.columns], len(found.columns)
+        P, target = (np.zeros((0, p)), np.zeros(0)) if prior is None else prior.rows(found.names)
+        return cls(
+            found.names, x, problem.weights.apply(found.B), found.whitened, sigma * P,
+            sigma * (target - P @ x), loss, sigma, fit_system(problem, constraints),
+        )  # fmt: skip
+
+    @cached_property
+    def K(self) -> Array:
+        """(rows, columns) with KᵀK = half the Hessian of the readings' loss."""
+        return self.loss.root(self.B, self.e)
+
+    @cached_property
+    def unit(self) -> Array:
+        """What makes the columns of K and P together unit length."""
+        norms = np.linalg.norm(np.vstack([self.K, self.P]), axis=0)
+        return 1 / np.where(norms > 0, norms, 1.0)
+
+    @cached_property
+    def variance(self) -> float:
+        """κ with cov x̂ = κ (KᵀK)⁻¹ for readings alone.
+
+        σ² for squares; for Huber's loss [Σ|ψ|²/(rows − p)] / mean ψ' (Huber and Ronchetti 2009,
+        section 7.6, H2), which the root of the Hessian turns into a covariance.
+        """
+        if self.loss.quadratic:
+            return self.sigma**2
+        w = self.loss.weights(self.e)
+        psi, near = w * self.e, self.loss.lengths(self.e) <= self.loss.threshold
+        slope = np.where(near, 1.0, w[:: self.loss.size] * (1 - 1 / self.loss.size)).mean()
+        return float(psi @ psi / max(len(psi) - len(self.x), 1) / slope)
+
+    @cached_property
+    def equalities(self) -> Array:
+        """Directions (columns, q) in which the equalities let x move."""
+        space = equality_space(self.system.A * self.unit, np.zeros(len(self.system.b)))
+        return self.unit[:, None] * space.basis
+
+    @cached_property
+    def face(self) -> Array:
+        """Directions (columns, q) in which all active constraints let x move."""
+        inside = self.system.moved(self.x, self.unit)
+        zero = np.zeros(len(self.x))
+        rows, values = tangent_rows(inside, active_at(inside, zero), zero)
+        return self.unit[:, None] * equality_space(rows, values).basis
+
+    @cached_property
+    def cofactor(self) -> Array:
+        """(NᵀKᵀK N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
+        half = self._half(self.equalities)
+        return half.T @ half
+
+    @cached_property
+    def on_face(self) -> Array:
+        """The same with every active constraint taken for an equality."""
+        return self._half_on_face.T @ self._half_on_face
+
+    @property
+    def covariance(self) -> Array:
+        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
+        by_prior = (self.P @ self.cofactor).T @ (self.P @ self.cofactor)
+        return self.variance * (self.cofactor - by_prior) + self.sigma**2 * by_prior
+
+    @property
+    def prior_share(self) -> Array:
+        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
+        return share_of_prior(self.cofactor, self.P)
+
+    @property
+    def effective(self) -> float:
+        """How many parameters' worth the readings determine: tr(cofactor KᵀK) on the face."""
+        return self.face.shape[1] - float(((self._half_on_face @ self.P.T) ** 2).sum())
+
+    @property
+    def leverage(self) -> Array:
+        """Diagonal (rows,) of K cofactor Kᵀ on the face, at most 1."""
+        return np.minimum(((self.K @ self._half_on_face.T) ** 2).sum(axis=1), 1.0)
+
+    @cached_property
+    def r_factor(self) -> tuple[Array, Array]:
+        """R (columns, columns), z (columns,): |z − R x|² is the readings' part, but a constant."""
+        p = len(self.x)
+        R = linalg.qr(self.K * self.unit, mode="r")[0][:p]
+        R = np.vstack([R, np.zeros((p - len(R), p))])
+        gradient = self.unit * (self.B.T @ (self.loss.weights(self.e) * self.e))
+        z = np.linalg.lstsq(R.T, gradient, rcond=None)[0]
+        return R / self.unit, z + R @ (self.x / self.unit)
+
+    @cached_property
+    def _half_on_face(self) -> Array:
+        return self._half(self.face)
+
+    def _half(self, basis: Array) -> Array:
+        """H (q, columns) with HᵀH the cofactor within the basis (columns, q)."""
+        rows = np.vstack([self.K, self.P]) @ basis
+        R = linalg.qr(rows, mode="r")[0][: basis.shape[1]]
+        half = linalg.solve_triangular(R, basis.T, trans="T") if R.size else basis.T
+        half[:, np.linalg.norm(half / self.unit, axis=0) <= PINNED] = 0.0
+        return np.asarray(half)
+
+
+# Intervals of a fit under constraints or with a prior.
+
+ONE_SIDED = "one-sided at a bound, and wide rather than narrow near one"
+
+
+def degrees_of_freedom(of_readings: Array, share: Array) -> Array:
+    """dof (p,) of a posterior variance of which the prior gave the `share` (p,).
+
+    A posterior variance V moves with the noise's variance s² by the readings' share of it,
+    d log V = (1 − share) d log s², so that by Satterthwaite it has dof/(1 − share)² where s² has
+    `of_readings` (p,); infinite where all is the prior's or fixed by equalities.
+    """
+    left = 1 - np.nan_to_num(share, nan=1.0)
+    full = np.full(len(left), np.inf)
+    return np.divide(of_readings, left**2, out=full, where=left > 1e-6)
+
+
+def intervals_with_knowledge(
+    problem: FitProblem,
+    found: ConstrainedFit,
+    local: LinearisedFit,
+    constraints: Constraints,
+    prior: GaussianPrior | None,
+    of_readings: Array,
+    options: Options,
+) -> Intervals:
+    """95 % intervals of the constrained fit's columns, and their covariance.
+
+    auto: t intervals of the posterior covariance, cut off at bounds, where no inequality is
+    active; else the profile of the linearised model under the constraints.  profile: that of the
+    nonlinear one.  bootstrap: parametric, on the linearised model under the constraints.
+
+    The covariance takes equalities for exact and leaves inequalities out: knowing more than it
+    says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
+    """
+    kind, dof = options.intervals, degrees_of_freedom(of_readings, local.prior_share)
+    matrix, inside = local.covariance, not any(a.kind != "equality" for a in found.active)
+    if kind == "auto" and inside:
+        name, text = _posterior(prior, local)
+        covariance = Covariance(name, matrix, dof, text)
+        ci95 = covariance.interval(local.x, LEVEL)
+        lower, upper = local.system.lower[:, None], local.system.upper[:, None]
+        return Intervals(covariance, np.clip(ci95, lower, upper))
+    if kind == "bootstrap":
+        objective = objective_of(
+            local.B, local.e + local.B @ local.x, local.names, prior,
+            "squares" if local.loss.quadratic else "huber", local.loss.size, local.sigma,
+        )  # fmt: skip
+        drawn = constrained_bootstrap(
+            objective, local.system, local.sigma, draws=DRAWS, seed=options.seed, jobs=options.jobs
+        )
+        text = f"{drawn.description}, on the linearised model under the constraints, its noise kept"
+        return Intervals(
+            Covariance("constrained bootstrap", matrix, dof, text), drawn.interval(local.x, LEVEL)
+        )
+    ends = []
+    for name, wide in zip(local.names, _inflation(local, dof), strict=True):
+        wider = None if prior is None else replace(prior, covariance=prior.covariance * wide**2)
+        sigma = local.sigma * wide
+        if kind == "profile":
+            one = profile_fit_interval(problem, found, name, constraints, sigma, prior=wider)
+        else:
+            linear = objective_of(*local.r_factor, local.names, wider, "squares", 1, sigma)
+            one = profile_linear_interval(linear, local.system, name, sigma)
+        ends.append((one.lower, one.upper))
+    model = "nonlinear" if kind == "profile" else "linearised"
+    text = f"profile of the {model} fit under the constraints, {ONE_SIDED}; assumes normal noise"
+    return Intervals(Covariance("constrained profile", matrix, dof, text), np.array(ends))
+
+
+def _posterior(prior: GaussianPrior | None, local: LinearisedFit) -> tuple[str, str]:
+    noise = "normal noise" if local.loss.quadratic else "independent readings, as Huber's estimate"
+    if prior is None:
+        return "t under constraints", f"equalities taken for exact, bounds cut off; assumes {noise}"
+    return "posterior", f"readings and prior together, the prior taken at its word; assumes {noise}"
+
+
+def _inflation(local: LinearisedFit, dof: Array) -> Array:
+    """Factors (p,) on σ that turn the normal quantile of a known noise into t of `dof`."""
+    t = t_quantile(LEVEL, np.maximum(dof, 1.0))
+    return t / stats.norm.ppf((1 + LEVEL) / 2) * np.sqrt(local.variance) / local.sigma
+
+
+# The fit of a method, its knowledge added: one more step on the weights that the method ends with.
 
 ROUNDING = 1e-9  # factors below this share of a typical size are no combination
 CONTRADICTED = 0.001  # false-alarm rate of a sentence that doubts what the user knows
@@ -58,8 +458,8 @@ def fit_with_knowledge(
     """Minimise Σ ρ(W (y − h(X))) + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
 
     W and the readings are those of the method's `solution`, σ the noise of a whitened row under
-    it, ρ squares or, for the method huber, Huber's loss.  `knowledge_columns` says what is fitted,
-    `knowledge_intervals` what the intervals are; t intervals have the degrees of freedom of
+    it, ρ squares or, for the method huber, Huber's loss.  `fitted_columns` says what is fitted,
+    `intervals_with_knowledge` what the intervals are; t intervals have the degrees of freedom of
     `before`, the method's own.
 
     Raises InputError for constraints that contradict each other or held values, names that are no
@@ -84,9 +484,8 @@ def fit_with_knowledge(
     local = LinearisedFit.at(posed, found, constraints, prior, loss, sigma)
     progress("intervals under constraints" if prior is None else "intervals with the prior")
     intervals = intervals_with_knowledge(
-        posed, found, local, constraints, prior, _dof(solution, before, columns),
-        options.intervals, options.seed, options.jobs,
-    )  # fmt: skip
+        posed, found, local, constraints, prior, _dof(solution, before, columns), options
+    )
     shares = {} if prior is None else dict(zip(found.names, local.prior_share, strict=True))
     known = replace(
         solution,
@@ -144,7 +543,7 @@ def _dof(solution: Solution, before: Intervals, columns: NDArray[np.int64]) -> A
 
 
 def _as_fit(problem: FitProblem, found: ConstrainedFit, local: LinearisedFit) -> Fit:
-    """As the fit of a method; its triangle has prior and equalities as further rows.
+    """As the fit of a method; its R factor has prior and equalities as further rows.
 
     Without them a parameter that no reading shows would leave it singular; equalities weigh as
     much as the readings of a parameter do.

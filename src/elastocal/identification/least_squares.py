@@ -26,7 +26,7 @@ from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations
 from elastocal.units import Array
 
-# Least squares on triangles: Levenberg–Marquardt where one evaluation is a pass over the table.
+# Levenberg–Marquardt on R factors, where one evaluation is a pass over a large table.
 
 SETTLED = "the sum of squares no longer fell"
 NEGLIGIBLE = "the steps became negligible"
@@ -51,7 +51,7 @@ class Descent:
 class SumOfSquares:
     """|e(u)|² + |(u − centre)/tie|² over lower ≤ u ≤ upper, B = −∂e/∂u.
 
-    `evaluate` gives the triangle of e and of B per unit of u, (p,) in typical sizes; it raises
+    `evaluate` gives the R factor of e and of B per unit of u, (p,) in typical sizes; it raises
     ElastocalError where the model has no prediction.  A `tie` (p,) of infinity is none.
     `evaluate_last`, where given, evaluates in its place where the descent means to end: for what
     else is wanted there.
@@ -153,7 +153,7 @@ class FitProblem:
     `sizes` (parameters,) scale the variables.  `tie` (columns,), where given, adds
     ((X − centre)/tie)² per column, in units of the noise: a weak tie, used only to keep
     undetermined directions still before they are known to be undetermined.  `among` (ascending)
-    are columns of which those fitted are a choice: a large table's fit leaves their triangle too,
+    are columns of which those fitted are a choice: a large table's fit leaves their R factor too,
     which else would take another pass.
     """
 
@@ -205,9 +205,9 @@ class FitProblem:
 
 @dataclass(frozen=True)
 class Fit:
-    """Values x (parameters,), raw and whitened residual (rows,), `triangle` of whitened B and it.
+    """Values x (parameters,), raw and whitened residual (rows,), R factor of whitened B and it.
 
-    `columns` (fitted,) index the parameters; `wide`, where there is one, is the triangle of the
+    `columns` (fitted,) index the parameters; `wide`, where there is one, is the R factor of the
     columns that these were chosen among.
     """
 
@@ -227,13 +227,13 @@ class Fit:
 
     @cached_property
     def B(self) -> Array:
-        """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `triangle`."""
+        """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `r_factor`."""
         return _regression(self.problem, self.x).B
 
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13).
 
-        Exact to working precision for tables of ordinary size; of a large one from the triangle,
+        Exact to working precision for tables of ordinary size; of a large one from the R factor,
         exact to working precision times condition number.
         """
         scale = self.problem.sizes[self.columns]
@@ -246,7 +246,7 @@ class Fit:
 def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLERANCE) -> Fit:
     """Levenberg–Marquardt from the problem's x, derivatives exact.
 
-    A large table is fitted on triangles, with the cost and the gradient of all rows, until a step
+    A large table is fitted on R factors, with the cost and the gradient of all rows, until a step
     promises less than `tolerance` of the cost.
 
     Raises ElastocalError where the start has poses without equilibrium.
@@ -256,62 +256,49 @@ def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLER
     return _fit_whole(problem, max_steps)
 
 
-class _Points:
-    """The regression at one point after another: residual and B come from one evaluation.
-
-    It lives as long as one descent, whose rows do not change.
-    """
-
-    def __init__(self, problem: FitProblem) -> None:
-        self.problem = problem
-        self._u: Array | None = None
-        self._at: Regression | None = None
-
-    def at(self, u: Array) -> Regression:
-        """The regression at u (columns,).  Raises ElastocalError for poses without one."""
-        if self._at is None or self._u is None or not np.array_equal(u, self._u):
-            self._at = _regression(self.problem, self.problem.values(u))
-            self._u = u.copy()
-        return self._at
-
-    def residual(self, u: Array) -> Array:
-        """Predicted minus observed (rows,), NaN where a pose has no equilibrium."""
-        try:
-            return -self.at(u).residual
-        except ElastocalError:
-            observed, x = self.problem.observations, self.problem.values(u)
-            return self.problem.model.predict(observed.table, x, observed) - observed.value
-
-
 def _regression(problem: FitProblem, x: Array) -> Regression:
     observed = problem.observations
     return problem.model.regressor(observed.table, x, problem.columns, observed)
 
 
 def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
-    size, weights, points = problem.sizes[problem.columns], problem.weights, _Points(problem)
+    size, weights, observed = problem.sizes[problem.columns], problem.weights, problem.observations
+    last: dict[bytes, Regression] = {}  # residual and B come from one evaluation
+
+    def regression_at(u: Array) -> Regression:
+        if u.tobytes() not in last:
+            at = _regression(problem, problem.values(u))
+            last.clear()
+            last[u.tobytes()] = at
+        return last[u.tobytes()]
 
     def residual(u: Array) -> Array:
-        r = weights.apply(points.residual(u))
+        """Predicted minus observed, NaN where a pose has no equilibrium."""
+        try:
+            raw = -regression_at(u).residual
+        except ElastocalError:
+            predicted = problem.model.predict(observed.table, problem.values(u), observed)
+            raw = predicted - observed.value
+        r = weights.apply(raw)
         if problem.tie is None:
             return r
         x = problem.values(u)
         return np.concatenate([r, (x[problem.columns] - problem.tied_to) / problem.tie])
 
     def jacobian(u: Array) -> Array:
-        B = weights.apply(points.at(u).B * size)
+        B = weights.apply(regression_at(u).B * size)
         return B if problem.tie is None else np.vstack([B, np.diag(size / problem.tie)])
 
     lower, upper = problem.limits
     start = np.clip(np.zeros(len(problem.columns)), lower, upper)
     if not np.isfinite(residual(start)).all():
-        points.at(start)  # names the row
+        regression_at(start)  # names the row
         raise ElastocalError("the model has no finite prediction at the start values")
     found = least_squares(
         residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
         ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
     )  # fmt: skip
-    x, final = problem.values(found.x), points.at(found.x)
+    x, final = problem.values(found.x), regression_at(found.x)
     if problem.tie is None and not problem.bounded and found.status > 0:
         x, final = _polished(problem, x, final)
     whitened = weights.apply(final.residual)

@@ -193,15 +193,15 @@ ROUNDS = 12
 ALONE = 1e-9  # share of an observation's direction that the other observations must see
 
 
-# The trimmed cost of a fit (`judge`), the observations (N,) it is of, and the fit.
-Visit = tuple[float, BoolArray, Solution]
+# A fit that was judged: its trimmed cost (`judge`), the observations (N,) it is of, and itself.
+Judged = tuple[float, BoolArray, Solution]
 
 
 def verdict(
     solution: Solution,
     refit: Callable[[BoolArray], Solution],
     good: BoolArray,
-    before: tuple[Visit, ...] = (),
+    before: tuple[Judged, ...] = (),
 ) -> tuple[BoolArray, Solution]:
     """Which observations (N,) are faulty, and the fit to the others, beginning with the `good`.
 
@@ -210,7 +210,7 @@ def verdict(
     readings back in has bent the fit away from the majority, the earlier verdict stands.
     `before` are fits to others that have been judged already.
     """
-    visited = list(before)
+    tried = list(before)
     for _ in range(ROUNDS):
         try:
             current = solution if good.all() else refit(good)
@@ -219,15 +219,15 @@ def verdict(
             break  # that subset does not determine a valid arm: it cannot judge the others
         if beyond.sum() >= len(beyond) // 2:
             break  # no majority agrees with this fit: it cannot judge
-        visited.append((cost, good, current))
-        if any(np.array_equal(~beyond, mask) for _, mask, _ in visited):
+        tried.append((cost, good, current))
+        if any(np.array_equal(~beyond, mask) for _, mask, _ in tried):
             good = ~beyond
             break
         good = ~beyond
-    if not visited:
+    if not tried:
         return np.zeros(len(good), dtype=bool), solution
-    final = next((v for v in reversed(visited) if np.array_equal(v[1], good)), visited[-1])
-    best = min(visited, key=lambda v: v[0])
+    final = next((v for v in reversed(tried) if np.array_equal(v[1], good)), tried[-1])
+    best = min(tried, key=lambda v: v[0])
     half = len(good) // 2
     if final[0] > best[0] * stats.f.isf(FALSE_ALARM, half, half):
         final = best
@@ -267,7 +267,7 @@ def judge(whole: Solution, fitted: Solution, good: BoolArray) -> tuple[BoolArray
 
 
 def _inside(whole: Solution, fitted: Solution, good: BoolArray) -> RFactor:
-    """The triangle of the good observations at the fit, whitened as the whole table is."""
+    """The R factor of the good observations at the fit, whitened as the whole table is."""
     problem = whole.problem
     kept, size = fitted.reduction.kept, problem.observations.size
     if fitted.fit is whole.fit and good.all() and len(whole.fit.whitened) == len(good) * size:
@@ -316,10 +316,10 @@ def find_faulty(
     """
     if not solution.problem.large:
         good = ~_suspects(solution)
-        visit = _acquitted(solution, good)
-        if visit is not None:
-            found = verdict(solution, refit, np.ones(len(good), dtype=bool), (visit,))
-            if found[1] is not visit[2]:
+        judged = _acquitted(solution, good)
+        if judged is not None:
+            found = verdict(solution, refit, np.ones(len(good), dtype=bool), (judged,))
+            if found[1] is not judged[2]:
                 return found
         return verdict(solution, refit, good)
 
@@ -329,11 +329,11 @@ def find_faulty(
     return verdict(solution, fit_others, _agreeing_with_a_sample(solution))
 
 
-def _acquitted(solution: Solution, good: BoolArray) -> Visit | None:
+def _acquitted(solution: Solution, good: BoolArray) -> Judged | None:
     """The judgement by one Gauss–Newton step from the fit of all to the `good` observations.
 
     None where it accuses anybody, or where the good ones ask for other parameters: then the fit
-    has to be made.  Of that visit's fit, values and parameters alone are those of the good ones.
+    has to be made.  Of the fit judged, values and parameters alone are those of the good ones.
     """
     problem, kept = solution.problem, solution.reduction.kept
     independent = problem.parts.blocks is None and problem.weights.kind != "component"
@@ -414,8 +414,8 @@ def _fit_to(solution: Solution, good: BoolArray) -> Solution:
         raise InsufficientDataError("fewer than half of the readings agree with each other")
     part = part_of(problem.observations, problem.weights, np.flatnonzero(good))
     own = replace(problem, observations=part.observations, weights=part.weights, bounded=False)
-    settled = settle(own, solution.sizes)
-    return replace(solution, problem=settled.problem, fit=settled.fit, reduction=settled.reduction)
+    placed, found, reduction, *_ = settle(own, solution.sizes)
+    return replace(solution, problem=placed, fit=found, reduction=reduction)
 
 
 def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[Outlier, ...]:

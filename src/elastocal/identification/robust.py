@@ -13,7 +13,7 @@ from elastocal.errors import ElastocalError, InsufficientDataError, require
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.least_squares import FitProblem
 from elastocal.identification.robust_core import Absolute, RobustEstimate, huber, lengths
-from elastocal.identification.robust_fits import m_estimate, mm_estimate, student_t
+from elastocal.identification.robust_fits import SUBSETS, m_estimate, mm_estimate, student_t
 from elastocal.units import Array
 
 # Covariance of an M-estimate: from ψ and ψ′, never from the weights of its iteration.
@@ -34,8 +34,6 @@ from elastocal.units import Array
 # normal (per row and for L1, nothing), several times too much with blunders, which s² counts.  And
 # variances e_i² taken one by one, as eq. (14) applied to each residual, hold almost nothing.
 
-Kind = Literal["H1", "H2", "H3"]
-
 UNDETERMINED = (
     "the loss rejects so many observations that the rest do not determine the parameters' "
     "covariance; use a monotone loss such as huber, or look for the cause of the outliers"
@@ -43,76 +41,60 @@ UNDETERMINED = (
 EXACT = 1e-8  # scaled length below which an L1 fit passes through an observation
 
 
-@dataclass(frozen=True)
-class Curvature:
-    """Eigenvalues of every J_i: `along` (n,) the error and `across` (n,) it."""
-
-    along: Array
-    across: Array
-
-
-def curvature(found: RobustEstimate) -> Curvature:
-    """ψ′ and ψ/d of every observation.
+def curvature(found: RobustEstimate) -> tuple[Array, Array]:
+    """Eigenvalues of every J_i: ψ′ along the error (n,) and ψ/d across it (n,).
 
     ψ of L1 jumps at zero: for size 1 ψ′ = 2 f(0) is estimated from the density of the residuals
     there; for vectors ψ′ = 0 and ψ/d = 1/d suffice, without observations that are met exactly.
     """
     d, loss = found.distance, found.loss
     if not isinstance(loss, Absolute):
-        return Curvature(loss.slope(d), loss.weight(d))
+        return loss.slope(d), loss.weight(d)
     if loss.size == 1:
-        level = 2 * _density_at_zero(found.residual / found.scale, found.design.p)
-        return Curvature(np.full_like(d, level), np.full_like(d, level))
+        level = np.full_like(d, 2 * _density_at_zero(found.residual / found.scale, found.design.p))
+        return level, level
     met = d < EXACT
-    return Curvature(np.zeros_like(d), np.where(met, 0.0, 1 / np.where(met, 1.0, d)))
+    return np.zeros_like(d), np.where(met, 0.0, 1 / np.where(met, 1.0, d))
 
 
-def asymptotic_covariance(found: RobustEstimate, kind: Kind = "H2") -> Covariance:
+def asymptotic_covariance(found: RobustEstimate) -> Covariance:
     """Covariance (p, p) of x̂; t intervals with the rows that keep a weight less p as dof.
 
-    With â the mean eigenvalue of J_i, b̂ = Σψ²/(n·size − p), and Huber's small-sample factor
-    k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for L1):
+    Huber's H2, k σ² (b̂/â) W⁻¹, with â the mean eigenvalue of J_i, b̂ = Σψ²/(n·size − p), and his
+    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for L1).
 
-        H1   k² σ² (b̂/â²) (BᵀB)⁻¹,     H2   k σ² (b̂/â) W⁻¹,     H3   k⁻¹ σ² b̂ W⁻¹ BᵀB W⁻¹
+    His H1, k² σ² (b̂/â²) (BᵀB)⁻¹, and H3, k⁻¹ σ² b̂ W⁻¹ BᵀB W⁻¹, estimate the same for independent
+    errors that know nothing of B.  Where the wrong observations are also leverage points, H1
+    credits x̂ with information that the loss has rejected and H3 charges it for them; H2 leaves
+    them out of b̂/â and of W alike.  Under dependence or unequal spread use `clustered_covariance`.
 
-    All three estimate the same for independent errors that know nothing of B.  Where the wrong
-    observations are also leverage points, H1 credits x̂ with information that the loss has
-    rejected and H3 charges it for them; H2 leaves them out of b̂/â and of W alike, and is the
-    default.  Under dependence or unequal spread use `clustered.clustered_covariance`.
-
-    Raises InputError for another kind, InsufficientDataError where W is not positive definite.
+    Raises InsufficientDataError where W is not positive definite.
     """
-    require(kind in ("H1", "H2", "H3"), f"kind is H1, H2 or H3; found '{kind}'")
-    problem, shape = found.design, curvature(found)
+    problem, (along, across) = found.design, curvature(found)
     rows, p, size = len(problem.y), problem.p, problem.size
-    a = _mean_eigenvalue(shape, size)
+    a = float(np.mean(along + (size - 1) * across)) / size
     if not a > 0:
         raise InsufficientDataError(UNDETERMINED)
     b = float((found.loss.psi(found.distance) ** 2).sum()) / (rows - p)
     k = 1.0
     if not isinstance(found.loss, Absolute):
-        square = float((shape.along**2).sum() + (size - 1) * (shape.across**2).sum()) / rows
+        square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
         k = 1 + p / rows * (square - a**2) / a**2
     variance = found.scale**2 * b
-    if kind == "H1":
-        inner = np.eye(p) * (k**2 * variance / a**2)
-    else:
-        inverse = inverse_of(information(found, shape).sum(axis=0))
-        inner = k * variance / a * inverse if kind == "H2" else variance / k * inverse @ inverse
+    inner = k * variance / a * inverse_of(information(found, along, across).sum(axis=0))
     P = problem.parameters(np.eye(p))
     dof = float(size * np.count_nonzero(found.weights) - p)
-    text = f"asymptotic covariance {kind} of the {found.loss.name} estimate, from ψ and ψ′"
-    return Covariance(kind, P @ inner @ P.T, np.full(p, dof), text)
-
-
-def _mean_eigenvalue(shape: Curvature, size: int) -> float:
-    return float(np.mean(shape.along + (size - 1) * shape.across)) / size
+    text = f"asymptotic covariance H2 of the {found.loss.name} estimate, from ψ and ψ′"
+    return Covariance("H2", P @ inner @ P.T, np.full(p, dof), text)
 
 
 def information(
-    found: RobustEstimate, shape: Curvature, group: NDArray[np.int64] | None = None
+    found: RobustEstimate, along: Array, across: Array, group: NDArray[np.int64] | None = None
 ) -> Array:
-    """Σ Q_iᵀ J_i Q_i (groups, p, p) per group code of the observations; one group by default."""
+    """Σ Q_iᵀ J_i Q_i (groups, p, p) per group code of the observations; one group by default.
+
+    `along` and `across` (n,) are the eigenvalues of the J_i (`curvature`).
+    """
     problem = found.design
     size, p, n = problem.size, problem.p, problem.n
     codes = np.zeros(n, dtype=np.int64) if group is None else group
@@ -121,13 +103,13 @@ def information(
     Q3 = problem.Q.reshape(n, size, p)
     r = found.residual.reshape(n, size)
     u = r / np.maximum(np.linalg.norm(r, axis=1), np.finfo(float).tiny)[:, None]
-    along = np.einsum("nij,ni->nj", Q3, u)
+    toward = np.einsum("nij,ni->nj", Q3, u)
     total = np.zeros((len(starts), p, p))
     for g, chosen in enumerate(np.split(order, starts[1:])):
         rows = Q3[chosen].reshape(-1, p)
-        across = np.repeat(shape.across[chosen], size)
-        excess = shape.along[chosen] - shape.across[chosen]
-        total[g] = (rows.T * across) @ rows + (along[chosen].T * excess) @ along[chosen]
+        excess = along[chosen] - across[chosen]
+        total[g] = (rows.T * np.repeat(across[chosen], size)) @ rows
+        total[g] += (toward[chosen].T * excess) @ toward[chosen]
     return total
 
 
@@ -185,7 +167,7 @@ def clustered_covariance(found: RobustEstimate, cluster: ArrayLike) -> Covarianc
     names, code = np.unique(labels, return_inverse=True)
     require(len(names) > 1, "a clustered covariance needs at least two clusters; found one")
     problem = found.design
-    W_g = information(found, curvature(found), code)
+    W_g = information(found, *curvature(found), code)
     W = W_g.sum(axis=0)
     inverse = inverse_of(W)
     rest = W - W_g
@@ -253,9 +235,9 @@ class RobustFit:
     def weights(self) -> Array:
         return self.linear.weights
 
-    def covariance(self, kind: Kind = "H2") -> Covariance:
-        """Covariance of the fitted columns for independent errors (`asymptotic`)."""
-        return asymptotic_covariance(self.linear, kind)
+    def covariance(self) -> Covariance:
+        """Covariance of the fitted columns for independent errors (`asymptotic_covariance`)."""
+        return asymptotic_covariance(self.linear)
 
     def clustered(self, cluster: NDArray[np.int64]) -> Covariance:
         """Covariance of the fitted columns under dependence within `cluster` (n,)."""
@@ -321,9 +303,8 @@ def _step(
         return m_estimate(B, e, Absolute(size), size=size)
     if loss_name == "student-t":
         return student_t(B, e, size=size)
-    if search:
-        return mm_estimate(B, e, size=size, seed=seed, start=np.zeros(B.shape[1]))
-    return mm_estimate(B, e, size=size, subsets=0, start=np.zeros(B.shape[1]))
+    subsets = SUBSETS if search else 0
+    return mm_estimate(B, e, size=size, seed=seed, subsets=subsets, start=np.zeros(B.shape[1]))
 
 
 def _damping(problem: FitProblem, x: Array, found: RobustEstimate, sizes: Array, e: Array) -> float:

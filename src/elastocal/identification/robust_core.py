@@ -62,12 +62,6 @@ class Design:
         """y − Q z (rows,)."""
         return self.y - self.Q @ z
 
-    @property
-    def cofactor(self) -> Array:
-        """(BᵀB)⁻¹ (p, p)."""
-        inverse = self.parameters(np.eye(self.p))
-        return inverse @ inverse.T
-
     def rows(self, weights: Array) -> Array:
         """Per-observation weights (n,) repeated for the rows (rows,)."""
         return np.repeat(weights, self.size)
@@ -291,7 +285,7 @@ def normal_mean(g: Callable[[Array], Array], size: int, kink: float | None = Non
 
 
 def normal_moments(loss: Loss) -> tuple[float, float]:
-    """a and b of the loss at the normal (see the module); efficiency is a²/b."""
+    """a and b of the loss at the normal (see above); efficiency is a²/b."""
     share = 1 / loss.size
     a = normal_mean(
         lambda d: share * loss.slope(d) + (1 - share) * loss.weight(d), loss.size, loss.kink
@@ -366,28 +360,6 @@ def median_scale(length: Array, size: int) -> float:
     return float(np.median(length)) / median_length(size)
 
 
-@lru_cache
-def _beta(loss: Huber) -> float:
-    return normal_moments(loss)[1]
-
-
-def proposal_2(length: Array, size: int, p: int = 0, c: float | None = None) -> float:
-    """Huber's proposal 2: σ with Σ ψ(|e_i|/σ)² = (n·size − p) E ψ²/size (Huber 1964, 1981).
-
-    `length` (n,), `p` fitted parameters, `c` of Huber's ψ, by default 2.5 for size 1 and the
-    same probability beyond it for other sizes.
-    """
-    tail = float(stats.chi.isf(stats.chi.sf(2.5, 1), size)) if c is None else c
-    loss = Huber(size, tail)
-    beta = _beta(loss) * (len(length) * size - p)
-
-    def excess(scale: float) -> float:
-        return float((loss.psi(length / scale) ** 2).sum()) - beta
-
-    # Σ min(d, c)² never exceeds n c²: with too few degrees of freedom there is no solution.
-    return _root(excess, length)
-
-
 def m_scale(length: Array, loss: Bisquare, p: int = 0) -> float:
     """M-scale of the S-estimate: σ with Σ ρ(|e_i|/σ) = (n − p/size) E ρ.
 
@@ -432,9 +404,9 @@ class RobustEstimate:
 
     `weights` (n,) are ψ(d)/d of each observation, 1 for what counts in full and 0 for what is
     rejected (unbounded where an L1 fit meets an observation).  They solve the estimating equation
-    and are NOT inverse variances; for the covariance see `asymptotic`.  `optimality` says how
-    nearly x is optimal: |Σ Q_iᵀ Ψ| over √Σ|Ψ|² with an orthonormal basis Q of B, or for L1 the
-    duality gap relative to the minimum.
+    and are NOT inverse variances; for the covariance see `asymptotic_covariance`.  `optimality`
+    says how nearly x is optimal: |Σ Q_iᵀ Ψ| over √Σ|Ψ|² with an orthonormal basis Q of B, or for
+    L1 the duality gap relative to the minimum.
     """
 
     design: Design
@@ -461,9 +433,14 @@ class RobustEstimate:
         return float(self.loss.rho(self.distance).sum())
 
 
-def score_optimality(design: Design, loss: Loss, residual: Array, scale: float) -> float:
-    """|Σ Q_iᵀ Ψ_i| / √Σ|Ψ_i|², zero at a solution of the estimating equation."""
-    d = lengths(residual, design.size) / scale
-    scores = design.rows(loss.weight(d)) * residual / scale
+def estimate_at(
+    problem: Design, loss: Loss, z: Array, scale: float, converged: bool, iterations: int
+) -> RobustEstimate:
+    """The estimate at coordinates z; zero |Σ Q_iᵀ Ψ_i| solves its estimating equation."""
+    r = problem.residual(z)
+    scores = problem.rows(loss.weight(lengths(r, problem.size) / scale)) * r / scale
     size = float(np.linalg.norm(scores))
-    return float(np.linalg.norm(design.Q.T @ scores)) / size if size > 0 else 0.0
+    optimality = float(np.linalg.norm(problem.Q.T @ scores)) / size if size > 0 else 0.0
+    return RobustEstimate(
+        problem, loss, problem.parameters(z), r, scale, converged, iterations, optimality
+    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,7 +11,6 @@ from scipy import linalg, optimize, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, require
 from elastocal.identification.robust_core import (
-    EFFICIENCY,
     Absolute,
     Bisquare,
     Design,
@@ -20,13 +20,12 @@ from elastocal.identification.robust_core import (
     bisquare,
     breakdown_bisquare,
     design,
+    estimate_at,
     expected_rho,
     lengths,
     m_scale,
     median_length,
     median_scale,
-    proposal_2,
-    score_optimality,
 )
 from elastocal.units import Array
 
@@ -47,16 +46,16 @@ SMOOTHING = 1e-9  # last ε in units of the scale
 MAX_NEWTON = 400
 
 
-def least_absolute(problem: Design, loss: Absolute, scale: float | None = None) -> RobustEstimate:
+def least_absolute(problem: Design, loss: Absolute) -> RobustEstimate:
     """Minimise the sum of |e_i|; `optimality` is the duality gap over the minimum.
 
-    `scale` (by default the median's) is only reported: x does not depend on it.
+    The median's scale is only reported: x does not depend on it.
     """
     z, dual, count = _linear_program(problem) if problem.size == 1 else _newton(problem)
     r = problem.residual(z)
     length = lengths(r, problem.size)
     optimality = _gap(problem, r, dual)
-    sigma = scale or max(median_scale(length, problem.size), problem.floor)
+    sigma = max(median_scale(length, problem.size), problem.floor)
     x = problem.parameters(z)
     return RobustEstimate(problem, loss, x, r, sigma, optimality <= OPTIMAL, count, optimality)
 
@@ -187,11 +186,7 @@ def s_estimate(
         candidates = np.concatenate([candidates, drawn[best]])
     candidates = _improve(search, candidates, loss, MORE_STEPS)
     order = np.argsort(_scales(search, candidates, loss), kind="stable")[:WINNERS]
-    return min((_refine(problem, candidates[k], loss) for k in order), key=_scale_of)
-
-
-def _scale_of(found: tuple[Array, float]) -> float:
-    return found[1]
+    return min((_refine(problem, candidates[k], loss) for k in order), key=itemgetter(1))
 
 
 def _searched(problem: Design, rng: np.random.Generator) -> Design:
@@ -204,7 +199,7 @@ def _searched(problem: Design, rng: np.random.Generator) -> Design:
     information = np.linalg.eigvalsh(Q.T @ Q) * problem.n / SEARCH
     if information[0] < DETERMINED:
         return problem
-    return Design(problem.B[rows], problem.y[rows], problem.size, Q, problem.R, problem.norm)
+    return replace(problem, B=problem.B[rows], y=problem.y[rows], Q=Q)
 
 
 def _products(problem: Design) -> tuple[Array, Array]:
@@ -311,110 +306,58 @@ def _refine(problem: Design, z: Array, loss: Bisquare) -> tuple[Array, float]:
 
 # M-estimates: iteratively reweighted least squares with the scale estimated alongside.
 
-ScaleRule = Literal["median", "proposal2", "m"]
-
 TOLERANCE = 1e-11  # of the step |B δx| in units of the scale
 MAX_ITER = 500
 
 
-def m_estimate(
-    B: ArrayLike,
-    y: ArrayLike,
-    loss: Loss,
-    *,
-    size: int = 1,
-    scale: ScaleRule | float = "median",
-    start: ArrayLike | None = None,
-    tolerance: float = TOLERANCE,
-    max_iter: int = MAX_ITER,
-) -> RobustEstimate:
+def m_estimate(B: ArrayLike, y: ArrayLike, loss: Loss, *, size: int = 1) -> RobustEstimate:
     """Solve Σ B_iᵀ Ψ(e_i/σ) = 0, e = y − B x, Ψ(r) = ψ(|r|) r/|r| (Huber 1981, chapter 7).
 
-    B (n·size, p) and y (n·size,) whitened, `size` rows per observation.  `scale` is a rule, by
-    which σ is estimated anew from every residual ("median": the MAD about zero; "proposal2"
-    Huber's; "m": the M-scale of the 50 % bisquare), or the known σ.  `start` (p,), by default
-    least squares.
+    B (n·size, p) and y (n·size,) whitened, `size` rows per observation.  σ is the MAD about zero
+    of every residual anew; the start is least squares.
 
     The breakdown point is that of the start and of the leverage: a monotone ψ (Huber, L1) has
     one solution and resists errors in y but not at leverage points; a redescending one finds the
     solution near the start, so bisquare belongs after an S-estimate (`mm_estimate`).  With
-    `Absolute` the scale plays no part in x and the minimum is certified (`l1`).
+    `Absolute` the scale plays no part in x and the minimum is certified (`least_absolute`).
 
-    Raises InputError for wrong shapes, dependent columns, a loss for another size or a scale
-    that is not positive; InsufficientDataError where rejection leaves too little.
+    Raises InputError for wrong shapes, dependent columns or a loss for another size;
+    InsufficientDataError where rejection leaves too little.
     """
     problem = design(B, y, size)
     require(
         loss.size == size, f"the loss is for {loss.size} rows per observation, the data have {size}"
     )
-    require(tolerance > 0 and max_iter >= 1, "tolerance must be positive, max_iter at least 1")
-    known = _known(scale)
     if isinstance(loss, Absolute):
-        return least_absolute(problem, loss, known)
-    z = problem.Q.T @ problem.y if start is None else problem.coordinates(_checked(start, problem))
-    return reweighted(problem, loss, z, known or scale, tolerance, max_iter)
+        return least_absolute(problem, loss)
+    return reweighted(problem, loss, problem.Q.T @ problem.y)
 
 
-def reweighted(
-    problem: Design,
-    loss: Loss,
-    z: Array,
-    rule: ScaleRule | float | str,
-    tolerance: float = TOLERANCE,
-    max_iter: int = MAX_ITER,
-) -> RobustEstimate:
-    """IRLS from coordinates z; each step lowers Σ ρ at its scale (Huber 1981, section 7.8)."""
+def reweighted(problem: Design, loss: Loss, z: Array, known: float | None = None) -> RobustEstimate:
+    """IRLS from coordinates z; each step lowers Σ ρ at its scale (Huber 1981, section 7.8).
+
+    The scale is the `known` one, or by the median of every residual anew.
+    """
+
+    def scale_of(residual: Array) -> float:
+        if known is not None:
+            return known
+        return max(median_scale(lengths(residual, problem.size), problem.size), problem.floor)
+
     r = problem.residual(z)
-    sigma = _scale(problem, r, rule)
-    converged, count = False, 0
-    while not converged and count < max_iter:
+    sigma, converged, count = scale_of(r), False, 0
+    while not converged and count < MAX_ITER:
         weights = loss.weight(lengths(r, problem.size) / sigma)
         step = problem.weighted_step(weights, r)
         z = z + step
         r = problem.residual(z)
-        before, sigma = sigma, _scale(problem, r, rule)
+        before, sigma = sigma, scale_of(r)
         count += 1
         moved = float(np.linalg.norm(step))
         still = moved <= 4 * np.finfo(float).eps * np.linalg.norm(z)  # no more digits in z
-        settled = moved <= tolerance * sigma and abs(sigma - before) <= tolerance * sigma
+        settled = moved <= TOLERANCE * sigma and abs(sigma - before) <= TOLERANCE * sigma
         converged = bool(settled or still)
-    optimality = score_optimality(problem, loss, r, sigma)
-    return RobustEstimate(
-        problem, loss, problem.parameters(z), r, sigma, converged, count, optimality
-    )
-
-
-def _scale(problem: Design, residual: Array, rule: ScaleRule | float | str) -> float:
-    if not isinstance(rule, str):
-        return rule
-    length = lengths(residual, problem.size)
-    if rule == "median":
-        found = median_scale(length, problem.size)
-    elif rule == "proposal2":
-        found = proposal_2(length, problem.size, problem.p)
-    else:
-        found = m_scale(length, breakdown_bisquare(problem.size), problem.p)
-    return max(found, problem.floor)
-
-
-def _known(scale: ScaleRule | float) -> float | None:
-    if isinstance(scale, str):
-        require(
-            scale in ("median", "proposal2", "m"),
-            f"scale is 'median', 'proposal2', 'm' or a positive number; found '{scale}'",
-        )
-        return None
-    require(0 < scale < np.inf, f"a known scale must be positive and finite; found {scale}")
-    return float(scale)
-
-
-def _checked(start: ArrayLike, problem: Design) -> Array:
-    x = np.asarray(start, dtype=float)
-    require(
-        x.shape == (problem.p,) and bool(np.isfinite(x).all()),
-        f"start must be {problem.p} finite numbers, one per column of B; found shape {x.shape}",
-    )
-    return x
+    return estimate_at(problem, loss, z, sigma, converged, count)
 
 
 # MM-estimates: the breakdown point of an S-estimate with the efficiency of an M-estimate.
@@ -428,35 +371,23 @@ def mm_estimate(
     seed: int = 0,
     subsets: int = SUBSETS,
     start: ArrayLike | None = None,
-    efficient: float = EFFICIENCY,
 ) -> RobustEstimate:
     """MM-estimate (Yohai 1987): S-estimate with 50 % breakdown, then Tukey's bisquare.
 
     B (n·size, p) and y (n·size,) whitened, `size` rows per observation.  The S-estimate fixes
-    start and scale; the bisquare with efficiency `efficient` at the normal then descends from
+    start and scale; the bisquare with 95 % efficiency at the normal then descends from
     there at that scale, so almost half of the observations, leverage points among them, may be
     arbitrarily wrong.  `subsets` random subsets are tried (deterministic in `seed`), and `start`
-    (p,) or (k, p) beside them, such as `trimmed.least_trimmed_squares`; 0 subsets refine the
+    (p,) or (k, p) beside them, such as `least_trimmed_squares`; 0 subsets refine the
     start alone.
 
     Raises InputError for wrong shapes or dependent columns.
     """
+    problem, starts = design(B, y, size), None
     require(
         subsets >= 0 and (subsets > 0 or start is not None),
         "an S-estimate needs random subsets or a start",
     )
-    return mm_of(design(B, y, size), seed, subsets, start, efficient)
-
-
-def mm_of(
-    problem: Design,
-    seed: int = 0,
-    subsets: int = SUBSETS,
-    start: ArrayLike | None = None,
-    efficient: float = EFFICIENCY,
-) -> RobustEstimate:
-    """`mm_estimate` of a checked design."""
-    starts = None
     if start is not None:
         given = np.atleast_2d(np.asarray(start, dtype=float))
         require(
@@ -465,7 +396,7 @@ def mm_of(
         )
         starts = np.stack([problem.coordinates(x) for x in given])
     z, scale = s_estimate(problem, breakdown_bisquare(problem.size), seed, subsets, starts)
-    return reweighted(problem, bisquare(problem.size, efficient), z, scale)
+    return reweighted(problem, bisquare(problem.size), z, scale)
 
 
 # Maximum likelihood under multivariate Student-t errors, ν given or estimated.
@@ -542,7 +473,4 @@ def _estimate(problem: Design, loss: StudentT, z: Array, scale: float) -> Robust
         converged = bool(
             (moved <= TOLERANCE * scale or still) and abs(scale - before) <= TOLERANCE * scale
         )
-    optimality = score_optimality(problem, loss, r, scale)
-    return RobustEstimate(
-        problem, loss, problem.parameters(z), r, scale, converged, count, optimality
-    )
+    return estimate_at(problem, loss, z, scale, converged, count)

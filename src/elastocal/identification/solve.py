@@ -71,35 +71,27 @@ def solve(
     Raises InsufficientDataError where the data determine nothing.
     """
     sizes = sizes_and_check(problem)
-    settled = settle(problem, sizes, progress)
-    problem, found, reduction = settled.problem, settled.fit, settled.reduction
+    problem, found, reduction, r_factor, placed = settle(problem, sizes, progress)
     heldout = heldout_of(problem, found)
     if try_wider:
         progress("comparing with wider sets")
         found, reduction, heldout = prefer_wider(
-            problem, sizes, found, reduction, heldout, settled.r_factor
+            problem, sizes, found, reduction, heldout, r_factor
         )
     if problem.bounded:
         found, reduction = held_at_bounds(problem, sizes, found, reduction)
         heldout = heldout_of(problem, found)
-    nominal = rms_3d(settled.nominal, problem.observations.size)
+    nominal = rms_3d(placed, problem.observations.size)
     return Solution(problem, found, reduction, sizes, heldout, nominal)
 
 
-@dataclass(frozen=True)
-class Settled:
-    """A minimal set and its fit: `problem` with base and markers placed at x0, `triangle` of the
-    free columns at the fit, `nominal` (rows,) residual of the nominal arm so placed."""
-
-    problem: Problem
-    fit: Fit
-    reduction: Reduction
-    r_factor: RFactor
-    nominal: Array
-
-
-def settle(problem: Problem, sizes: Array, progress: Progress = lambda message: None) -> Settled:
+def settle(
+    problem: Problem, sizes: Array, progress: Progress = lambda message: None
+) -> tuple[Problem, Fit, Reduction, RFactor, Array]:
     """Place base and markers, choose a minimal complete set of parameters and fit it.
+
+    Returns the problem with base and markers placed at x0, the fit, the set, the R factor of the
+    free columns at the fit, and the residual (rows,) of the nominal arm so placed.
 
     Raises InsufficientDataError where the data determine nothing.
     """
@@ -124,7 +116,7 @@ def settle(problem: Problem, sizes: Array, progress: Progress = lambda message: 
         kept = reduction.kept
         found = fit_kept(problem, sizes, found.x, reduction, again=True)
         sigma, r_factor = residual_sigma(found, len(kept)), free_r_factor(problem, found)
-    return Settled(problem, found, reduction, r_factor, nominal)
+    return problem, found, reduction, r_factor, nominal
 
 
 def is_placed(model: Model) -> NDArray[np.bool_]:
@@ -143,11 +135,11 @@ def sizes_and_check(problem: Problem) -> Array:
         r_factor = RFactor.of(at.B[:, free], at.residual) if few else None
         return np.abs(at.B).max(axis=0, initial=0.0), r_factor
 
-    largest, triangles = zip(*each(problem.parts, of_part), strict=True)
+    largest, factors = zip(*each(problem.parts, of_part), strict=True)
     sizes = model.sizes(np.stack(largest))
     sizes[is_placed(model)] = PLACED
     if few:
-        check_enough(model, observed, merge(t for t in triangles if t is not None).R * sizes[free])
+        check_enough(model, observed, merge(t for t in factors if t is not None).R * sizes[free])
     return sizes
 
 

@@ -169,10 +169,9 @@ def check_enough(model: Model, observed: Observations, scaled: Array) -> None:
     lacking = -(-(rank + 1) // observed.size)
     raise InsufficientDataError(
         f"{observed.table.source}: {rows} equations from {len(observed.lead)} readings cannot "
-        "determine "
-        f"the model's {scaled.shape[1]} parameters and their uncertainty; measure more poses "
-        f"(more than {max(lacking, -(-scaled.shape[1] // observed.size))} readings) or fit fewer "
-        "effects"
+        f"determine the model's {scaled.shape[1]} parameters and their uncertainty; measure more "
+        f"poses (more than {max(lacking, -(-scaled.shape[1] // observed.size))} readings) or fit "
+        "fewer effects"
     )
 
 
@@ -225,10 +224,15 @@ def register(problem: RegistrationProblem, seed: int = 0) -> Registration:
     n = len(problem.points)
     if n > SAMPLE:
         chosen = np.random.default_rng(seed).choice(n, SAMPLE, replace=False)
-        problem = _subset(problem, chosen)
+        of_rows = ("flange_rotation", "flange_position", "points", "marker")
+        problem = replace(problem, **{name: getattr(problem, name)[chosen] for name in of_rows})
     if not problem.free_base:
         return _descend(problem, problem.base_rotation, sweeps=3)
-    starts = [_linear_rotation(problem), _kabsch_rotation(problem, problem.start_markers)]
+    body = _body_points(problem, problem.start_markers)
+    starts = [
+        _linear_rotation(problem),
+        _rotation_between(body, problem.points, np.ones(len(body))),
+    ]
     starts += list(Rotation.create_group("O").as_matrix())
     # All starts together show which ones lead where; those are gone through again with all digits.
     nearest = np.argsort(_errors(problem, np.array(starts)), kind="stable")[:FINALISTS]
@@ -282,14 +286,6 @@ def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tupl
     markers = np.broadcast_to(fixed, (len(R), *fixed.shape)).copy()
     markers[:, free] = x[:, 3:].reshape(len(R), -1, 3)
     return (R @ x[:, :3, None])[..., 0], markers
-
-
-def _subset(problem: RegistrationProblem, rows: NDArray) -> RegistrationProblem:
-    return RegistrationProblem(
-        problem.flange_rotation[rows], problem.flange_position[rows], problem.points[rows],
-        problem.marker[rows], problem.start_markers, problem.free_markers, problem.free_base,
-        problem.base_rotation, problem.base_translation,
-    )  # fmt: skip
 
 
 def _descend(
@@ -356,12 +352,6 @@ def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
     U, _, Vt = np.linalg.svd((p.swapaxes(-1, -2) * w) @ b)
     U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
     return np.asarray(U @ Vt, dtype=np.float64)
-
-
-def _kabsch_rotation(problem: RegistrationProblem, markers: Array) -> Array:
-    return _rotation_between(
-        _body_points(problem, markers), problem.points, np.ones(len(problem.points))
-    )
 
 
 def _linear_rotation(problem: RegistrationProblem) -> Array:
@@ -476,15 +466,16 @@ def _distance_start(
     best, best_cost = x, np.inf
     given = model.cell.tracker.anchor is not None
 
-    def residual(z: Array) -> Array:
+    def values(z: Array) -> Array:
         y = x.copy()
         y[columns] = z
-        return model.predict(table, y) - distance
+        return y
+
+    def residual(z: Array) -> Array:
+        return model.predict(table, values(z)) - distance
 
     def jacobian(z: Array) -> Array:
-        y = x.copy()
-        y[columns] = z
-        return model.regressor(table, y, columns).B
+        return model.regressor(table, values(z), columns).B
 
     for k, direction in enumerate(directions):
         trial = x.copy()
@@ -495,6 +486,5 @@ def _distance_start(
             residual, trial[columns], jacobian, loss="soft_l1", f_scale=2e-3, max_nfev=60
         )
         if found.cost < best_cost:
-            best, best_cost = trial.copy(), found.cost
-            best[columns] = found.x
+            best, best_cost = values(found.x), found.cost
     return best

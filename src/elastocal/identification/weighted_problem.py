@@ -252,7 +252,7 @@ def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
 
 
 def _run(index: IntArray) -> IntArray | slice:
-    """`index` (n,) as a slice where it counts up by one: arrays are then seen and not copied."""
+    """`index` (n,) as a slice where it counts up by one: arrays are then views and not copies."""
     if len(index) and index[-1] - index[0] == len(index) - 1 and (np.diff(index) == 1).all():
         return slice(int(index[0]), int(index[-1]) + 1)
     return index
@@ -342,12 +342,12 @@ def _packed(ends: IntArray, start: int, limit: int) -> list[Span]:
     return spans
 
 
-# A least-squares problem of any length as a triangle: what is left of B and e after QR.
+# A least-squares problem of any length as its R factor: what is left of B and e after QR.
 #
 #     [B e] = Q [R z; 0 ρ],   |e − B x|² = |z − R x|² + ρ²
 #
 # R (p, p), z = Qᵀe (p,) and ρ decide everything that a fit asks of the rows: steps, rank,
-# covariance, sum of squares.  Triangles of parts of the rows are merged by the QR of one on top of
+# covariance, sum of squares.  R factors of parts of the rows are merged by the QR of one on top of
 # the other (TSQR; Demmel, Grigori, Hoemmen and Langou 2012, SIAM J. Sci. Comput. 34), which is
 # backward stable like a QR of all rows at once: the condition number enters once, not squared as
 # in BᵀB.
@@ -368,7 +368,7 @@ class RFactor:
 
     @classmethod
     def of(cls, B: Array, e: Array) -> RFactor:
-        """The triangle of the whitened B (rows, p) and residual e (rows,)."""
+        """The R factor of the whitened B (rows, p) and residual e (rows,)."""
         step = _leaf(B.shape[1] + 1, BLOCK)
         if len(e) <= step:
             return cls(_factor(np.column_stack([B, e])), len(e))
@@ -377,12 +377,12 @@ class RFactor:
         return cls(_factor(np.vstack(leaves)), len(e))
 
     def merged(self, other: RFactor) -> RFactor:
-        """The triangle of the rows of both."""
+        """The R factor of the rows of both."""
         stacked = np.vstack([self.augmented, other.augmented])
         return RFactor(_factor(stacked), self.rows + other.rows)
 
     def of_columns(self, chosen: NDArray[np.integer]) -> RFactor:
-        """The triangle of the columns `chosen` of B and the same e."""
+        """The R factor of the columns `chosen` of B and the same e."""
         return RFactor(_factor(self.augmented[:, [*chosen, self.columns]]), self.rows)
 
     @property
@@ -410,7 +410,7 @@ class RFactor:
         return float(self.augmented[:, -1] @ self.augmented[:, -1])
 
     def scaled(self, scale: Array) -> RFactor:
-        """The triangle of B with its columns multiplied by `scale` (p,)."""
+        """The R factor of B with its columns multiplied by `scale` (p,)."""
         return RFactor(self.augmented * np.append(scale, 1.0), self.rows)
 
     def step(self, scale: Array) -> Array:
@@ -427,9 +427,9 @@ class RFactor:
         return (inverse @ inverse.T) * np.outer(scale, scale)
 
 
-def merge(triangles: Iterable[RFactor]) -> RFactor:
-    """The triangle of all rows, merged in the order given."""
-    return reduce(RFactor.merged, triangles)
+def merge(factors: Iterable[RFactor]) -> RFactor:
+    """The R factor of all rows, merged in the order given."""
+    return reduce(RFactor.merged, factors)
 
 
 def _leaf(k: int, numbers: int = 0) -> int:
@@ -445,8 +445,8 @@ def _leaves(rows: Array) -> Array:
     whole = len(rows) // leaf * leaf
     if not whole:
         return rows
-    triangles = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, leaf, k), mode="r"))
-    return np.vstack([triangles.reshape(-1, k), rows[whole:]])
+    factors = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, leaf, k), mode="r"))
+    return np.vstack([factors.reshape(-1, k), rows[whole:]])
 
 
 def _factor(rows: Array) -> Array:
@@ -454,7 +454,7 @@ def _factor(rows: Array) -> Array:
     k = rows.shape[1]
     while rows.size > BLOCK and len(rows) >= 2 * _leaf(k):
         rows = _leaves(rows)
-    # Not scipy's qr, whose R has all n rows: kept in a triangle it would hold a part of the table.
+    # Not scipy's qr, whose R has all n rows: kept as a factor it would hold a part of the table.
     R = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
     return R if len(R) == k else np.vstack([R, np.zeros((k - len(R), k))])
 
@@ -471,9 +471,9 @@ AT_ONCE = 2
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Residual (rows,), observed minus predicted and raw, and the triangle of whitened B and it.
+    """Residual (rows,), observed minus predicted and raw, and the R factor of whitened B and it.
 
-    `wide` is the triangle of more columns, where they were evaluated with it.
+    `wide` is the R factor of more columns, where they were evaluated with it.
     """
 
     residual: Array
@@ -482,7 +482,7 @@ class Evaluation:
 
 
 def evaluate(model: Model, parts: Partition, x: Array, columns: NDArray[np.integer]) -> Evaluation:
-    """B of the `columns` at x and the residual, whitened and reduced to a triangle.
+    """B of the `columns` at x and the residual, whitened and reduced to their R factor.
 
     Raises ElastocalError where a reading has no static equilibrium at x.
     """
@@ -523,7 +523,7 @@ def in_order(items: Sequence[Item], work: Callable[[Item], Result]) -> Iterator[
     """`work` on every item, AT_ONCE at a time; results in the order of the items.
 
     What the results add up to so does not depend on which item is done first.  The first item is
-    done alone: it builds what the others share (the model's tapes).
+    done alone: it builds what the others share (the model's compiled functions).
     """
     yield work(items[0])
     if len(items) == 1:

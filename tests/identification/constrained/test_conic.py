@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import statsmodels.api as sm
 from scipy import optimize
+from support.constrained import solve
 
 from elastocal.errors import InputError
 from elastocal.identification import (
@@ -17,7 +18,6 @@ from elastocal.identification import (
     SemidefiniteMatrix,
     huber,
     non_negative,
-    solve_constrained,
 )
 
 NAMES = tuple("abcdef")
@@ -57,7 +57,7 @@ SCALED = Constraints(
 @pytest.mark.parametrize("size", [1, 3])
 def test_huber_without_constraints_solves_its_equations(size):
     B, y = problem(1, outliers=5)
-    found = solve_constrained(B, y, NAMES, loss="huber", size=size)
+    found = solve(B, y, NAMES, loss="huber", size=size)
     r = (y - B @ found.x).reshape(-1, size)
     d, k = np.linalg.norm(r, axis=1), huber(size).c
     assert (d > k).sum() >= 5
@@ -70,14 +70,14 @@ def test_huber_by_row_is_statsmodels():
     B, y = problem(2, outliers=5)
     c = huber(1).c
     rlm = sm.RLM(y, B * UNIT, M=sm.robust.norms.HuberT(c)).fit(tol=1e-13, maxiter=500)
-    found = solve_constrained(B, y, NAMES, loss="huber", sigma=rlm.scale)
+    found = solve(B, y, NAMES, loss="huber", sigma=rlm.scale)
     np.testing.assert_allclose(found.x / UNIT, rlm.params, rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.parametrize("size", [1, 3])
 def test_constrained_huber_is_a_bounded_smooth_minimum(size):
     B, y = problem(3, truth=[1, -0.2, 0.5, -0.3, 2, 0.0], outliers=5)
-    found = solve_constrained(B, y, NAMES, non_negative(*NAMES), loss="huber", size=size)
+    found = solve(B, y, NAMES, non_negative(*NAMES), loss="huber", size=size)
     J, k = B * UNIT, huber(size).c
 
     def cost(z):
@@ -105,7 +105,7 @@ def test_huber_resists_what_squares_do_not():
     spoilt[:9] += 300.0
     far = {
         loss: np.linalg.norm(
-            (solve_constrained(clean_B, clean_B @ truth + spoilt, NAMES, non_negative(*NAMES),
+            (solve(clean_B, clean_B @ truth + spoilt, NAMES, non_negative(*NAMES),
                                loss=loss, size=3).x - truth) / UNIT
         )
         for loss in ("squares", "huber")
@@ -141,7 +141,7 @@ def test_half_the_hessian_is_the_derivative_of_half_the_gradient(size):
 def test_semidefinite_fit_is_the_best_factor(seed):
     # Random truth is indefinite: the constraint binds, with a null space of one or two.
     B, y = problem(seed)
-    found = solve_constrained(B, y, NAMES, SCALED)
+    found = solve(B, y, NAMES, SCALED)
     K = matrix(found.x)
     values = np.linalg.eigvalsh(K)
     assert values[0] > -1e-12 * max(values[-1], 1)
@@ -169,18 +169,18 @@ def test_semidefinite_fit_is_the_best_factor(seed):
 
 def test_semidefinite_fit_beats_the_projection_of_the_free_fit():
     B, y = problem(1)
-    free = solve_constrained(B, y, NAMES)
+    free = solve(B, y, NAMES)
     values, vectors = np.linalg.eigh(matrix(free.x))
     assert values[0] < 0
     P = (vectors * np.maximum(values, 0)) @ vectors.T
     projected = UNIT * np.array([P[0, 0], P[1, 1], P[2, 2], P[0, 1], P[0, 2], P[1, 2]])
-    found = solve_constrained(B, y, NAMES, SCALED)
+    found = solve(B, y, NAMES, SCALED)
     assert free.objective < found.objective < np.sum((y - B @ projected) ** 2)
 
 
 def test_a_matrix_the_data_agree_with_changes_nothing():
     B, y = problem(0, truth=[3, 3, 3, 0.5, 0.5, 0.5])
-    free, found = solve_constrained(B, y, NAMES), solve_constrained(B, y, NAMES, SCALED)
+    free, found = solve(B, y, NAMES), solve(B, y, NAMES, SCALED)
     np.testing.assert_allclose(found.x, free.x, rtol=1e-13)
     assert found.active == ()
 
@@ -188,8 +188,8 @@ def test_a_matrix_the_data_agree_with_changes_nothing():
 def test_a_diagonal_matrix_is_bounds():
     B, y = problem(7)
     diagonal = SemidefiniteMatrix("D", (("a", 0, 0), (0, "b", 0), (0, 0, "c")))
-    as_matrix = solve_constrained(B, y, NAMES, Constraints(matrices=(diagonal,)))
-    as_bounds = solve_constrained(B, y, NAMES, non_negative("a", "b", "c"))
+    as_matrix = solve(B, y, NAMES, Constraints(matrices=(diagonal,)))
+    as_bounds = solve(B, y, NAMES, non_negative("a", "b", "c"))
     assert as_bounds.active
     np.testing.assert_allclose(as_matrix.x / UNIT, as_bounds.x / UNIT, atol=1e-10)
     assert as_matrix.active[0].multiplier == pytest.approx(
@@ -204,9 +204,9 @@ def test_the_multiplier_of_a_matrix_is_the_price_of_a_larger_smallest_eigenvalue
         entries = (({"a": 1.0, "": -t}, "b"), ("b", {"c": 1.0, "": -t}))
         return Constraints(matrices=(SemidefiniteMatrix("K", entries),))
 
-    found = solve_constrained(B, y, NAMES, shifted(0.0))
+    found = solve(B, y, NAMES, shifted(0.0))
     (active,) = found.active
-    up, down = (solve_constrained(B, y, NAMES, shifted(s * 1e-11)).objective for s in (1, -1))
+    up, down = (solve(B, y, NAMES, shifted(s * 1e-11)).objective for s in (1, -1))
     assert active.multiplier == pytest.approx((up - down) / 2e-11, rel=1e-3)
     assert active.names == ("a", "b", "c")
 
@@ -218,7 +218,7 @@ def test_all_kinds_of_constraints_at_once_satisfy_kkt():
         (LinearEquality({"b": 1.0, "c": -1.0}),),
     )
     for loss in ("squares", "huber"):
-        found = solve_constrained(B, y, NAMES, stated, loss=loss, size=3)
+        found = solve(B, y, NAMES, stated, loss=loss, size=3)
         assert found.kkt < 1e-9
         assert found.x[0] <= 0.5e-7 and found.x[5] >= 1e-4
         assert found.x[1] == pytest.approx(found.x[2], rel=1e-12, abs=1e-20)
@@ -230,7 +230,7 @@ def test_contradicting_matrix_is_named():
     stated = Constraints((Bounds("d", lower=0.0),), (LinearEquality({"a": 1.0, "c": 1.0}, -1e-7),))
     stated += Constraints(matrices=(PLANE,))
     with pytest.raises(InputError, match="contradict") as error:
-        solve_constrained(B, y, NAMES, stated)
+        solve(B, y, NAMES, stated)
     assert "'K'" in str(error.value) and "a + c" in str(error.value)
     assert "bound of d" not in str(error.value)
 
@@ -257,7 +257,7 @@ def test_a_six_by_six_base_compliance_on_the_boundary(noise, rank, loss):
     B = rng.normal(size=(300, 21)) / sizes * 3
     y = B @ truth + noise * rng.normal(size=300)
     stated = Constraints(matrices=(SemidefiniteMatrix("base", tuple(map(tuple, entries))),))
-    found = solve_constrained(B, y, BASE_NAMES, stated, loss=loss, size=3)
+    found = solve(B, y, BASE_NAMES, stated, loss=loss, size=3)
     assert found.kkt < 1e-9
     K = np.zeros((6, 6))
     for value, (i, j) in zip(found.x, PAIRS, strict=True):
@@ -269,9 +269,9 @@ def test_a_six_by_six_base_compliance_on_the_boundary(noise, rank, loss):
 
 def test_a_fit_follows_the_units_of_its_matrix():
     B, y = problem(2)
-    one = solve_constrained(B, y, NAMES, Constraints(matrices=(PLANE,)))
+    one = solve(B, y, NAMES, Constraints(matrices=(PLANE,)))
     scaled = {n: {n: 1e6} for n in "abc"}
     K = SemidefiniteMatrix("K", ((scaled["a"], scaled["b"]), (scaled["b"], scaled["c"])))
-    other = solve_constrained(B, y, NAMES, Constraints(matrices=(K,)))
+    other = solve(B, y, NAMES, Constraints(matrices=(K,)))
     np.testing.assert_allclose(other.x / UNIT, one.x / UNIT, atol=1e-11)
     assert other.active[0].multiplier == pytest.approx(one.active[0].multiplier * 1e-6, rel=1e-8)

@@ -1,5 +1,7 @@
 """Constraints by name: what they become as numbers, and what they refuse."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,12 +16,15 @@ from elastocal.identification import (
     SemidefiniteMatrix,
     equal,
     non_negative,
-    passivity,
     physical_constraints,
 )
 from elastocal.model import Model, Parameter
 
 NAMES = ("joint1.compliance", "joint2.compliance", "joint3.offset")
+
+
+def _arm(*parameters):
+    return SimpleNamespace(parameters=parameters)
 
 
 def test_resolved_numbers_are_what_was_stated():
@@ -148,7 +153,7 @@ def test_coupling_terms_make_a_matrix_with_the_drive_on_its_diagonal():
                   lower=-np.inf if k.endswith(("xy", "xz")) else 0.0)
         for k in keys
     ]  # fmt: skip
-    demanded = passivity([*parameters, _compliance("joint3.compliance")])
+    demanded = physical_constraints(_arm(*parameters, _compliance("joint3.compliance")))
     (matrix,) = demanded.matrices
     x, y, xy, xz = (f"joint2.off_axis_compliance_{a}" for a in ("x", "y", "xy", "xz"))
     assert matrix.entries == ((x, xy, xz), (xy, y, 0.0), (xz, 0.0, "joint2.compliance"))
@@ -156,5 +161,6 @@ def test_coupling_terms_make_a_matrix_with_the_drive_on_its_diagonal():
 
 
 def test_a_coupling_term_without_its_diagonal_is_refused():
+    stated = ("base.tilt_compliance_x", "base.tilt_compliance_xy")
     with pytest.raises(InputError, match=r"base\.tilt_compliance_y is not a parameter"):
-        passivity([_compliance("base.tilt_compliance_x"), _compliance("base.tilt_compliance_xy")])
+        physical_constraints(_arm(*map(_compliance, stated)))

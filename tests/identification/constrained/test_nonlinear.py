@@ -202,7 +202,7 @@ def test_a_start_without_equilibrium_is_said():
 def test_profile_of_an_active_parameter_is_one_sided():
     stated, physics = negative_bearing(), physical_constraints(arm())
     found = constrained_fit(stated, physics)
-    interval = profile_fit_interval(stated, found, BEARING_X, physics, sigma=1.0)
+    interval = profile_fit_interval(stated, found, BEARING_X, physics, 1.0)
     assert interval.lower == 0.0 and interval.ends == ("bound", "crossing")
     # The upper end by its definition: there the objective is 3.84 above the minimum.
     at_end = Constraints((Bounds(BEARING_X, interval.upper, interval.upper),))

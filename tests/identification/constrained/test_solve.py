@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize
+from support.constrained import solve
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification import (
@@ -13,7 +14,6 @@ from elastocal.identification import (
     LinearEquality,
     equal,
     non_negative,
-    solve_constrained,
     solve_weighted,
 )
 
@@ -35,7 +35,7 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(20))
 def test_non_negative_is_nnls(seed):
     B, y = problem(seed)
-    found = solve_constrained(B, y, NAMES, non_negative(*NAMES))
+    found = solve(B, y, NAMES, non_negative(*NAMES))
     z, _ = optimize.nnls(B * SIZES, y)
     assert relative(found.x, SIZES * z) < 1e-12
     assert {a.names[0] for a in found.active} == {NAMES[i] for i in np.flatnonzero(z == 0)}
@@ -47,7 +47,7 @@ def test_bounds_are_lsq_linear(seed):
     B, y = problem(seed)
     lower, upper = -0.4 * SIZES, 0.7 * SIZES
     bounds = Constraints(tuple(Bounds(*b) for b in zip(NAMES, lower, upper, strict=True)))
-    found = solve_constrained(B, y, NAMES, bounds)
+    found = solve(B, y, NAMES, bounds)
     expected = optimize.lsq_linear(B * SIZES, y, (-0.4, 0.7), method="bvls", tol=1e-15).x
     assert relative(found.x, SIZES * expected) < 1e-11
     assert ((found.x >= lower) & (found.x <= upper)).all()
@@ -60,7 +60,7 @@ def test_equalities_are_the_closed_form():
     B, y = problem(1)
     A = np.array([[1.0, -2.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]])
     b = np.array([1e-7, 2e-3])
-    found = solve_constrained(
+    found = solve(
         B, y, NAMES,
         Constraints(equalities=(
             LinearEquality({"a": 1.0, "b": -2.0}, 1e-7),
@@ -83,7 +83,7 @@ def test_equalities_are_the_closed_form():
 def test_bounds_and_equalities_together_are_slsqp():
     B, y = problem(5)
     stated = non_negative(*NAMES) + equal("d", "e") + Constraints((Bounds("f", upper=1e-4),))
-    found = solve_constrained(B, y, NAMES, stated)
+    found = solve(B, y, NAMES, stated)
     J = B * SIZES
     reference = optimize.minimize(
         lambda z: np.sum((J @ z - y) ** 2), np.full(6, 0.1), method="SLSQP",
@@ -98,7 +98,7 @@ def test_bounds_and_equalities_together_are_slsqp():
 
 def test_without_constraints_it_is_least_squares():
     B, y = problem(2)
-    found, expected = solve_constrained(B, y, NAMES), solve_weighted(B, y)
+    found, expected = solve(B, y, NAMES), solve_weighted(B, y)
     assert relative(found.x, expected.x) < 1e-13
     np.testing.assert_allclose(found.cofactor, expected.cofactor, rtol=1e-11)
     assert found.active == () and found.objective == pytest.approx(expected.rss, rel=1e-13)
@@ -106,7 +106,7 @@ def test_without_constraints_it_is_least_squares():
 
 def test_fixing_the_active_parameters_changes_nothing():
     B, y = problem(3)
-    found = solve_constrained(B, y, NAMES, non_negative(*NAMES))
+    found = solve(B, y, NAMES, non_negative(*NAMES))
     free = found.x > 0
     assert 0 < free.sum() < 6
     rest = solve_weighted(B[:, free], y)
@@ -125,14 +125,12 @@ def test_a_multiplier_is_the_price_of_its_bound(seed):
             equalities=(LinearEquality({"d": 1.0, "e": 1.0}, 1e-3 + value * (name == "sum")),)
         )
 
-    found = solve_constrained(B, y, NAMES, stated(0.0))
+    found = solve(B, y, NAMES, stated(0.0))
     assert len(found.active) > 1
     for a in found.active:
         name = "sum" if a.kind == "equality" else a.names[0]
         step = 1e-5 * SIZES[NAMES.index(a.names[0])]
-        up, down = (
-            solve_constrained(B, y, NAMES, stated(s * step, name)).objective for s in (1, -1)
-        )
+        up, down = (solve(B, y, NAMES, stated(s * step, name)).objective for s in (1, -1))
         assert a.multiplier == pytest.approx((up - down) / (2 * step), rel=1e-4)
 
 
@@ -141,8 +139,8 @@ def test_a_multiplier_is_the_price_of_its_bound(seed):
 def test_units_do_not_matter(seed, exponents):
     B, y = problem(seed)
     unit = 2.0 ** np.array(exponents)
-    one = solve_constrained(B, y, NAMES, non_negative(*NAMES))
-    other = solve_constrained(B / unit, y, NAMES, non_negative(*NAMES))
+    one = solve(B, y, NAMES, non_negative(*NAMES))
+    other = solve(B / unit, y, NAMES, non_negative(*NAMES))
     assert relative(other.x / unit, one.x) < 1e-11
     assert [a.label for a in one.active] == [a.label for a in other.active]
 
@@ -150,7 +148,7 @@ def test_units_do_not_matter(seed, exponents):
 def test_a_bound_far_from_the_data_loses_no_digits():
     B, y = problem(4)
     far = 1e4 * SIZES[0]
-    found = solve_constrained(B, y, NAMES, Constraints((Bounds("a", lower=far),)))
+    found = solve(B, y, NAMES, Constraints((Bounds("a", lower=far),)))
     rest = solve_weighted(B[:, 1:], y - B[:, 0] * far)
     assert found.x[0] == far
     np.testing.assert_allclose(found.x[1:], rest.x, rtol=1e-11)
@@ -166,7 +164,7 @@ def test_contradicting_constraints_are_named_and_no_others():
         ),
     )
     with pytest.raises(InputError, match="contradict") as error:
-        solve_constrained(B, y, NAMES, stated)
+        solve(B, y, NAMES, stated)
     message = str(error.value)
     for guilty in ("sum of drives", "lower bound of a", "lower bound of b"):
         assert guilty in message
@@ -181,27 +179,25 @@ def test_contradicting_equalities_are_named():
         LinearEquality({"f": 1.0}, 0.0),
     ))  # fmt: skip
     with pytest.raises(InputError, match=r"'a \+ b = 1e-07', '2·a \+ 2·b = 5e-07' together"):
-        solve_constrained(B, y, NAMES, stated)
+        solve(B, y, NAMES, stated)
 
 
 def test_repeated_equalities_are_one():
     B, y = problem(0)
     once, twice = (
-        solve_constrained(
-            B, y, NAMES, Constraints(equalities=(LinearEquality({"a": k}, k * 1e-7),))
-        )
+        solve(B, y, NAMES, Constraints(equalities=(LinearEquality({"a": k}, k * 1e-7),)))
         for k in (1.0, 3.0)
     )
     both = equal("a", "b") + equal("b", "a")
     assert relative(once.x, twice.x) < 1e-13
-    single = solve_constrained(B, y, NAMES, equal("a", "b"))
-    assert relative(solve_constrained(B, y, NAMES, both).x, single.x) < 1e-13
+    single = solve(B, y, NAMES, equal("a", "b"))
+    assert relative(solve(B, y, NAMES, both).x, single.x) < 1e-13
 
 
 def test_all_parameters_fixed_leaves_the_residual():
     B, y = problem(0)
     stated = Constraints(tuple(Bounds(n, s, s) for n, s in zip(NAMES, SIZES, strict=True)))
-    found = solve_constrained(B, y, NAMES, stated)
+    found = solve(B, y, NAMES, stated)
     np.testing.assert_allclose(found.x, SIZES, rtol=1e-13)
     np.testing.assert_allclose(found.residual, y - B @ SIZES, atol=1e-11)
     assert (found.cofactor == 0).all() and np.isnan(found.prior_share).all()
@@ -211,8 +207,8 @@ def test_what_nothing_determines_is_named_and_an_equality_can_determine_it():
     B, y = problem(0)
     B[:, 1] = 2 * B[:, 0]
     with pytest.raises(InsufficientDataError, match="do not determine a, b:"):
-        solve_constrained(B, y, NAMES, non_negative(*NAMES))
-    found = solve_constrained(B, y, NAMES, equal("a", "b"))
+        solve(B, y, NAMES, non_negative(*NAMES))
+    found = solve(B, y, NAMES, equal("a", "b"))
     merged = solve_weighted(np.column_stack([B[:, 0] + B[:, 1], B[:, 2:]]), y)
     np.testing.assert_allclose(found.x[1:], merged.x, rtol=1e-10)
 
@@ -233,7 +229,7 @@ def test_bad_input_is_refused(change, says):
     B, y = problem(0)
     arguments = {"B": B, "y": y, "names": NAMES} | change
     with pytest.raises(InputError, match=says):
-        solve_constrained(**arguments)
+        solve(**arguments)
 
 
 @settings(max_examples=60, deadline=None)
@@ -245,7 +241,7 @@ def test_constraints_without_room_are_solved_or_refused_but_never_wrong(seed):
         equalities=(LinearEquality({"a": 1.0, "b": 1.0}, 0.0),)
     )
     try:
-        found = solve_constrained(B, y, NAMES, stated)
+        found = solve(B, y, NAMES, stated)
     except ElastocalError:
         return
     rest = solve_weighted(B[:, 2:], y)

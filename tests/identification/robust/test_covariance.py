@@ -36,10 +36,10 @@ def holds(x, covariance, truth):
     return (low < truth) & (truth < high)
 
 
-def coverage(arm, name, share, count, kind="H2"):
+def coverage(arm, name, share, count):
     return np.array(
         [
-            holds(found.x, asymptotic_covariance(found, kind), arm.x)
+            holds(found.x, asymptotic_covariance(found), arm.x)
             for found in (FITS[name](arm.B, y) for y in tables(arm, share, count))
         ]
     )
@@ -56,12 +56,11 @@ def test_intervals_hold_the_truth(arm, name, share):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["H1", "H2", "H3"])
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.2])
 @pytest.mark.parametrize("name", ["huber", "tukey"])
-def test_intervals_hold_the_truth_in_many_tables(arm, name, share, kind):
-    held = coverage(arm, name, share, 1000, kind)
-    print(f"{name} {kind} {share:.0%}: {held.mean():.4f}")
+def test_intervals_hold_the_truth_in_many_tables(arm, name, share):
+    held = coverage(arm, name, share, 1000)
+    print(f"{name} {share:.0%}: {held.mean():.4f}")
     assert 0.935 < held.mean() < 0.965
 
 
@@ -94,27 +93,20 @@ def test_weights_taken_for_inverse_variances_give_wrong_intervals(arm, name, nar
     assert held.sum() / 3 >= binomial_band(held.size // 3, 0.95)[0]
 
 
-def test_only_h2_is_right_where_blunders_are_leverage_points(arm):
-    """27 of 270 readings ten times as far out and wrong.  H1 counts their information, H3 their
-    scatter; with H2 the truth is held as often as 99.9 % of binomial counts."""
+def test_intervals_hold_where_blunders_are_leverage_points(arm):
+    """27 of 270 readings ten times as far out and wrong: their information does not count, and the
+    truth is held as often as 99.9 % of binomial counts."""
     rng = np.random.default_rng(1)
     bad = np.repeat(np.arange(270) % 10 == 0, 3)
     B = np.where(bad[:, None], 10 * arm.B, arm.B)
-    std, held = {"H1": [], "H2": [], "H3": []}, []
-    errors = []
+    held = []
     for _ in range(60):
         y = arm.observed(arm.errors(rng)[0])
         y[bad] += 1000.0
         found = mm_estimate(B, y, size=3, subsets=30)
-        for kind in std:
-            std[kind].append(asymptotic_covariance(found, kind).std)
-        held.append(holds(found.x, asymptotic_covariance(found, "H2"), arm.x))
-        errors.append(found.x - arm.x)
+        held.append(holds(found.x, asymptotic_covariance(found), arm.x))
     low, high = binomial_band(np.size(held) // 3, 0.95)
     assert low <= np.sum(held) / 3 <= high
-    true = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert (np.mean(std["H1"], axis=0) < 0.6 * true).all()
-    assert (np.mean(std["H3"], axis=0) > 1.5 * true).all()
 
 
 @pytest.mark.parametrize("name", ["huber", "tukey"])
@@ -191,5 +183,3 @@ def test_what_cannot_be_told_is_refused(arm):
         clustered_covariance(found, np.zeros(810, dtype=int))
     with pytest.raises(InsufficientDataError, match="without cluster 0"):
         clustered_covariance(found, arm.configuration // 3)
-    with pytest.raises(InputError, match="H1, H2 or H3"):
-        asymptotic_covariance(found, "H4")

@@ -29,7 +29,6 @@ def regression(seed, n=120, p=4):
     return B, B @ x + 0.1 * rng.standard_t(2.5, size=n)
 
 
-@pytest.mark.parametrize("kind", ["H1", "H2", "H3"])
 @pytest.mark.parametrize(
     ("ours", "theirs"),
     [
@@ -38,27 +37,25 @@ def regression(seed, n=120, p=4):
     ],
     ids=["huber", "tukey"],
 )
-def test_estimate_scale_and_covariance_are_those_of_statsmodels(ours, theirs, kind):
+def test_estimate_scale_and_covariance_are_those_of_statsmodels(ours, theirs):
     """Columns scaled to unit length for statsmodels, whose pseudo-inverse needs that."""
     B, y = regression(1)
     unit = np.linalg.norm(B, axis=0)
-    reference = sm.RLM(y, B / unit, M=theirs).fit(cov=kind, tol=1e-13, maxiter=2000)
+    reference = sm.RLM(y, B / unit, M=theirs).fit(cov="H2", tol=1e-13, maxiter=2000)
     found = m_estimate(B, y, ours)
     np.testing.assert_allclose(found.x * unit, reference.params, rtol=1e-8)
     assert found.scale == pytest.approx(reference.scale, rel=1e-8)
-    scaled = asymptotic_covariance(found, kind).matrix * np.outer(unit, unit)
+    scaled = asymptotic_covariance(found).matrix * np.outer(unit, unit)
     np.testing.assert_allclose(scaled, reference.bcov_scaled, rtol=1e-8, atol=1e-14)
 
 
-@pytest.mark.parametrize("rule", ["median", "proposal2", "m", 0.2])
 @pytest.mark.parametrize("loss", [huber(3), Bisquare(3, 5.5), Absolute(3)], ids=lambda f: f.name)
-def test_regression_affine_and_scale_equivariance(arm, loss, rule):
+def test_regression_affine_and_scale_equivariance(arm, loss):
     rng = np.random.default_rng(3)
     y = arm.observed(arm.errors(rng, 0.1)[0])
     A, v = rng.normal(size=(9, 9)), rng.normal(size=9)
-    known = 6.0 * rule if not isinstance(rule, str) else rule
-    plain = m_estimate(arm.B, y, loss, size=3, scale=rule)
-    moved = m_estimate(arm.B @ A, 6.0 * (y + arm.B @ v), loss, size=3, scale=known)
+    plain = m_estimate(arm.B, y, loss, size=3)
+    moved = m_estimate(arm.B @ A, 6.0 * (y + arm.B @ v), loss, size=3)
     np.testing.assert_allclose(A @ moved.x, 6.0 * (plain.x + v), rtol=1e-7, atol=1e-7)
     assert moved.scale == pytest.approx(6.0 * plain.scale, rel=1e-7)
 
@@ -86,15 +83,16 @@ def test_the_axes_of_a_reading_do_not_matter(arm, fit):
 
 
 def test_vector_huber_minimises_its_objective(arm):
-    """At the known scale: against BFGS on Σρ."""
+    """At the scale that it ends with: against BFGS on Σρ."""
     y = arm.observed(arm.errors(np.random.default_rng(4), 0.1)[0])
     loss = huber(3)
 
+    found = m_estimate(arm.B, y, loss, size=3)
+
     def cost(x):
         d = np.linalg.norm((y - arm.B @ x).reshape(-1, 3), axis=1)
-        return loss.rho(d).sum()
+        return loss.rho(d / found.scale).sum()
 
-    found = m_estimate(arm.B, y, loss, size=3, scale=1.0)
     best = optimize.minimize(cost, found.x + 0.1, method="BFGS", options={"gtol": 1e-7})
     assert found.objective <= best.fun * (1 + 1e-12)
     np.testing.assert_allclose(found.x, best.x, atol=1e-5)
@@ -178,7 +176,3 @@ def test_what_is_wrong_is_named():
         m_estimate(np.column_stack([B[:, :3], B[:, 0] + B[:, 1]]), y, huber(1))
     with pytest.raises(InputError, match="loss is for 3 rows"):
         m_estimate(B, y, huber(3))
-    with pytest.raises(InputError, match="'mad'"):
-        m_estimate(B, y, huber(1), scale="mad")
-    with pytest.raises(InputError, match="start"):
-        m_estimate(B, y, huber(1), start=np.zeros(3))

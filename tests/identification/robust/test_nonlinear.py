@@ -94,7 +94,7 @@ def test_covariances_are_of_the_fitted_columns():
     problem, _, _ = arm_problem(5)
     found = robust_fit(problem)
     k = len(problem.columns)
-    assert found.covariance("H1").matrix.shape == (k, k)
+    assert found.covariance().matrix.shape == (k, k)
     clustered = found.clustered(np.arange(40) % 20)
     assert clustered.matrix.shape == (k, k) and (clustered.dof < 20).all()
 

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from statsmodels.robust import HuberScale, scale
+from statsmodels.robust import scale
 
-from elastocal.identification import breakdown_bisquare, m_scale, proposal_2
+from elastocal.identification import breakdown_bisquare, m_scale
 from elastocal.identification.robust_core import median_scale
 
 ESTIMATORS = {
     "median": median_scale,
-    "proposal2": proposal_2,
     "m": lambda length, size: m_scale(length, breakdown_bisquare(size)),
 }
 
@@ -34,12 +33,6 @@ def test_almost_half_of_the_readings_cannot_carry_it_away(name):
 def test_median_scale_is_the_mad_about_zero():
     r = np.random.default_rng(3).normal(size=40)
     assert median_scale(np.abs(r), 1) == pytest.approx(scale.mad(r, center=0), rel=1e-12)
-
-
-def test_proposal_2_is_that_of_statsmodels():
-    r = np.random.default_rng(4).standard_t(3, size=200)
-    reference = HuberScale(d=2.5, tol=1e-13, maxiter=1000)(193, 200, r)
-    assert proposal_2(np.abs(r), 1, 7) == pytest.approx(float(reference), rel=1e-8)
 
 
 def test_m_scale_solves_its_equation_and_is_zero_where_half_is_exact():

@@ -1,0 +1,74 @@
+"""Constrained linear fits and their intervals, stated by names and constraints."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from elastocal.identification import (
+    Constraints,
+    GaussianPrior,
+    constrained_bootstrap,
+    minimise,
+    objective_of,
+    profile_linear_interval,
+)
+from elastocal.identification.bootstrap import ParametricBootstrap
+from elastocal.identification.constrained import Minimum
+from elastocal.identification.intervals import ProfileInterval
+
+NONE = Constraints()
+
+
+def solve(
+    B: np.ndarray,
+    y: np.ndarray,
+    names: Sequence[str],
+    stated: Constraints = NONE,
+    *,
+    prior: GaussianPrior | None = None,
+    loss: str = "squares",
+    size: int = 1,
+    sigma: float = 1.0,
+) -> Minimum:
+    objective = objective_of(B, y, names, prior, loss, size, sigma)
+    return minimise(objective, stated.resolve(names))
+
+
+def profiles(
+    B: np.ndarray,
+    y: np.ndarray,
+    names: Sequence[str],
+    stated: Constraints,
+    *,
+    prior: GaussianPrior | None = None,
+    level: float = 0.95,
+) -> list[ProfileInterval]:
+    """The interval of every parameter for rows of unit noise."""
+    objective, system = objective_of(B, y, names, prior, "squares", 1, 1.0), stated.resolve(names)
+    return [profile_linear_interval(objective, system, n, 1.0, level) for n in names]
+
+
+def profile(
+    B: np.ndarray, y: np.ndarray, names: Sequence[str], stated: Constraints, name: str
+) -> ProfileInterval:
+    """The interval of one parameter for rows of unit noise."""
+    objective = objective_of(B, y, names, None, "squares", 1, 1.0)
+    return profile_linear_interval(objective, stated.resolve(names), name, 1.0)
+
+
+def bootstrap(
+    B: np.ndarray,
+    y: np.ndarray,
+    names: Sequence[str],
+    stated: Constraints,
+    *,
+    prior: GaussianPrior | None = None,
+    draws: int,
+    seed: int,
+    jobs: int = 1,
+) -> ParametricBootstrap:
+    """Draws for rows of unit noise."""
+    objective = objective_of(B, y, names, prior, "squares", 1, 1.0)
+    return constrained_bootstrap(
+        objective, stated.resolve(names), 1.0, draws=draws, seed=seed, jobs=jobs
+    )
