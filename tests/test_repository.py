@@ -34,8 +34,8 @@ LAYERS = (
 MOST_LINES = 800
 FEWEST_LINES = 60
 
-# Their work is begun on the command line alone; the pages of `report` tell how it goes on there.
-OF_THE_COMMAND_LINE = ("studies", "importing", "report")
+# The pages of `report` tell how the work goes on, on the command line.
+OF_THE_COMMAND_LINE = ("report",)
 ELSEWHERE = ("--install", "--version")  # flags of other programs
 
 # In two halves, so that this file does not mention them either.

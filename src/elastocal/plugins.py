@@ -48,36 +48,12 @@ from elastocal.model.effects.driven import (
 )
 
 __all__ = [
-    "Arm",
-    "BaseMotion",
-    "Cell",
-    "Chain",
-    "DrivenEffect",
-    "Effect",
-    "JointMotion",
-    "LinkFrame",
-    "LinkLength",
-    "LoadedEffect",
-    "MarkerMotion",
-    "NoiseModel",
-    "ParameterSpec",
-    "Readings",
-    "Setting",
-    "Spring",
-    "Symbols",
-    "TorqueEffect",
-    "add_deflection",
-    "index",
-    "joints",
-    "links",
-    "load_plugins",
-    "motion_unit",
-    "register_criterion",
-    "register_effect",
-    "register_noise_model",
-    "rigid",
-    "turning_joints",
-]
+    "Arm", "BaseMotion", "Cell", "Chain", "DrivenEffect", "Effect", "JointMotion", "LinkFrame",
+    "LinkLength", "LoadedEffect", "MarkerMotion", "NoiseModel", "ParameterSpec", "Readings",
+    "Setting", "Spring", "Symbols", "TorqueEffect", "add_deflection", "index", "joints",
+    "links", "load_plugins", "motion_unit", "register_criterion", "register_effect",
+    "register_noise_model", "rigid", "turning_joints",
+]  # fmt: skip
 
 load_plugins = plugin_loader.load_plugins
 

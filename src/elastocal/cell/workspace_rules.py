@@ -38,13 +38,7 @@ from elastocal.units import Array
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 Part = Annotated[str, Field(pattern=r"^(base|flange|link[1-9][0-9]{0,2})$")]
 Pair = Annotated[tuple[Text, Text], TUPLE]
-Angle = Annotated[
-    float,
-    Field(
-        gt=0,
-        le=180,
-    ),
-]
+Angle = Annotated[float, Field(gt=0, le=180)]
 Edges = Annotated[Array, numbers(3, above=0)]
 Scale = Annotated[Array, numbers(3, above=0, one_for_all=True)]
 Radii = Positive | Annotated[Array, numbers(least=0)]

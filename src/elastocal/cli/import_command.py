@@ -13,7 +13,7 @@ from elastocal.errors import InputError, require
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
-    from elastocal.importing.import_files import Imported
+    from elastocal.importing.assemble import Imported
 
 PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, kuka, abb, ros"
 
@@ -106,7 +106,7 @@ def import_(
 
 
 def _import(paths: list[Path], read: Any, cell: Path | None, output: Path | None) -> Imported:
-    from elastocal.importing.import_files import import_files
+    from elastocal.importing.assemble import import_files
 
     known = None
     if cell is not None:

@@ -17,7 +17,7 @@ from rich.text import Text
 from elastocal.errors import InputError
 from elastocal.files import atomic_write_text
 from elastocal.identification.result import Calibration
-from elastocal.importing.import_files import Imported
+from elastocal.importing.assemble import Imported
 from elastocal.importing.records import Understood
 from elastocal.report.formatting import counted, printable
 from elastocal.report.terminal import titled

@@ -33,15 +33,6 @@ LARGE = np.radians(20.0)  # a step beyond which another posture may be nearer
 LONGEST_PIECE = 256  # rows solved at once
 
 
-@dataclass(frozen=True)
-class NominalPath:
-    """`q` (n, joints) and whether the nominal arm `reached` (n,) each place; where it did not,
-    q is the posture that comes nearest."""
-
-    q: Array
-    reached: NDArray[np.bool_]
-
-
 def nominal_path(
     chain: Chain,
     position: Array,
@@ -50,8 +41,9 @@ def nominal_path(
     limits: tuple[Array, Array],
     near: Array | None,
     seed: int = 0,
-) -> NominalPath:
-    """Nominal joints that bring `point` (3,) of the flange to places along a path.
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Nominal joints (n, joints) that bring `point` (3,) of the flange to places along a path, and
+    whether the nominal arm reaches each place (n,); where not, the nearest posture stands there.
 
     `position` (n, 3) m and `rotation` (n, 3, 3) of the flange, or None for any, in the base
     frame.  The first place is reached in the posture nearest to `near` (default: the middle of
@@ -68,7 +60,7 @@ def nominal_path(
         if not taken:
             walk.leap(first, walk.last)
         first += max(taken, 1)
-    return NominalPath(walk.q, walk.reached)
+    return walk.q, walk.reached
 
 
 class _Walk:
@@ -172,6 +164,12 @@ class Goals:
     position: Array
     rotation: Array | None
 
+    def in_base(self, T: Array) -> Goals:
+        """The same in the base frame, which stands at T (n, 4, 4) in the data's frame."""
+        back = T[:, :3, :3].transpose(0, 2, 1)
+        position = np.einsum("nij,nj->ni", back, self.position - T[:, :3, 3])
+        return Goals(position, None if self.rotation is None else back @ self.rotation)
+
 
 @dataclass(frozen=True)
 class Solved:
@@ -183,9 +181,9 @@ class Solved:
 
     def replaced(self, rows: IntArray, other: Solved) -> Solved:
         """The same with `other` in the rows named."""
-        q, miss, turn = self.q.copy(), self.miss.copy(), self.turn.copy()
-        q[rows], miss[rows], turn[rows] = other.q, other.miss, other.turn
-        return Solved(q, miss, turn)
+        new = Solved(self.q.copy(), self.miss.copy(), self.turn.copy())
+        new.q[rows], new.miss[rows], new.turn[rows] = other.q, other.miss, other.turn
+        return new
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -221,6 +219,10 @@ class Commanding(BoundedSearch):
         equations = 3 if self.goals.rotation is None else 6
         if self.tool.chain.n_joints > equations:
             q = self.least_correction(q, nominal, target)
+        return self.judged(q, target)
+
+    def judged(self, q: Array, target: IntArray) -> Solved:
+        """Commands q with what they miss."""
         return Solved(q, *self.misses(q, target))
 
     def least_correction(self, q: Array, nominal: Array, target: IntArray) -> Array:
@@ -259,7 +261,7 @@ class Commanding(BoundedSearch):
 
     def _better(self, q: Array, started: Array, nominal: Array, target: IntArray) -> Array:
         """Of two sets of commands, row by row those that reach with the smaller correction."""
-        now, before = (Solved(v, *self.misses(v, target)) for v in (q, started))
+        now, before = (self.judged(v, target) for v in (q, started))
         shorter = np.linalg.norm(q - nominal, axis=1) <= np.linalg.norm(started - nominal, axis=1)
         take = now.reached & (shorter | ~before.reached)
         return np.where(take[:, None], q, started)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from elastocal.above import Result
 from elastocal.compensation.commands import (
-    TOLERANCE,
     Commanding,
     Goals,
     Solved,
@@ -134,10 +133,12 @@ def compensate(
         force = np.einsum("nij,nj->ni", T[:, :3, :3], force)
     rows = tool.rows(replace(targets.table, force=force))
     goals = _goals(targets, chain, T, place, turn)
-    in_base, flange = _seen_from_base(goals, T, turn)
+    aimed = goals.in_base(T)
+    in_base = aimed.position
+    flange = None if aimed.rotation is None else aimed.rotation @ turn.transpose(0, 2, 1)
     if targets.q is None:
         progress("nominal commands")
-        nominal = nominal_path(chain, in_base, flange, place[0], limits, near, seed).q
+        nominal = nominal_path(chain, in_base, flange, place[0], limits, near, seed)[0]
     else:
         check_limits(arm.model, replace(targets.table, q=targets.q))
         nominal = np.clip(targets.q, *limits)
@@ -185,15 +186,6 @@ def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) 
     return Goals(position, rotation)
 
 
-def _seen_from_base(goals: Goals, T: Array, turn: Array) -> tuple[Array, Array | None]:
-    """Position (n, 3) of the point and rotation (n, 3, 3) of the flange in the base frame."""
-    back = T[:, :3, :3].transpose(0, 2, 1)
-    position = np.einsum("nij,nj->ni", back, goals.position - T[:, :3, 3])
-    if goals.rotation is None:
-        return position, None
-    return position, back @ goals.rotation @ turn.transpose(0, 2, 1)
-
-
 def nominal_flanges(chain: Chain, q: Array) -> Array:
     """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
     symbol = ca.SX.sym("q", chain.n_joints)
@@ -214,8 +206,7 @@ def _other_postures(
     starts = found.q.reshape(len(lost) * count, -1)
     target = np.repeat(lost, count)
     q, _ = search.solve(starts, target)
-    miss, turn = search.misses(q, target)
-    good = np.asarray((miss <= TOLERANCE) & (turn <= TOLERANCE)).reshape(len(lost), count)
+    good = search.judged(q, target).reached.reshape(len(lost), count)
     far = np.linalg.norm(found.q - nominal[lost][:, None], axis=2)
     best = np.where(good, far, np.inf).argmin(axis=1)
     chosen = found.q[np.arange(len(lost)), best]
@@ -233,9 +224,7 @@ def _status(search: Commanding, found: Solved, nominal: Array) -> tuple[str, ...
         wide = np.full(nominal.shape[1], np.inf)
         free = Commanding(search.tool, search.rows, search.goals, -wide, wide)
         q, _ = free.solve(nominal[left], left)
-        miss, turn = free.misses(q, left)
-        within = (miss <= TOLERANCE) & (turn <= TOLERANCE)
-        status[left[within]] = LIMIT
+        status[left[free.judged(q, left).reached]] = LIMIT
     return tuple(status)
 
 

@@ -127,16 +127,15 @@ def _same_turns(row: DhRow, near: DhRow) -> DhRow:
     )
 
 
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
 def _turn(axis: str, angle: float) -> ca.SX:
-    return rigid.joint_motion("revolute", _unit(axis), angle)
+    return rigid.joint_motion("revolute", AXES[axis], angle)
 
 
 def _shift(axis: str, length: float) -> ca.SX:
-    return rigid.joint_motion("prismatic", _unit(axis), length)
-
-
-def _unit(axis: str) -> tuple[float, float, float]:
-    return {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}[axis]
+    return rigid.joint_motion("prismatic", AXES[axis], length)
 
 
 def _product(*factors: ca.SX) -> Array:
@@ -282,13 +281,8 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Dh
     n = len(table.row)
     if any(table.text(i, "type") == FIXED for i in range(n)):
         return nothing
-    keys = (
-        ("angle", "theta0"),
-        ("length", "d"),
-        ("length", "a"),
-        ("angle", "alpha"),
-        ("angle", "beta"),
-    )
+    stems = ("theta0", "d", "a", "alpha", "beta")
+    keys = [("length" if len(stem) == 1 else "angle", stem) for stem in stems]
     numbers = np.nan_to_num([[dh_number(table, i, *key) for key in keys] for i in range(n)])
     own = [DhRow(*row) for row in numbers.tolist()]
     if convention == "standard":

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections import defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements
 from elastocal.model import rigid
@@ -55,6 +55,7 @@ def origin_attributes(T: Array) -> dict[str, str]:
 
 # What a spring in a file cannot follow, named like effects among the omissions.
 LEVELS, LINEAR, NEGATIVE = "levels of a joint", "linear deflections", "negative compliance"
+OPTIONS = {"time": "time_s", "temperature": "temperature_c"}  # which state what an effect needs
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,7 @@ class Conditions:
 
     def state(self, need: str) -> bool:
         """Is what an effect needs ("time", "temperature", …) stated here?"""
-        return not (
-            (need == "time" and self.time is None)
-            or (need == "temperature" and self.temperature is None)
-        )
+        return getattr(self, need, 0.0) is not None
 
 
 @dataclass(frozen=True)
@@ -139,7 +137,10 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
     whole = [name for name, needs in unstated.items() if not needs]
     full = _part(calibrated, whole)
     format: Format = "elastic" if elastic else "rigid"
-    dropped = _cannot_be_springs(full) if elastic else {}
+    dropped = {}  # effects whose values no physical spring or body has, with the reason
+    for name in full.effects if elastic else ():
+        if reason := CATALOGUE[name].unphysical(full.values, full.model.chain, full.model.cell):
+            dropped[name] = reason
     kept_names = [
         name for name in whole if format in CATALOGUE[name].formats and name not in dropped
     ]
@@ -149,7 +150,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         if name not in kept_names
     ]
     omissions += [
-        Omission(name, f"no cost without {' and '.join(map(_option, needs))}", None)
+        Omission(name, f"no cost without {' and '.join(option(OPTIONS[n]) for n in needs)}", None)
         for name, needs in unstated.items()
         if needs
     ]
@@ -160,10 +161,6 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
             Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
         ]
     return Kept(full, exported, conditions, tuple(omissions), instrument)
-
-
-def _option(need: str) -> str:
-    return option({"time": "time_s", "temperature": "temperature_c"}[need])
 
 
 def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
@@ -177,21 +174,8 @@ def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
         observe="position",
         torque="computed",
     )
-    return _valued(calibrated.model, replace(cell, model=spec), calibrated.values)
-
-
-def _valued(like: Model, cell: Cell, values: dict[str, float]) -> Valued:
-    model = Model.assembled(like.chain, cell)
-    return Valued(model, np.array([values[name] for name in model.names]))
-
-
-def _cannot_be_springs(full: Valued) -> dict[str, str]:
-    """Effects whose values no physical spring or body has, with the reason."""
-    values, model = full.values, full.model
-    reasons = {
-        name: CATALOGUE[name].unphysical(values, model.chain, model.cell) for name in full.effects
-    }
-    return {name: reason for name, reason in reasons.items() if reason}
+    model = Model.assembled(calibrated.model.chain, replace(cell, model=spec))
+    return Valued(model, np.array([calibrated.values[name] for name in model.names]))
 
 
 def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tuple[str, str]]]:
@@ -201,7 +185,7 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     are those at the deflected pose.  `only` makes the change of one of them alone.
     """
     cell, values = part.model.cell, part.values
-    changed = []
+    changed = defaultdict[str, list[str]](list)
     spec = cell.model
     if spec.compliance_levels and JointCompliance.name in part.effects and only in (None, LEVELS):
         for joint, levels in spec.compliance_levels.items():
@@ -209,24 +193,18 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
             if names[0] in values:
                 values[f"{joint}.compliance"] = float(np.mean([values[name] for name in names]))
                 told = f"one spring with the mean compliance of {joint}'s {len(names)} levels"
-                changed.append((LEVELS, told))
+                changed[LEVELS].append(told)
         spec = replace(spec, compliance_levels={})
     if spec.deflection_model == "linear" and only in (None, LINEAR):
         spec = replace(spec, deflection_model="equilibrium")
-        changed.append((LINEAR, "springs settle under the load at the deflected pose, eq. (3) not"))
+        changed[LINEAR] = ["springs settle under the load at the deflected pose, eq. (3) not"]
     model = Model.assembled(part.model.chain, replace(cell, model=spec))
     negative = [p.name for p in model.parameters if p.lower == 0.0 and values[p.name] < 0.0]
     if negative and only in (None, NEGATIVE):
         values |= dict.fromkeys(negative, 0.0)
-        changed.append((NEGATIVE, f"rigid, as no spring yields so: {', '.join(negative)}"))
-    return Valued(model, np.array([values[name] for name in model.names])), _once(changed)
-
-
-def _once(changed: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    told: dict[str, list[str]] = {}
-    for effect, sentence in changed:
-        told.setdefault(effect, []).append(sentence)
-    return [(effect, "; ".join(sentences)) for effect, sentences in told.items()]
+        changed[NEGATIVE] = [f"rigid, as no spring yields so: {', '.join(negative)}"]
+    told = [(effect, "; ".join(sentences)) for effect, sentences in changed.items()]
+    return Valued(model, np.array([values[name] for name in model.names])), told
 
 
 # The numbers of an exported model: joint placements, markers, springs, masses.
@@ -272,6 +250,11 @@ class ExportNumbers:
         """Motion (4, 4) of joint i (0-based) by its offset: what stands at encoder zero."""
         joint = self.chain.joints[i]
         return ca.DM(rigid.joint_motion(joint.kind, joint.axis, float(self.offsets[i]))).full()
+
+    @property
+    def points(self) -> Array:
+        """(1 + markers, 3) m in the flange frame: its origin and the markers."""
+        return np.array([np.zeros(3), *(T[:3, 3] for T in self.markers.values())])
 
     def placement(self, i: int) -> Array:
         """Joint i's frame (0-based) in the frame before it, without its offset."""
@@ -419,8 +402,7 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
     """
     table = random_table(kept.full.model, kept.conditions, poses, seed)
     # No omission touches the tool, so one set of markers serves every model.
-    tool = evaluate_pieces(kept.exported, kept.conditions).markers
-    markers = np.array([np.zeros(3), *(T[:3, 3] for T in tool.values())])
+    markers = evaluate_pieces(kept.exported, kept.conditions).points
     full = _positions(kept.full, table, markers)
     exported = _positions(kept.exported, table, markers)
     settled = np.isfinite(full).all(axis=(1, 2)) & np.isfinite(exported).all(axis=(1, 2))
@@ -466,13 +448,11 @@ def random_table(model: Model, conditions: Conditions, poses: int, seed: int) ->
         marker_names=tuple(cell.tool.markers)[:1],
         force=np.tile(conditions.force, (poses, 1)),
         approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)),
-        time=_column(conditions.time, poses),
-        temperature=_column(conditions.temperature, poses),
+        time=None if conditions.time is None else np.full(poses, conditions.time),
+        temperature=None
+        if conditions.temperature is None
+        else np.full(poses, conditions.temperature),
     )
-
-
-def _column(value: float | None, n: int) -> Array | None:
-    return None if value is None else np.full(n, value)
 
 
 def _positions(part: Valued, table: Measurements, points: Array) -> Array:
@@ -483,9 +463,7 @@ def _positions(part: Valued, table: Measurements, points: Array) -> Array:
 
 def _difference(a: Array, b: Array) -> Difference:
     distance = np.linalg.norm(a - b, axis=2)
-    flange, markers = distance[:, :1], distance[:, 1:]
-    return Difference(_rms(flange), float(flange.max()), _rms(markers), float(markers.max()))
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    parts = distance[:, :1], distance[:, 1:]
+    return Difference(
+        *(float(v) for part in parts for v in (np.sqrt(np.mean(part**2)), part.max()))
+    )

@@ -212,7 +212,10 @@ def pooled(records: Sequence[Records]) -> PooledRecords:
         _same("labels", first, other, set(first.labels) - loads, set(other.labels) - loads)
         _same("times", first, other, {"time"} if first.time is not None else set(),
               {"time"} if other.time is not None else set())  # fmt: skip
-    units = {stem: _common([r.units[stem] for r in records]) for stem in first.numbers}
+    units = {}
+    for stem, unit in first.units.items():
+        alike = all(r.units[stem] == unit for r in records)
+        units[stem] = unit if alike else DEFAULT[quantities(unit)[0]]
     numbers = {
         stem: np.concatenate([convert(r.numbers[stem], r.units[stem], unit) for r in records])
         for stem, unit in units.items()
@@ -248,10 +251,6 @@ def _loads(records: Records) -> list[str]:
     return named if named is not None else [str(records.load)] * len(records)
 
 
-def _common(units: list[str]) -> str:
-    return units[0] if len(set(units)) == 1 else DEFAULT[quantities(units[0])[0]]
-
-
 def _same(what: str, first: Records, other: Records, one: set[str], two: set[str]) -> None:
     if one == two:
         return
@@ -266,7 +265,7 @@ CHUNK = 1024
 
 
 @dataclass(frozen=True)
-class Standstill:
+class Dwell:
     """Rows `first` to `last` of the log, both included; the arm's `q` (n,) then (median)."""
 
     first: int
@@ -274,14 +273,14 @@ class Standstill:
     q: Array
 
 
-def standstills(time: Array, q: Array, still: Array, shortest: float) -> list[Standstill]:
+def dwells(time: Array, q: Array, still: Array, shortest: float) -> list[Dwell]:
     """The longest runs of rows in which no joint moves by more than `still`.
 
     `time` (m,) s, rising; `q` (m, n); `still` (n,): the largest max - min of each joint within a
-    standstill, in the unit of q; `shortest` s between its first and last row.  Runs are taken from
+    dwell, in the unit of q; `shortest` s between its first and last row.  Runs are taken from
     the start of the log on, each as long as it can be; shorter ones count as motion.
     """
-    found: list[Standstill] = []
+    found: list[Dwell] = []
     start, m = 0, len(time)
     while start + 1 < m:
         # The first row with which the run is long enough.
@@ -295,7 +294,7 @@ def standstills(time: Array, q: Array, still: Array, shortest: float) -> list[St
             start += int(moved[-1]) + 1
             continue
         end = _last(q, start, still)
-        found.append(Standstill(start, end, np.median(q[start : end + 1], axis=0)))
+        found.append(Dwell(start, end, np.median(q[start : end + 1], axis=0)))
         start = end + 1
     return found
 
@@ -569,7 +568,7 @@ def _by_standstill(
     tolerance = TOLERANCE_S if settings.tolerance_s is None else settings.tolerance_s
     still = log.spread(settings.still_deg or STILL_DEG, settings.still_mm or STILL_MM)
     shortest = STILL_S if settings.still_s is None else settings.still_s
-    found = standstills(clock, log.q[order], still, shortest)
+    found = dwells(clock, log.q[order], still, shortest)
     if not found:
         raise InputError(
             f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
@@ -577,14 +576,10 @@ def _by_standstill(
         )
     first = np.array([clock[s.first] for s in found])
     last = np.array([clock[s.last] for s in found])
-    # 0 within a standstill, else the time to its nearer end: (points, standstills) at most a few
+    # 0 within a dwell, else the time to its nearer end: (points, dwells) at most a few
     # thousand each.
-    best = np.zeros(len(at), dtype=np.int64)
-    apart = np.zeros(len(at))
-    for i, t in enumerate(at):
-        away = np.maximum(np.maximum(first - t, t - last), 0.0)
-        best[i] = int(np.argmin(away))
-        apart[i] = away[best[i]]
+    best = np.array([np.argmin(np.maximum(np.maximum(first - t, t - last), 0.0)) for t in at])
+    apart = np.maximum(np.maximum(first[best] - at, at - last[best]), 0.0)
     good = apart <= tolerance
     q = np.array([s.q for s in found])[best]
     row = np.where(good, order[np.array([s.first for s in found])[best]], -1)
