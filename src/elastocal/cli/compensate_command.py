@@ -22,7 +22,7 @@ from elastocal.errors import require
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
-    from elastocal.compensation.tool_targets import Targets
+    from elastocal.compensation.tool import Targets
     from elastocal.model.calibrated import CalibratedArm
     from elastocal.units import Array
 
@@ -99,7 +99,7 @@ def compensate(
     Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
     """
     from elastocal.cli.outputs import commands_of, read_near, read_table_grid, table_of
-    from elastocal.compensation.tool_targets import tool_point
+    from elastocal.compensation.tool import tool_point
     from elastocal.files import atomic_write_text
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
@@ -153,7 +153,7 @@ def compensate(
 def _check_targets(
     targets: Path | None, target: str | None, frame: str, output: Path | None, table: Path | None
 ) -> None:
-    from elastocal.compensation.tool_targets import FRAMES
+    from elastocal.compensation.tool import FRAMES
 
     require(frame in FRAMES, f"--frame takes base or tracker; found '{frame}'")
     require(
@@ -181,7 +181,7 @@ def _check_grid(table: Path | None, grid: str, box: str | None, rotation: str | 
 def _targets(
     arm: CalibratedArm, path: Path | None, target: str | None, frame: str, force: Array | None
 ) -> Targets | None:
-    from elastocal.compensation.tool_targets import one_target, read_targets
+    from elastocal.compensation.tool import one_target, read_targets
 
     if path is not None:
         return read_targets(path, arm.model.chain.kinds, frame, force)  # type: ignore[arg-type]

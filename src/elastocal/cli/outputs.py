@@ -151,7 +151,7 @@ def read_near(arm: CalibratedArm, text: str | None) -> Array | None:
     import numpy as np
 
     from elastocal.compensation.compensate import in_file_units
-    from elastocal.compensation.tool_targets import numbers
+    from elastocal.compensation.tool import numbers
     from elastocal.model.chain import joint_limits
 
     if text is None:
@@ -175,7 +175,7 @@ def read_table_grid(
     from scipy.spatial.transform import Rotation
 
     from elastocal.compensation.correction_table import box_grid, joint_grid
-    from elastocal.compensation.tool_targets import numbers
+    from elastocal.compensation.tool import numbers
 
     try:
         counts = tuple(int(part) for part in grid.split(","))

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import Cell
-from elastocal.compensation.tool import CalibratedTool
-from elastocal.compensation.tool_targets import Targets
+from elastocal.compensation.tool import CalibratedTool, Targets
 from elastocal.errors import option
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain, finite_ranges, joint_limits

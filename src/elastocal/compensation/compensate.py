@@ -22,8 +22,7 @@ from elastocal.compensation.commands import (
     position_uncertainty,
     undetermined,
 )
-from elastocal.compensation.tool import CalibratedTool
-from elastocal.compensation.tool_targets import Targets, ToolPoint
+from elastocal.compensation.tool import CalibratedTool, Targets, ToolPoint
 from elastocal.errors import InsufficientDataError, option
 from elastocal.identification.start import check_limits
 from elastocal.measurements import families

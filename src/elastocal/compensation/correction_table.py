@@ -12,8 +12,7 @@ from scipy.stats import qmc
 
 from elastocal.compensation.commands import Goals
 from elastocal.compensation.compensate import Compensation, compensate, nominal_flanges
-from elastocal.compensation.tool import CalibratedTool
-from elastocal.compensation.tool_targets import Targets, ToolPoint, targets_at
+from elastocal.compensation.tool import CalibratedTool, Targets, ToolPoint, targets_at
 from elastocal.errors import InputError, option
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import finite_ranges, joint_limits
