@@ -51,6 +51,11 @@ PLANS = ("plan", "targets")
 PLAN_ONLY = ("level", "order")
 # What `compensate` writes beside its commands, which are a plan too.
 BESIDE_COMMANDS = ("correction_", "error_", "std_", "status")
+# In the order in which they are written.
+NUMBERS = (
+    "repeat", "q", "force", "position", "rotation", "distance", "torque", "sigma", "time",
+    "approach", "temperature",
+)  # fmt: skip
 DEFAULT_MARKER = "M1"
 QUATERNION_NORM_TOLERANCE = 1e-3
 LARGEST_EXACT_INTEGER = 2.0**53
@@ -105,27 +110,17 @@ class Measurements:
     def columns(self, joint_kinds: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """The same as header → (n,) numbers or labels."""
         known = families(joint_kinds or ("revolute",) * self.q.shape[1])
-        blocks: dict[str, np.ndarray | None] = {
-            "repeat": self.repeat,
-            "q": self.q,
-            "force": self.force,
-            "position": self.position,
-            "rotation": self.rotation,
-            "distance": self.distance,
-            "torque": self.torque,
-            f"sigma_{self.sigma_frame}": self.sigma,
-            "time": self.time,
-            "approach": None if self.approach is None else self.approach.astype(np.int64),
-            "temperature": self.temperature,
-        }
         columns: dict[str, np.ndarray] = {
             "configuration": np.array(self.configuration_labels, dtype=object)[self.configuration],
             "marker": np.array(self.marker_names, dtype=object)[self.marker],
         }
-        for name, values in blocks.items():
+        for name in NUMBERS:
+            values = getattr(self, name)
             if values is None:
                 continue
-            stems = known[name].units
+            if name == "approach":
+                values = values.astype(np.int64)
+            stems = known[f"sigma_{self.sigma_frame}" if name == "sigma" else name].units
             for stem, numbers in zip(stems, values.reshape(len(self), len(stems)).T, strict=True):
                 unit = next(unit for unit in SI_UNITS if unit in stems[stem])
                 columns[column(stem, unit)] = numbers

@@ -306,10 +306,9 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
     Joints and corrections of a row that is not reached are left empty.  Forces stand in the
     data's frame, as in every plan, so that `simulate` can read the table.
     """
-    blocks: list[tuple[list[str], Array, str]] = []
     held = np.where(result.reached[:, None], 1.0, np.nan)
     q = in_file_units(result.q, kinds)
-    blocks.append((joint_columns(kinds), held * q, f".{DIGITS}f"))
+    blocks = [(joint_columns(kinds), held * q, f".{DIGITS}f")]
     table = result.targets.table
     if result.force.any():
         blocks.append((["force_x_N", "force_y_N", "force_z_N"], result.force, ".9g"))
@@ -336,20 +335,20 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
     header = ["configuration", *(h for heads, _, _ in blocks for h in heads), "status"]
     rows = []
     for i in range(len(table)):
-        cells = [_cell(v, form) for _, values, form in blocks for v in values[i]]
+        cells = [
+            format(v + 0.0, form) if np.isfinite(v) else ""
+            for _, values, form in blocks
+            for v in values[i]
+        ]
         label = table.configuration_labels[table.configuration[i]]
         rows.append([label, *cells, result.status[i]])
     return csv_text(header, rows)
 
 
-def _cell(value: float, form: str) -> str:
-    return format(value + 0.0, form) if np.isfinite(value) else ""
-
-
 def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[str, Any]:
     """What was done, JSON-ready; with `commands` also every command."""
-    good = result.reached
-    names = joint_columns(kinds)
+    good, names = result.reached, joint_columns(kinds)
+    change = in_file_units(result.q - result.nominal, kinds)
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "targets": result.targets.table.source,
@@ -361,7 +360,7 @@ def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[
         "error_after_um": spread(result.after[good]),
         "std_um": spread(result.uncertainty.std[good]),
         "largest_correction": dict(
-            zip(names, _largest(in_file_units(result.q - result.nominal, kinds)[good]), strict=True)
+            zip(names, plain(np.abs(change[good]).max(axis=0, initial=-np.inf)), strict=True)
         ),
         "not_reached": [
             {"line": int(result.targets.table.row[i]), "status": result.status[i],
@@ -379,12 +378,6 @@ def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[
             for i, status in enumerate(result.status)
         ]
     return content
-
-
-def _largest(values: Array) -> list[float | None]:
-    if not len(values):
-        return [None] * values.shape[1]
-    return [float(v) for v in np.abs(values).max(axis=0)]
 
 
 def spread(values: Array) -> dict[str, float | None]:

@@ -26,6 +26,7 @@ from elastocal.importing.joining import (
     PooledRecords,
     groups_alike,
     join,
+    joint_stems,
     pooled,
     with_joints,
 )
@@ -84,10 +85,9 @@ def forces_of(
         )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in (loads or {}).items():
-        down = stated.mass_kg * GRAVITY if isinstance(stated, LoadStatesTable) else 0.0
-        known[name] = np.array(
-            [0.0, 0.0, -down] if isinstance(stated, LoadStatesTable) else list(stated), dtype=float
-        ) + 0.0  # no -0.0  # fmt: skip
+        if isinstance(stated, LoadStatesTable):
+            stated = np.array([0.0, 0.0, -stated.mass_kg * GRAVITY])
+        known[name] = stated + 0.0  # no -0.0
     for i, name in enumerate(named):
         if name not in known:
             raise InputError(
@@ -132,21 +132,20 @@ def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joine
     settings = mapping.join or JoinTable()
     rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
     numbers, units = _numbers(points, log, joined, rows)
-    n_joints = sum(1 for stem in numbers if stem[0] == "q" and stem[1:].isdigit())
-    if not n_joints:
+    stems = joint_stems(numbers)
+    if not stems:
         raise InputError(
             f"{where}: no joint values; map q1_deg … in [source.columns], or add a [[source]] with "
             'role = "joints"'
         )
     kinds = tuple(
-        "revolute" if "angle" in quantities(units[f"q{j + 1}"]) else "prismatic"
-        for j in range(n_joints)
+        "revolute" if "angle" in quantities(units[stem]) else "prismatic" for stem in stems
     )
     forces = forces_of(where, points, mapping.loads)
     if forces is not None:
         for k, axis in enumerate("xyz"):
             numbers[f"force_{axis}"], units[f"force_{axis}"] = forces[rows, k], "N"
-    q = np.column_stack([numbers[f"q{j + 1}"] for j in range(n_joints)])
+    q = np.column_stack([numbers[stem] for stem in stems])
     spread = (log or points).spread(
         settings.same_pose_deg or SAME_DEG, settings.same_pose_mm or SAME_MM
     )
@@ -606,10 +605,9 @@ def import_files(
         found = with_labels(where, read_records(where, path, source, units), source.names)
         spherical = spherical or is_spherical(found)
         found = with_positions(found, clockwise=source.azimuth == "clockwise")
-        has_joints = any(stem[0] == "q" and stem[1:].isdigit() for stem in found.numbers)
         role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
                                else "joints")  # fmt: skip
-        if role in ("joints", "both") and has_joints:
+        if role in ("joints", "both") and joint_stems(found.numbers):
             found = with_joints(where, found, table.joints, names)
         records["joints" if role == "joints" else "points"].append(found)
         understood.append(found.understood)
@@ -647,19 +645,14 @@ def _assigned(
     """
     if not files:
         raise InputError("no files to import; name the tracker's export and the joint log")
-    observed: set[Path] = set()
-    for path in files:
-        if path in observed:
-            raise InputError(f"{path}: named twice; name each file once")
-        observed.add(path)
     chosen: dict[int, SourceTable] = {}
     for i, path in enumerate(files):
-        for source in sources:
-            if source.files and any(
-                fnmatchcase(path.name, p) or fnmatchcase(str(path), p) for p in source.files
-            ):
+        if path in files[:i]:
+            raise InputError(f"{path}: named twice; name each file once")
+        names = path.name, str(path)
+        for source in reversed(sources):
+            if any(fnmatchcase(name, p) for p in source.files or () for name in names):
                 chosen[i] = source
-                break
     rest = [i for i in range(len(files)) if i not in chosen]
     for source in sources:
         if source.files and source not in chosen.values():

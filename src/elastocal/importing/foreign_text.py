@@ -90,14 +90,11 @@ def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
         wide = _wide(data)
         if wide:
             return decoded(source, data, SAVE_AS, wide, "UTF-16"), "UTF-16"
-        try:
-            return data.decode("utf-8"), "ASCII" if data.isascii() else "UTF-8"
-        except UnicodeDecodeError:
-            pass
-        try:
-            return data.decode("cp1252"), "Windows-1252"
-        except UnicodeDecodeError:
-            return data.decode("latin-1"), "Latin-1"
+        plain = "ASCII" if data.isascii() else "UTF-8"
+        for codec, name in (("utf-8", plain), ("cp1252", "Windows-1252")):
+            with suppress(UnicodeDecodeError):
+                return data.decode(codec), name
+        return data.decode("latin-1"), "Latin-1"
     codec = {"utf-8": "utf-8-sig"}.get(encoding, encoding)
     if encoding == "utf-16" and not data.startswith(codecs.BOM_UTF16):
         codec = _wide(data) or "utf-16-le"
@@ -108,10 +105,9 @@ def _wide(data: bytes) -> str | None:
     """UTF-16 without a byte order mark shows by zeros at every other place."""
     start = data[:4000]
     even, odd = start[0::2].count(0), start[1::2].count(0)
-    if odd > 0.4 * len(start) / 2 and even < odd / 4:
-        return "utf-16-le"
-    if even > 0.4 * len(start) / 2 and odd < even / 4:
-        return "utf-16-be"
+    for codec, many, few in (("utf-16-le", odd, even), ("utf-16-be", even, odd)):
+        if many > 0.4 * len(start) / 2 and few < many / 4:
+            return codec
     return None
 
 
@@ -381,16 +377,12 @@ class Clock:
 
     def seconds(self, text: str) -> float:
         """Seconds of one text.  Raises ValueError where no format fits."""
-        if self.chosen is None:
-            for candidate in (*self.formats, ISO):
-                try:
-                    value = _moment(text, candidate)
-                except ValueError:
-                    continue
+        for candidate in (self.chosen,) if self.chosen else (*self.formats, ISO):
+            with suppress(ValueError):
+                value = _moment(text, candidate)
                 self.chosen = candidate
                 return value
-            raise ValueError(text)
-        return _moment(text, self.chosen)
+        raise ValueError(text)
 
     def complaint(self, where: str, text: str) -> InputError:
         """What to say of a text that `seconds` did not take."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,14 +74,14 @@ def with_joints(
     return replace(records, numbers=numbers, units=own)
 
 
-def joint_stems(numbers: Sequence[str]) -> list[str]:
+def joint_stems(numbers: Iterable[str]) -> list[str]:
     """q1, q2 … among the columns, in order."""
     found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
     return sorted(found, key=lambda stem: int(stem[1:]))
 
 
 def _stems(records: Records) -> list[str]:
-    stems = joint_stems(list(records.numbers))
+    stems = joint_stems(records.numbers)
     wrong = [stem for i, stem in enumerate(stems, 1) if stem != f"q{i}"]
     if wrong:
         raise InputError(
@@ -181,14 +181,14 @@ class PooledRecords:
     @property
     def q(self) -> Array:
         """(n, joints) joint values in the units of their columns."""
-        stems = joint_stems(list(self.numbers))
+        stems = joint_stems(self.numbers)
         return (
             np.column_stack([self.numbers[s] for s in stems]) if stems else np.zeros((len(self), 0))
         )
 
     @property
     def q_units(self) -> tuple[str, ...]:
-        return tuple(self.units[stem] for stem in joint_stems(list(self.numbers)))
+        return tuple(self.units[stem] for stem in joint_stems(self.numbers))
 
     def spread(self, deg: float, mm: float) -> Array:
         """(joints,) these tolerances in the unit of each joint."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -277,12 +277,22 @@ _QUANTITIES = _quantities()
 
 @dataclass(frozen=True)
 class ColumnKey:
-    """A column to fill: `stem` ("x", "q3", "q#"), `unit` ("" where there is none, or "auto")."""
+    """A column to fill: `stem` ("x", "q3", "q#"), `unit` ("" where there is none, or "auto").
+
+    `at`: where it stands in the file; `required`: it is of [source.columns], not [source.optional].
+    """
 
     key: str
     stem: str
     unit: str
     is_text: bool = False
+    at: Where = ""
+    required: bool = True
+
+    @property
+    def parts(self) -> list[str | int]:
+        """The places in the file; several only for texts."""
+        return list(self.at) if isinstance(self.at, list) else [self.at]
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -296,7 +306,8 @@ class ColumnKey:
 
     def numbered(self, i: int) -> ColumnKey:
         """The column of joint i (from 1) of a template."""
-        return replace(self, key=self.key.replace("#", str(i)), stem=f"{self.stem[:-1]}{i}")
+        key, stem = self.key.replace("#", str(i)), f"{self.stem[:-1]}{i}"
+        return replace(self, key=key, stem=stem, required=self.required and i == 1)
 
 
 def column_key(where: str, key: str) -> ColumnKey:
@@ -353,26 +364,20 @@ class FileColumn:
     unit: str
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """The keys of [source.columns] (required) and [source.optional]."""
+def wanted(
+    where: str, required: Mapping[str, Where], optional: Mapping[str, Where]
+) -> tuple[ColumnKey, ...]:
+    """The keys of [source.columns] (required) and [source.optional], checked.
 
-    required: tuple[tuple[ColumnKey, Where], ...]
-    optional: tuple[tuple[ColumnKey, Where], ...]
-
-    @property
-    def by_name(self) -> bool:
-        """Whether any required column is looked for by its name in a header."""
-        return any(isinstance(part, str) for _, at in self.required for part in _parts(at))
-
-
-def wanted(where: str, required: Mapping[str, Where], optional: Mapping[str, Where]) -> Wanted:
-    """The keys checked.  Raises InputError for unknown columns and columns given twice."""
+    Raises InputError for unknown columns and columns given twice.
+    """
     observed: dict[str, str] = {}
-    result: list[list[tuple[ColumnKey, Where]]] = []
+    result: list[ColumnKey] = []
     for part in (required, optional):
-        targets = [(column_key(where, key), at) for key, at in part.items()]
-        for target, at in targets:
+        for target in [
+            replace(column_key(where, name), at=at, required=part is required)
+            for name, at in part.items()
+        ]:
             # Seconds and nanoseconds of one clock stand in two columns, and are added.
             name = target.key if target.stem == "time" else target.stem
             if name in observed:
@@ -380,32 +385,40 @@ def wanted(where: str, required: Mapping[str, Where], optional: Mapping[str, Whe
                     f"{where}: {observed[name]} and {target.key} fill the same column; keep one"
                 )
             observed[name] = target.key
-            if target.is_template and any(isinstance(p, int) for p in _parts(at)):
+            if target.is_template and any(isinstance(p, int) for p in target.parts):
                 raise InputError(
                     f"{where}: {target.key} takes a name with # or #0 in it, as in "
-                    f'"position_#0"; write {target.numbered(1).key} = {at}, … for columns by number'
+                    f'"position_#0"; write {target.numbered(1).key} = {target.at}, … for columns '
+                    "by number"
                 )
-            if isinstance(at, list) and not target.is_text:
+            if isinstance(target.at, list) and not target.is_text:
                 raise InputError(
                     f"{where}: {target.key} takes one column; only texts such as name are joined "
                     "from several"
                 )
-        result.append(targets)
-    return Wanted(tuple(result[0]), tuple(result[1]))
+            result.append(target)
+    return tuple(result)
 
 
-def lacking(asked: Wanted, cells: Sequence[str]) -> list[str]:
+def by_name(asked: Sequence[ColumnKey]) -> bool:
+    """Whether any required column is looked for by its name in a header."""
+    return any(isinstance(part, str) for c in asked if c.required for part in c.parts)
+
+
+def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
     """The required columns asked for by name that a line does not name, as the mapping has them."""
     absent = []
-    for target, at in asked.required:
+    for target in (c for c in asked if c.required):
         first = target.numbered(1) if target.is_template else target
-        for part in _parts(at):
+        for part in target.parts:
             if isinstance(part, str) and not _find(_named(part, first), cells):
                 absent.append(f"{target.key} = {quoted(part)}")
     return absent
 
 
-def no_header(source: str, asked: Wanted, rows: Sequence[tuple[int, list[str]]]) -> InputError:
+def no_header(
+    source: str, asked: Sequence[ColumnKey], rows: Sequence[tuple[int, list[str]]]
+) -> InputError:
     """What to say where no line is the header: which line comes nearest, and what it lacks."""
     number, cells = min(rows, key=lambda row: len(lacking(asked, row[1])))
     return InputError(
@@ -416,8 +429,8 @@ def no_header(source: str, asked: Wanted, rows: Sequence[tuple[int, list[str]]])
 
 
 def resolve(
-    source: str, asked: Wanted, header: Sequence[str], width: int, units: UnitsTable,
-    hint: str | None,
+    source: str, asked: Sequence[ColumnKey], header: Sequence[str], width: int,
+    units: UnitsTable, hint: str | None,
 ) -> tuple[FileColumn, ...]:  # fmt: skip
     """Where each column stands, and in which unit.
 
@@ -427,42 +440,28 @@ def resolve(
     Raises InputError for names and numbers that the file does not have, names that stand for
     several columns, and units that contradict the header.
     """
-    columns = [
-        column
-        for part, required in ((asked.required, True), (asked.optional, False))
-        for target, at in part
-        for column in _columns(source, target, at, header, width, required)
-    ]
+    columns = [c for target in asked for c in _columns(source, target, header, width)]
     return tuple(_with_unit(source, column, units, hint) for column in columns)
 
 
-def _parts(at: Where) -> list[str | int]:
-    return list(at) if isinstance(at, list) else [at]
-
-
 def _columns(
-    source: str, target: ColumnKey, at: Where, header: Sequence[str], width: int, required: bool
-) -> list[FileColumn]:
-    if not target.is_template:
-        found = _column(source, target, at, header, width, required)
-        return [] if found is None else [found]
-    columns = []
-    for i in range(1, MOST_JOINTS + 1):
-        found = _column(source, target.numbered(i), at, header, width, required and i == 1)
+    source: str, target: ColumnKey, header: Sequence[str], width: int
+) -> Iterator[FileColumn]:
+    """The column of a key where the file has it; of a template those of all joints."""
+    templates = (target.numbered(i) for i in range(1, MOST_JOINTS + 1))
+    for one in templates if target.is_template else (target,):
+        found = _column(source, one, header, width)
         if found is None:
-            break
-        columns.append(found)
-    return columns
+            return
+        yield found
 
 
-def _column(
-    source: str, target: ColumnKey, at: Where, header: Sequence[str], width: int, required: bool
-) -> FileColumn | None:
+def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -> FileColumn | None:
     index, names = [], []
-    for part in _parts(at):
+    for part in target.parts:
         if isinstance(part, int):
             if part > width:
-                if not required:
+                if not target.required:
                     return None
                 raise InputError(
                     f"{source}: {target.key} is column {part}, but the first reading has {width} "
@@ -474,7 +473,7 @@ def _column(
         sought = _named(part, target)
         hits = _find(sought, header)
         if not hits:
-            if not required:
+            if not target.required:
                 return None
             raise InputError(
                 f"{source}: no column {' or '.join(map(quoted, sought))} for {target.key}"

@@ -23,12 +23,13 @@ from elastocal.importing.foreign_text import (
     unit_in_comments,
 )
 from elastocal.importing.mapping_file import (
+    ColumnKey,
     FileColumn,
     NamesTable,
     SourceTable,
     TextSourceKeys,
     UnitsTable,
-    Wanted,
+    by_name,
     lacking,
     no_header,
     resolve,
@@ -137,12 +138,13 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     return reader.records(understood, source)
 
 
-def _table(text: Text, settings: TextSourceKeys, asked: Wanted) -> Rows:
+def _table(text: Text, settings: TextSourceKeys, asked: Sequence[ColumnKey]) -> Rows:
     kind = settings.format or "table"
     if kind != "table":
         return (krl_rows if kind == "krl" else rapid_rows)(text)
     guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
-    places = [at for t, at in asked.required if not t.is_text and isinstance(at, int)]
+    named = by_name(asked)
+    places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
 
     def is_header(cells: Sequence[str]) -> bool:
         return not lacking(asked, cells)
@@ -150,8 +152,8 @@ def _table(text: Text, settings: TextSourceKeys, asked: Wanted) -> Rows:
     def is_data(cells: Sequence[str]) -> bool:
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
 
-    table = table_rows(text, settings, is_header if asked.by_name else None, is_data)
-    if asked.by_name and not table.header_line:
+    table = table_rows(text, settings, is_header if named else None, is_data)
+    if named and not table.header_line:
         raise no_header(text.source, asked, table.rows[:SAMPLE])
     return table
 
