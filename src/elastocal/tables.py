@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+# The lines of a CSV file: bounded, checked and counted before anything is parsed.
+
 MAX_LINE = 64 * 1024
 MAX_BLANK_LINES = 10_000
 MAX_ROWS = 5_000_000
@@ -238,9 +240,6 @@ def _problem(cell: str, comma_allowed: bool) -> str | None:
     if THOUSANDS.fullmatch(cell):
         return f"{quoted(cell)} has thousands separators; write it without them"
     return f"{quoted(cell)} is not a number; correct it"
-
-
-# What a table may hold
 
 
 NO_UNIT = ("",)

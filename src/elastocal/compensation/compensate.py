@@ -35,8 +35,6 @@ from elastocal.tables import column, csv_text
 from elastocal.text import plain
 from elastocal.units import Array
 
-# From targets to commands: nominal joints, their error, the command that undoes it.
-
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
 

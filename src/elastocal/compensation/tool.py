@@ -1,4 +1,4 @@
-"""The tool: which point of it shall be where, and where the calibrated arm puts it."""
+"""The tool: which point of it is to be where, and where the calibrated arm puts it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,6 @@ from elastocal.model.symbolic import SymbolicArm
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
-# Which point of the tool shall be at the target.
-
 
 @dataclass(frozen=True)
 class ToolPoint:
@@ -50,7 +48,7 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
         if len(markers) == 1:
             return _marker(cell, next(iter(markers)))
         raise InputError(
-            f"{cell.path or cell.name}: which point of the tool shall be at the targets? Give "
+            f"{cell.path or cell.name}: which point of the tool is to be at the targets? Give "
             f"{option('point')} with a marker ({listed(markers)}) or with x,y,z in m in the flange "
             "frame, or state [tool] load_point_m"
         )
@@ -85,8 +83,6 @@ def numbers(option: str, text: str, counts: tuple[int, ...], what: str) -> Array
     return values
 
 
-# Where the tool shall be: targets from a table or from the command line.
-
 Frame = Literal["base", "tracker"]
 FRAMES: tuple[Frame, ...] = ("base", "tracker")
 
@@ -97,7 +93,7 @@ class Targets:
 
     `position` (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`;
     rotation None: any.  `q` (n, joints) is the nominal command, None where it is to be found;
-    without a position the tool shall be where the nominal arm has it at q.
+    without a position the tool is to be where the nominal arm has it at q.
     """
 
     table: Measurements
@@ -193,9 +189,6 @@ def targets_at(
     return Targets(table, frame, position, rotation, q)
 
 
-# Between the levels of a joint whose compliance is known at levels alone.
-
-
 def share_of_levels(angle: Array, levels: Array) -> Array:
     """Shares (n, levels) of each level's compliance at joint values `angle` (n,), sum 1.
 
@@ -214,15 +207,12 @@ def share_of_levels(angle: Array, levels: Array) -> Array:
     return share
 
 
-# An expression of the elastic arm and its total derivative, through the equilibrium.
-
-
 class Total:
     """y(inputs, X, extra; θ) and dy/dz at the static equilibrium F(inputs, X; θ) = 0.
 
     dy/dz = ∂y/∂z − ∂y/∂θ F_θ⁻¹ ∂F/∂z, by the adjoint λ = F_θ⁻ᵀ (∂y/∂θ)ᵀ as the partial
-    derivative of y − λᵀF.  `y` (m, 1) and `z` (k, 1) are expressions of `arm`, whose tapes follow
-    the backend; `extra` are further symbols in y.  Where the model is linear (eq. 3) or rigid,
+    derivative of y − λᵀF.  `y` (m, 1) and `z` (k, 1) are expressions of `arm`, compiled for
+    its backend; `extra` are further symbols in y.  Where the model is linear (eq. 3) or rigid,
     y is explicit and nothing is solved.
     """
 
@@ -233,12 +223,12 @@ class Total:
         if not arm.implicit:
             y = arm.explicit(y, 0)
             self._slopes = None
-            self._tape = BatchFunction(inputs, [y, ca.jacobian(y, z)], arm.backend)
+            self._function = BatchFunction(inputs, [y, ca.jacobian(y, z)], arm.backend)
             return
         adjoint = ca.SX.sym("adjoint", y.shape[0], theta.shape[0])
         lagrangian = y - adjoint @ arm.residual
         self._slopes = BatchFunction(inputs, [ca.jacobian(y, theta)], arm.backend)
-        self._tape = BatchFunction(
+        self._function = BatchFunction(
             [*inputs, ca.vec(adjoint.T)], [y, ca.jacobian(lagrangian, z)], arm.backend
         )
 
@@ -248,19 +238,17 @@ class Total:
         """y (n, m) and dy/dz (n, m, k) of every row; y is NaN where there is no equilibrium."""
         springs = self._arm.arm.theta.shape[0]
         if self._slopes is None:
-            y, slope = self._tape(*inputs, *extra, x, np.zeros((len(inputs[0]), springs)))
+            y, slope = self._function(*inputs, *extra, x, np.zeros((len(inputs[0]), springs)))
             return y[..., 0], slope
         theta, F_theta = self._arm.equilibrium.solve(inputs, x)
         y_theta = self._slopes(*inputs, *extra, x, theta)[0]
         y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
         adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
         adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
-        y, slope = self._tape(*inputs, *extra, x, theta, adjoint)
+        y, slope = self._function(*inputs, *extra, x, theta, adjoint)
         y[~np.isfinite(theta).all(axis=1)] = np.nan
         return y[..., 0], slope
 
-
-# Where the calibrated arm puts its tool, as a function of the commanded joints.
 
 LEVEL = "level:"
 

@@ -184,18 +184,17 @@ def dh_lines(robot: Robot, pieces: ExportNumbers, convention: Convention) -> lis
     first, *joints = [row.near(old) for row, old in zip(rows, ideal, strict=True)]
     end, last = split(F)
     flange = [end, DhRow(theta=math.atan2(last[1, 0], last[0, 0]), d=float(last[2, 3]))]
-    # (what moves, L and X) in the order of the chain
-    whole: list[tuple[str, Joint | None, DhRow]] = [("base", None, first)]
-    whole += [(j.name, j, row) for j, row in zip(nominal.joints, joints, strict=True)]
-    whole += [(f"flange{k}", None, row) for k, row in enumerate(flange, start=1)]
+    lines = [
+        Line("base", None, first),
+        *(Line(j.name, j, row) for j, row in zip(nominal.joints, joints, strict=True)),
+        *(Line(f"flange{k}", None, row) for k, row in enumerate(flange, start=1)),
+    ]
     if convention == "modified":
-        before = [DhRow(), *(row for _, _, row in whole[:-1])]
-        whole = [
-            (name, joint, replace(b, theta=row.theta, d=row.d))
-            for (name, joint, row), b in zip(whole, before, strict=True)
-        ]
-    cleaned = [Line(name, joint, row.near(DhRow(), ZERO)) for name, joint, row in whole]
-    return [line for line in cleaned if line.joint is not None or line.row != DhRow()]
+        before = [DhRow(), *(line.row for line in lines[:-1])]
+        pairs = zip(lines, before, strict=True)
+        lines = [replace(k, row=replace(b, theta=k.row.theta, d=k.row.d)) for k, b in pairs]
+    lines = [replace(line, row=line.row.near(DhRow(), ZERO)) for line in lines]
+    return [line for line in lines if line.joint is not None or line.row != DhRow()]
 
 
 FORMULA = {

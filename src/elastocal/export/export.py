@@ -289,8 +289,6 @@ def _accepted(distance: float, largest: float) -> float:
     return distance
 
 
-# A calibrated arm written in one of the formats, checked, and with what that costs.
-
 SCHEMA = "elastocal/export/1"
 POSES_AT_REST = 20
 

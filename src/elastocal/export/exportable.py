@@ -26,8 +26,6 @@ from elastocal.model.symbolic import SymbolicArm
 from elastocal.simulation.mujoco_arm import numbers
 from elastocal.units import Array
 
-# Rigid transforms as URDF writes them.
-
 
 def rpy(R: Array) -> tuple[float, float, float]:
     """Roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll), the URDF's convention.
@@ -134,19 +132,19 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         for name in chosen
         if name not in instrument
     }
-    whole = [name for name, needs in unstated.items() if not needs]
-    full = _part(calibrated, whole)
+    stated = [name for name, needs in unstated.items() if not needs]
+    full = _part(calibrated, stated)
     format: Format = "elastic" if elastic else "rigid"
     dropped = {}  # effects whose values no physical spring or body has, with the reason
     for name in full.effects if elastic else ():
         if reason := CATALOGUE[name].unphysical(full.values, full.model.chain, full.model.cell):
             dropped[name] = reason
     kept_names = [
-        name for name in whole if format in CATALOGUE[name].formats and name not in dropped
+        name for name in stated if format in CATALOGUE[name].formats and name not in dropped
     ]
     omissions = [
-        Omission(name, dropped.get(name, ""), _part(calibrated, set(whole) - {name}))
-        for name in whole
+        Omission(name, dropped.get(name, ""), _part(calibrated, set(stated) - {name}))
+        for name in stated
         if name not in kept_names
     ]
     omissions += [
@@ -154,7 +152,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         for name, needs in unstated.items()
         if needs
     ]
-    exported = full if len(kept_names) == len(whole) else _part(calibrated, kept_names)
+    exported = full if len(kept_names) == len(stated) else _part(calibrated, kept_names)
     if elastic:
         exported, changed = _as_springs(exported)
         omissions += [
@@ -331,9 +329,6 @@ def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple
     return tuple(bodies)
 
 
-# Inertia tensors of the bodies that each joint carries, from the robot's URDF.
-
-
 def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
     """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes.
 
@@ -343,12 +338,12 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
     import pinocchio as pin
 
     try:
-        whole = pin.buildModelFromXML(path.read_text(encoding="utf-8-sig"))
+        robot = pin.buildModelFromXML(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RuntimeError):
         return ()
     moving = {joint.name for joint in chain.joints}
-    held = [i for i in range(1, whole.njoints) if whole.names[i] not in moving]
-    model = pin.buildReducedModel(whole, held, pin.neutral(whole)) if held else whole
+    held = [i for i in range(1, robot.njoints) if robot.names[i] not in moving]
+    model = pin.buildReducedModel(robot, held, pin.neutral(robot)) if held else robot
     tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
     return tuple(tensors) if len(tensors) == chain.n_joints else ()
 

@@ -61,7 +61,7 @@ class UrdfText:
     def set_child(self, joint: str, link: str) -> None:
         """Let a joint carry another link."""
         tag = self.joints[joint].child
-        assert tag is not None, joint  # urdf_check has seen it
+        assert tag is not None, joint  # check_urdf refuses a joint without one
         self._set_attributes(tag, {"link": link})
 
     def append(self, text: str) -> None:

@@ -54,8 +54,6 @@ from elastocal.tables import Family, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, convert, quantities
 
-# Points and their joint values → the checked measurement table.
-
 GRAVITY = 9.80665  # m/s², standard
 UNLOADED = ("none", "unloaded", "0")
 
@@ -226,7 +224,7 @@ def _repeats(
 ) -> NDArray[np.int64]:
     stated = points.labels.get("repeat")
     count: dict[tuple, int] = {}
-    observed: dict[tuple, int] = {}
+    known: dict[tuple, int] = {}
     repeats = np.zeros(len(rows), dtype=np.int64)
     for k, (i, key) in enumerate(zip(rows, keys, strict=True)):
         if stated is None:
@@ -238,7 +236,7 @@ def _repeats(
             raise InputError(f"{points.where(int(i))}: repeat {quoted(text)} is no whole number; "
                              "correct the pattern or the column")  # fmt: skip
         repeats[k] = int(text)
-        first = observed.setdefault((*key, int(text)), k)
+        first = known.setdefault((*key, int(text)), k)
         if first != k:
             raise InputError(
                 f"{points.where(int(i))}: repeat {text} of configuration {key[0]}"

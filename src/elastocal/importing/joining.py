@@ -111,13 +111,13 @@ def _order(
                 'joint# = "name_#0" to [source.columns], or use order'
             )
         return None
-    observed = list(zip(*columns, strict=True))
-    wanted = joints.names or (model_names if set(model_names) <= set(observed[0]) else None)
+    found = list(zip(*columns, strict=True))
+    wanted = joints.names or (model_names if set(model_names) <= set(found[0]) else None)
     if not wanted:
         return None
     orders: dict[tuple[str, ...], list[int]] = {}
     rows = []
-    for i, names in enumerate(observed):
+    for i, names in enumerate(found):
         if names not in orders:
             absent = [name for name in wanted if name not in names]
             if absent:
@@ -445,11 +445,11 @@ def _visits(points: PooledRecords, chosen: IntArray, per_pose: int | None) -> In
     markers = [points.labels["marker"][i] for i in chosen] if "marker" in points.labels else []
     if len(set(markers)) < 2:
         return np.arange(n)
-    visit, observed, codes = 0, set[str](), []
+    visit, measured, codes = 0, set[str](), []
     for k, marker in enumerate(markers):
-        if marker in observed and marker != markers[k - 1]:
-            visit, observed = visit + 1, set()
-        observed.add(marker)
+        if marker in measured and marker != markers[k - 1]:
+            visit, measured = visit + 1, set()
+        measured.add(marker)
         codes.append(visit)
     return np.array(codes)
 

@@ -371,7 +371,7 @@ def wanted(
 
     Raises InputError for unknown columns and columns given twice.
     """
-    observed: dict[str, str] = {}
+    filled: dict[str, str] = {}
     result: list[ColumnKey] = []
     for part in (required, optional):
         for target in [
@@ -380,11 +380,11 @@ def wanted(
         ]:
             # Seconds and nanoseconds of one clock stand in two columns, and are added.
             name = target.key if target.stem == "time" else target.stem
-            if name in observed:
+            if name in filled:
                 raise InputError(
-                    f"{where}: {observed[name]} and {target.key} fill the same column; keep one"
+                    f"{where}: {filled[name]} and {target.key} fill the same column; keep one"
                 )
-            observed[name] = target.key
+            filled[name] = target.key
             if target.is_template and any(isinstance(p, int) for p in target.parts):
                 raise InputError(
                     f"{where}: {target.key} takes a name with # or #0 in it, as in "

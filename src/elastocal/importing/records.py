@@ -407,13 +407,13 @@ def _labels_of_names(
 
 def _taken(records: Records, keep: np.ndarray, reasons: tuple[tuple[int, str], ...]) -> Records:
     """The rows `keep`; the others are listed as passed over."""
-    observed = records.understood
-    ignored = tuple(sorted([*observed.ignored, *reasons]))
+    before = records.understood
+    ignored = tuple(sorted([*before.ignored, *reasons]))
     return replace(
         records,
         line=records.line[keep],
         numbers={stem: values[keep] for stem, values in records.numbers.items()},
         texts={stem: [texts[i] for i in keep] for stem, texts in records.texts.items()},
         time=None if records.time is None else records.time[keep],
-        understood=replace(observed, rows=len(keep), ignored=ignored),
+        understood=replace(before, rows=len(keep), ignored=ignored),
     )

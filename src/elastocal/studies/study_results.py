@@ -128,8 +128,8 @@ class StudyResults:
             tables.append(table)
         if not tables:
             return None
-        whole = pa.concat_tables(tables)
-        frame = whole.select(["task", "task_hash", "task_row"]).to_pandas()
+        lines = pa.concat_tables(tables)
+        frame = lines.select(["task", "task_hash", "task_row"]).to_pandas()
         twice = frame.duplicated(["task", "task_row"])
         hashes = frame.groupby("task")["task_hash"].nunique()
         alone = frame["task_row"].isna() & frame["task"].duplicated(keep=False)
@@ -139,7 +139,7 @@ class StudyResults:
             f"{self.folder}: task {min(wrong, default=0)} has more than one result; parts of two "
             f"runs were put together: remove those of one, or run with {option('restart', True)}",
         )
-        return whole
+        return lines
 
     def drop_failed(self) -> None:
         """Remove the lines of failed tasks, part by part."""
@@ -296,11 +296,11 @@ def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     elastocal (version), task_error.
     Raises InputError where there are none, or a result is there twice.
     """
-    whole = StudyResults(Path(folder)).read()
-    if whole is None:
+    lines = StudyResults(Path(folder)).read()
+    if lines is None:
         raise InputError(f"{folder}: holds no results; run elastocal study first")
-    frame = whole.to_pandas()
-    for field in filter(_is_json, whole.schema):
+    frame = lines.to_pandas()
+    for field in filter(_is_json, lines.schema):
         frame[field.name] = frame[field.name].map(json.loads)
     wanted = frame["task_error"].notna() if failed else frame["task_row"].notna()
     frame = frame[wanted].sort_values(["task", "task_row"], ignore_index=True)

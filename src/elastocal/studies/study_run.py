@@ -412,11 +412,11 @@ def _known(study: Study, results: StudyResults) -> dict[int, bool]:
 
     Raises InputError where a task there is not the study's task of that index now.
     """
-    whole = results.read(study)
-    if whole is None:
+    found = results.read(study)
+    if found is None:
         return {}
     names = ("task", "task_hash", "task_error")
-    lines = sorted(zip(*(whole[name].to_pylist() for name in names), strict=True))
+    lines = sorted(zip(*(found[name].to_pylist() for name in names), strict=True))
     lines = [line for line in lines if line[0] < len(study.tasks)]
     for index, hashed, _ in lines:
         if study.tasks[index].hash != hashed:
