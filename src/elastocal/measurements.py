@@ -415,8 +415,12 @@ def write_measurements(
     q1_m.  Raises InputError where the folder is missing or not writable, and for values or
     labels that no table can hold (NaN, infinite, control characters).
     """
-    for names in (measurements.configuration_labels, measurements.marker_names):
-        _check_labels(names)
+    for name in (*measurements.configuration_labels, *measurements.marker_names):
+        if not is_label(name):
+            raise InputError(
+                f"label {quoted(name)} cannot stand in a table; use one line without blanks at "
+                "its ends"
+            )
     kinds = joint_kinds or ("revolute",) * measurements.q.shape[1]
     columns = measurements.columns(kinds)
     meaning = {
@@ -438,15 +442,6 @@ def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
     for start in range(0, n, AT_A_TIME):
         some = slice(start, start + AT_A_TIME)
         yield from zip(*(values[some].tolist() for values in columns.values()), strict=True)
-
-
-def _check_labels(names: Sequence[str]) -> None:
-    for name in names:
-        if not is_label(name):
-            raise InputError(
-                f"label {quoted(name)} cannot stand in a table; use one line without blanks at "
-                "its ends"
-            )
 
 
 # Its noise: what the stated noise of the tracker means for a reading

@@ -201,8 +201,8 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     if negative and only in (None, NEGATIVE):
         values |= dict.fromkeys(negative, 0.0)
         changed[NEGATIVE] = [f"rigid, as no spring yields so: {', '.join(negative)}"]
-    told = [(effect, "; ".join(sentences)) for effect, sentences in changed.items()]
-    return Valued(model, np.array([values[name] for name in model.names])), told
+    omitted = [(effect, "; ".join(sentences)) for effect, sentences in changed.items()]
+    return Valued(model, np.array([values[name] for name in model.names])), omitted
 
 
 # The numbers of an exported model: joint placements, markers, springs, masses.

@@ -32,37 +32,29 @@ DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')"""
 
 
 @dataclass
-class JointTags:
-    """Offsets of a joint's start tags in the UTF-8 bytes of the file; None where it has none."""
-
-    start: int
-    origin: int | None = None
-    child: int | None = None
-
-
-@dataclass
 class UrdfText:
-    """The text of a URDF and the edits to make; offsets count bytes of `data`, which is UTF-8."""
+    """The text of a URDF and the edits to make; offsets count bytes of `data`, which is UTF-8.
+
+    `joints`: joint → the offset of its start tag ("joint"), and of the first of each tag in it.
+    """
 
     data: bytes
-    joints: dict[str, JointTags]
+    joints: dict[str, dict[str, int]]
     end: int  # of the robot's content: where its end tag starts
     edits: list[tuple[int, int, bytes]] = field(default_factory=list)
 
     def set_origin(self, joint: str, attributes: Mapping[str, str]) -> None:
         """Replace xyz and rpy of a joint's <origin>, or give it one."""
         tags = self.joints[joint]
-        if tags.origin is not None:
-            self._set_attributes(tags.origin, attributes)
+        if "origin" in tags:
+            self._set_attributes(tags["origin"], attributes)
             return
-        after = _tag_end(self.data, tags.start)
+        after = _tag_end(self.data, tags["joint"])
         self.edits.append((after, after, element("origin", attributes).encode()))
 
     def set_child(self, joint: str, link: str) -> None:
         """Let a joint carry another link."""
-        tag = self.joints[joint].child
-        assert tag is not None, joint  # check_urdf refuses a joint without one
-        self._set_attributes(tag, {"link": link})
+        self._set_attributes(self.joints[joint]["child"], {"link": link})
 
     def append(self, text: str) -> None:
         """Add elements at the end of the robot."""
@@ -105,19 +97,16 @@ def read_urdf_text(path: Path) -> UrdfText:
     found = UrdfText(data, {}, len(data))
     parser = expat.ParserCreate()
     stack: list[str] = []
-    current: list[JointTags] = []
+    tags: dict[str, int] = {}
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal tags
         local, at = tag.rpartition(":")[2], parser.CurrentByteIndex
         stack.append(local)
         if len(stack) == 2 and local == "joint":
-            current[:] = [JointTags(at)]
-            found.joints[attributes["name"].strip()] = current[0]
+            tags = found.joints[attributes["name"].strip()] = {"joint": at}
         elif len(stack) == 3 and stack[1] == "joint":
-            if local == "origin" and current[0].origin is None:
-                current[0].origin = at
-            elif local == "child" and current[0].child is None:
-                current[0].child = at
+            tags.setdefault(local, at)
 
     def end(tag: str) -> None:
         stack.pop()

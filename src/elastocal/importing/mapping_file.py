@@ -29,6 +29,7 @@ from elastocal.config import (
 )
 from elastocal.errors import InputError, option
 from elastocal.measurements import families
+from elastocal.tables import column
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
@@ -329,7 +330,8 @@ def column_key(where: str, key: str) -> ColumnKey:
             stem, _, unit = key.rpartition("_")
         general = stem
     if general not in _QUANTITIES:
-        valid = [*TEXTS, *_ways()]
+        ways = [column(stem, next(iter(FACTORS[q[0]]))) for stem, q in _QUANTITIES.items()]
+        valid = [*TEXTS, *ways]
         raise InputError(
             f"{where}: unknown column {quoted(key)}{did_you_mean(key, valid)}; columns are "
             f"{listed(valid, 40)}"
@@ -338,17 +340,10 @@ def column_key(where: str, key: str) -> ColumnKey:
     if unit == AUTO and units != [""]:
         return ColumnKey(key, stem, AUTO)
     if unit not in units:
-        ways = listed(f"{stem}_{u}" if u else stem for u in units)
+        ways = [column(stem, u) for u in units]
         what = f"the unit {unit} is not one of its" if unit else "has no unit"
-        raise InputError(f"{where}: column {quoted(key)}: {what}; write {ways}")
+        raise InputError(f"{where}: column {quoted(key)}: {what}; write {listed(ways)}")
     return ColumnKey(key, stem, unit)
-
-
-def _ways() -> list[str]:
-    return [
-        f"{stem}_{next(iter(FACTORS[q[0]]))}".rstrip("_") if q[0] != "number" else stem
-        for stem, q in _QUANTITIES.items()
-    ]
 
 
 MOST_JOINTS = 64
