@@ -101,8 +101,7 @@ class _Walk:
             q = q[np.argmin(np.linalg.norm(q - near, axis=1))][None]
             if self.chain.n_joints > self._task.equations:
                 q = self._task.nearest(q, np.array([i]), near)
-            self._keep(i, q, np.ones(1, dtype=bool))
-            return
+            good = np.ones(1, dtype=bool)
         self._keep(i, q[:1], good[:1])
 
     def _many(self, i: int, near: Array | None) -> Postures:

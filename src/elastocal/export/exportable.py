@@ -93,15 +93,31 @@ class Valued:
 
 
 @dataclass(frozen=True)
+class Difference:
+    """Distance between two predictions over the poses, in m: of the flange and of the markers."""
+
+    flange_rms: float
+    flange_max: float
+    marker_rms: float
+    marker_max: float
+
+    def to_json(self) -> dict[str, float]:
+        """The four numbers in µm."""
+        return {f"{name}_um": value * 1e6 for name, value in vars(self).items()}
+
+
+@dataclass(frozen=True)
 class Omission:
     """One thing that the file cannot hold; `without` is the full model without it.
 
-    `without` is None where its cost cannot be stated, and `note` says why.
+    `without` is None where its cost cannot be stated, and `note` says why.  `difference` is what
+    leaving it out changes, once that is found.
     """
 
     effect: str
     note: str
     without: Valued | None
+    difference: Difference | None = None
 
 
 @dataclass(frozen=True)
@@ -352,29 +368,6 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
 
 
 @dataclass(frozen=True)
-class Difference:
-    """Distance between two predictions over the poses, in m: of the flange and of the markers."""
-
-    flange_rms: float
-    flange_max: float
-    marker_rms: float
-    marker_max: float
-
-    def to_json(self) -> dict[str, float]:
-        """The four numbers in µm."""
-        return {f"{name}_um": value * 1e6 for name, value in vars(self).items()}
-
-
-@dataclass(frozen=True)
-class EffectCost:
-    """What leaving one effect out changes; `difference` is None where that cannot be said."""
-
-    effect: str
-    note: str
-    difference: Difference | None
-
-
-@dataclass(frozen=True)
 class Cost:
     """`total` between the full model and the file's, `effects` one by one, over `poses`.
 
@@ -383,7 +376,7 @@ class Cost:
     """
 
     total: Difference
-    effects: tuple[EffectCost, ...]
+    effects: tuple[Omission, ...]
     poses: int
     unsettled: int
     force: Array
@@ -409,11 +402,11 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
         )
     effects = []
     for omission in kept.omissions:
-        difference = None
         if omission.without is not None:
             without = _positions(omission.without, table, markers)
             difference = _difference(full[settled], without[settled])
-        effects.append(EffectCost(omission.effect, omission.note, difference))
+            omission = replace(omission, difference=difference)
+        effects.append(omission)
     effects.sort(key=lambda e: -np.inf if e.difference is None else -e.difference.marker_rms)
     return Cost(
         total=_difference(full[settled], exported[settled]),
