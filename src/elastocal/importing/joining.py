@@ -182,9 +182,7 @@ class PooledRecords:
     def q(self) -> Array:
         """(n, joints) joint values in the units of their columns."""
         stems = joint_stems(self.numbers)
-        return (
-            np.column_stack([self.numbers[s] for s in stems]) if stems else np.zeros((len(self), 0))
-        )
+        return np.column_stack([np.zeros((len(self), 0)), *(self.numbers[s] for s in stems)])
 
     @property
     def q_units(self) -> tuple[str, ...]:
@@ -213,7 +211,8 @@ def pooled(records: Sequence[Records]) -> PooledRecords:
         _same("times", first, other, {"time"} if first.time is not None else set(),
               {"time"} if other.time is not None else set())  # fmt: skip
     units = {}
-    for stem, unit in first.units.items():
+    for stem in first.numbers:
+        unit = first.units[stem]
         alike = all(r.units[stem] == unit for r in records)
         units[stem] = unit if alike else DEFAULT[quantities(unit)[0]]
     numbers = {
@@ -576,8 +575,7 @@ def _by_standstill(
         )
     first = np.array([clock[s.first] for s in found])
     last = np.array([clock[s.last] for s in found])
-    # 0 within a dwell, else the time to its nearer end: (points, dwells) at most a few
-    # thousand each.
+    # 0 within a dwell, else the time to its nearer end.
     best = np.array([np.argmin(np.maximum(np.maximum(first - t, t - last), 0.0)) for t in at])
     apart = np.maximum(np.maximum(first[best] - at, at - last[best]), 0.0)
     good = apart <= tolerance

@@ -223,18 +223,15 @@ class _Reader:
         texts = {c.target.stem: t for c, t in zip(self.textual, self.texts, strict=True)}
         written = texts.pop("time_text", None)
         if written is not None and time is None:
-            time = self._times(written)
+            time = np.array([self._time(*at) for at in zip(self.line, written, strict=True)])
         line = np.array(self.line, dtype=np.int64)
         return Records(self.source, line, numbers, units, texts, time, understood, source.load)
 
-    def _times(self, written: list[str]) -> Array:
-        seconds = np.empty(len(written))
-        for i, text in enumerate(written):
-            try:
-                seconds[i] = self.clock.seconds(text)
-            except ValueError:
-                raise self.clock.complaint(f"{self.source}, line {self.line[i]}", text) from None
-        return seconds
+    def _time(self, number: int, text: str) -> float:
+        try:
+            return self.clock.seconds(text)
+        except ValueError:
+            raise self.clock.complaint(f"{self.source}, line {number}", text) from None
 
 
 HEIGHT = ("zenith", "elevation")
