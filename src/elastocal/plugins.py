@@ -48,12 +48,36 @@ from elastocal.model.effects.driven import (
 )
 
 __all__ = [
-    "Arm", "BaseMotion", "Cell", "Chain", "DrivenEffect", "Effect", "JointMotion", "LinkFrame",
-    "LinkLength", "LoadedEffect", "MarkerMotion", "NoiseModel", "ParameterSpec", "Readings",
-    "Setting", "Spring", "Symbols", "TorqueEffect", "add_deflection", "index", "joints",
-    "links", "load_plugins", "motion_unit", "register_criterion", "register_effect",
-    "register_noise_model", "rigid", "turning_joints",
-]  # fmt: skip
+    "Arm",
+    "BaseMotion",
+    "Cell",
+    "Chain",
+    "DrivenEffect",
+    "Effect",
+    "JointMotion",
+    "LinkFrame",
+    "LinkLength",
+    "LoadedEffect",
+    "MarkerMotion",
+    "NoiseModel",
+    "ParameterSpec",
+    "Readings",
+    "Setting",
+    "Spring",
+    "Symbols",
+    "TorqueEffect",
+    "add_deflection",
+    "index",
+    "joints",
+    "links",
+    "load_plugins",
+    "motion_unit",
+    "register_criterion",
+    "register_effect",
+    "register_noise_model",
+    "rigid",
+    "turning_joints",
+]
 
 load_plugins = plugin_loader.load_plugins
 

@@ -91,6 +91,11 @@ class Cell:
 
         Raises:
             InputError: names file, key, what the key takes and the nearest valid name.
+
+        Examples:
+            >>> cell = ec.read_cell("cell.toml")
+            >>> cell.model.observe, tuple(cell.tool.markers)
+            ('deflection', ('M1', 'M2', 'M3'))
         """
         path = Path(path)
         table: Any = checked(table_of(cls), read_toml(path, "cell file"), path)
