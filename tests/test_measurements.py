@@ -430,9 +430,9 @@ def test_a_file_that_vanishes_between_two_looks_is_refused(tmp_path, monkeypatch
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    from elastocal import csv_lines
+    from elastocal import tables
 
-    monkeypatch.setattr(csv_lines, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(tables, "CHUNK_BYTES", 1)
 
 
 def test_a_table_read_in_pieces_is_the_same_table(read, small_chunks):
@@ -455,9 +455,9 @@ def test_mixed_decimal_marks_are_found_across_pieces(refusal, small_chunks, firs
 
 
 def test_more_rows_than_any_campaign_has_are_refused(refusal, small_chunks, monkeypatch):
-    from elastocal import csv_lines
+    from elastocal import tables
 
-    monkeypatch.setattr(csv_lines, "MAX_ROWS", 3)
+    monkeypatch.setattr(tables, "MAX_ROWS", 3)
     assert "more than 3 rows" in refusal(table(*(f"{i},2,3,4,5" for i in range(9))))
 
 

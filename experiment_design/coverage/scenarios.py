@@ -16,10 +16,9 @@ from campaign import DEMO, campaign
 from elastocal.cell.work_cell import read_cell
 from elastocal.demo import LOAD_N, published_compliances
 from elastocal.identification import Readings
-from elastocal.measurements import read_plan
+from elastocal.measurements import polar_axes, read_plan
 from elastocal.model import Model
 from elastocal.simulation import expand_plan, values_from
-from elastocal.tracker_noise import polar_axes
 
 EFFECT = 80e-6  # m, configuration effect in each direction
 OUTLIERS = 0.05, 1e-3, 1e-2  # share of readings, least and largest error in m

@@ -279,20 +279,14 @@ def _advice(spot: _Spot, root: type[BaseModel]) -> str:
     valid = [field for table in spot.tables for field in table.model_fields]
     where = header(above).split(" no. ")[0] if above else "the top level"
     takes = f"{where} takes {listed(valid)}"
-    if with_unit := with_units(name, valid):
-        return f"; missing unit: did you mean {' or '.join(with_unit)}? {takes}"
-    stem = UNIT_SUFFIX.sub("", name)
-    if stem != name and (with_unit := with_units(stem, valid)):
-        return f"; other unit: did you mean {' or '.join(with_unit)}? {takes}"
+    for what, stem in (("missing", name), ("other", UNIT_SUFFIX.sub("", name))):
+        stated = [v for v in valid if v.startswith(stem + "_") and UNIT_SUFFIX.sub("", v) == stem]
+        if stated:
+            return f"; {what} unit: did you mean {' or '.join(stated)}? {takes}"
     if homes := list(_homes_of(name, root, ())):
         return f"; did you mean it in {' or '.join(homes[:4])}? {takes}"
     near = nearest(name, valid)
     return f"; did you mean {near}? {takes}" if near else f"; {takes}"
-
-
-def with_units(stem: str, valid: Sequence[str]) -> list[str]:
-    """The valid names that are `stem` and a unit."""
-    return [v for v in valid if v.startswith(stem + "_") and UNIT_SUFFIX.sub("", v) == stem]
 
 
 def _homes_of(name: str, table: type[BaseModel], above: tuple[str, ...]) -> Iterator[str]:

@@ -16,8 +16,9 @@ from contextlib import contextmanager
 from elastocal.text import did_you_mean, listed, quoted
 
 # Keyword arguments whose flag is another word; everywhere else joint1_x is --joint1-x.
-FLAGS = {"fixed": "--fix"}
-LISTS = ("fixed", "without")  # keyword arguments that take a list, and flags that are repeated
+FLAGS = {"fixed": "--fix", "options": "--set", "presets": "--preset"}
+# Keyword arguments that take a list, and flags that are repeated.
+LISTS = ("fixed", "without", "options", "presets")
 
 _flags = False
 

@@ -1,4 +1,7 @@
-"""What the user measured: a checked, frozen table in SI units, its columns, reader and writer."""
+"""What the user measured: a checked, frozen table in SI units, its columns, reader and writer.
+
+Beside it, what the noise that is stated for the table or its tracker means for each reading.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError
+from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
+from elastocal.errors import InputError, require
 from elastocal.files import atomic_writer
 from elastocal.tables import (
     NO_UNIT,
@@ -31,6 +35,7 @@ from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 if TYPE_CHECKING:
     import pandas as pd
 
+
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")
 REQUIRED: dict[str, tuple[tuple[str, ...], ...]] = {
     "position": (("position",),),
@@ -46,6 +51,11 @@ PLANS = ("plan", "targets")
 PLAN_ONLY = ("level", "order")
 # What `compensate` writes beside its commands, which are a plan too.
 BESIDE_COMMANDS = ("correction_", "error_", "std_", "status")
+# In the order in which they are written.
+NUMBERS = (
+    "repeat", "q", "force", "position", "rotation", "distance", "torque", "sigma", "time",
+    "approach", "temperature",
+)  # fmt: skip
 DEFAULT_MARKER = "M1"
 QUATERNION_NORM_TOLERANCE = 1e-3
 LARGEST_EXACT_INTEGER = 2.0**53
@@ -100,27 +110,17 @@ class Measurements:
     def columns(self, joint_kinds: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """The same as header → (n,) numbers or labels."""
         known = families(joint_kinds or ("revolute",) * self.q.shape[1])
-        blocks: dict[str, np.ndarray | None] = {
-            "repeat": self.repeat,
-            "q": self.q,
-            "force": self.force,
-            "position": self.position,
-            "rotation": self.rotation,
-            "distance": self.distance,
-            "torque": self.torque,
-            f"sigma_{self.sigma_frame}": self.sigma,
-            "time": self.time,
-            "approach": None if self.approach is None else self.approach.astype(np.int64),
-            "temperature": self.temperature,
-        }
         columns: dict[str, np.ndarray] = {
             "configuration": np.array(self.configuration_labels, dtype=object)[self.configuration],
             "marker": np.array(self.marker_names, dtype=object)[self.marker],
         }
-        for name, values in blocks.items():
+        for name in NUMBERS:
+            values = getattr(self, name)
             if values is None:
                 continue
-            stems = known[name].units
+            if name == "approach":
+                values = values.astype(np.int64)
+            stems = known[f"sigma_{self.sigma_frame}" if name == "sigma" else name].units
             for stem, numbers in zip(stems, values.reshape(len(self), len(stems)).T, strict=True):
                 unit = next(unit for unit in SI_UNITS if unit in stems[stem])
                 columns[column(stem, unit)] = numbers
@@ -415,8 +415,12 @@ def write_measurements(
     q1_m.  Raises InputError where the folder is missing or not writable, and for values or
     labels that no table can hold (NaN, infinite, control characters).
     """
-    for names in (measurements.configuration_labels, measurements.marker_names):
-        _check_labels(names)
+    for name in (*measurements.configuration_labels, *measurements.marker_names):
+        if not is_label(name):
+            raise InputError(
+                f"label {quoted(name)} cannot stand in a table; use one line without blanks at "
+                "its ends"
+            )
     kinds = joint_kinds or ("revolute",) * measurements.q.shape[1]
     columns = measurements.columns(kinds)
     meaning = {
@@ -440,10 +444,73 @@ def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
         yield from zip(*(values[some].tolist() for values in columns.values()), strict=True)
 
 
-def _check_labels(names: Sequence[str]) -> None:
-    for name in names:
-        if not is_label(name):
+# Its noise: what the stated noise of the tracker means for a reading
+
+
+def available_noise(table: Measurements, tracker: Tracker) -> str:
+    """Which noise is stated: "rows" (the table's sigmas win), "polar", "axis" or "none"."""
+    if table.sigma is not None:
+        return "rows"
+    if isinstance(tracker.noise, PolarNoise):
+        return "polar"
+    return "none" if tracker.noise is None else "axis"
+
+
+def position_covariance(table: Measurements, tracker: Tracker, kind: str) -> tuple[Array, str]:
+    """Covariance (n, 3, 3) in m² of each row's x, y, z, and a sentence on where it comes from.
+
+    `kind`: "rows", "axis" or "polar".  Polar noise lies along the line of sight and across it:
+    Σ = Σ_k s_k² e_k e_kᵀ over range, azimuth and elevation direction.
+
+    Raises InputError where the noise that `kind` names is not stated.
+    """
+    n = len(table)
+    if kind == "rows":
+        need(table.sigma is not None, f"{table.source} has no sigma_… columns")
+        sigma = np.asarray(table.sigma)
+        text = f"per-row {table.sigma_frame} sigmas from the table"
+        polar = table.sigma_frame == "polar"
+    elif kind == "axis":
+        noise = tracker.noise
+        if not isinstance(noise, CartesianNoise):
+            raise InputError("these weights cannot be formed: the cell has no [tracker] sigma_um")
+        sigma, polar = np.tile(noise.sigma, (n, 1)), False
+        text = f"tracker sigma {np.round(noise.sigma * 1e6, 3).tolist()} µm along x, y, z"
+    else:
+        noise = tracker.noise
+        if not isinstance(noise, PolarNoise):
             raise InputError(
-                f"label {quoted(name)} cannot stand in a table; use one line without blanks at "
-                "its ends"
+                "these weights cannot be formed: the cell has no [tracker] range_um, range_ppm, "
+                "transverse_um, transverse_ppm"
             )
+        reach = np.linalg.norm(_position(table) - tracker.position, axis=1)
+        along = noise.range + noise.range_per_m * reach
+        across = noise.transverse + noise.transverse_per_m * reach
+        sigma, polar = np.column_stack([along, across, across]), True
+        text = "polar tracker noise (range and transverse) from the cell"
+    if not polar:
+        return np.eye(3) * (sigma**2)[:, None, :], text
+    axes = polar_axes(_position(table) - tracker.position)
+    return np.einsum("nki,nk,nkj->nij", axes, sigma**2, axes), text
+
+
+def polar_axes(sight: Array) -> Array:
+    """Unit vectors (n, 3, 3): range, azimuth and elevation direction of each line of sight."""
+    length = np.linalg.norm(sight, axis=1, keepdims=True)
+    need(bool((length > 0).all()), "a marker stands at the tracker's own position")
+    radial = sight / length
+    azimuth = np.column_stack([-radial[:, 1], radial[:, 0], np.zeros(len(radial))])
+    flat = np.linalg.norm(azimuth, axis=1)
+    # Straight above the tracker azimuth is undefined; any horizontal direction serves.
+    azimuth = np.where(flat[:, None] > 1e-9, azimuth / np.maximum(flat, 1e-300)[:, None], [1, 0, 0])
+    return np.stack([radial, azimuth, np.cross(radial, azimuth)], axis=1)
+
+
+def _position(table: Measurements) -> Array:
+    need(table.position is not None, f"{table.source} has no positions")
+    return np.asarray(table.position)
+
+
+def need(condition: bool, message: str) -> None:
+    """Raise InputError unless `condition` holds: what the noise model lacks."""
+    require(condition, f"these weights cannot be formed: {message}")

@@ -12,24 +12,234 @@ from __future__ import annotations
 
 import csv
 import math
+import re
+from array import array
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO, StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.csv_lines import Chunk, CsvLines, first_bad_cell
 from elastocal.errors import InputError
-from elastocal.files import open_input
+from elastocal.files import decoded, open_input
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import Array, IntArray, to_si
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+# The lines of a CSV file: bounded, checked and counted before anything is parsed.
+
+MAX_LINE = 64 * 1024
+MAX_BLANK_LINES = 10_000
+MAX_ROWS = 5_000_000
+CHUNK_BYTES = 1 << 20
+DELIMITERS = ",;\t"
+BOM = b"\xef\xbb\xbf"
+UTF16 = (b"\xff\xfe", b"\xfe\xff")
+ARCHIVE = b"PK\x03\x04"
+# pandas takes True and False for 1 and 0; "true" in any case it knows has one of these in it.
+TRUTH_VALUES = (b"rue", b"RUE", b"alse", b"ALSE")
+NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)(?:[eE][+-]?[0-9]+)?")
+NOT_FINITE = re.compile(r"[+-]?(nan|na|n/a|null|none|inf|infinity|#n/?a|#num!)", re.IGNORECASE)
+THOUSANDS = re.compile(r"[+-]?[0-9]+([.,' ][0-9]{3})*[.,][0-9]+")
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Some consecutive data lines: their text and their `numbers` in the file."""
+
+    data: bytes
+    numbers: array[int]
+
+
+class CsvLines:
+    """An open CSV file: `header` and `delimiter` from its first line, the others in chunks.
+
+    Raises InputError where the file is empty, not UTF-8 text, or its first line is blank.
+    """
+
+    def __init__(
+        self, source: str, handle: BinaryIO, what: str = "table", comments: bool = False
+    ) -> None:
+        self.source, self.handle, self.what, self.comments = source, handle, what, comments
+        number, line = 1, self._line(1)
+        while comments and line and not self._counts(line):
+            number += 1
+            line = self._line(number)
+        if not line:
+            raise InputError(f"{source}: empty file; the first line names the columns")
+        if line.startswith(UTF16):
+            raise InputError(f"{source}: is UTF-16; save the table as CSV in UTF-8")
+        if line.startswith(ARCHIVE):
+            raise InputError(f"{source}: is a workbook or archive; export the sheet as CSV")
+        text = self._decoded(line, number).removeprefix("\ufeff").rstrip("\r\n")
+        if not text.strip():
+            raise InputError(f"{source}: line 1 is blank; the first line must name the columns")
+        self.delimiter = max(DELIMITERS, key=text.count)
+        self.header = tuple(name.strip() for name in self._cells(number, text))
+        self._header_line, self._start = number, handle.tell()
+
+    def chunks(self) -> Iterator[Chunk]:
+        """All data lines, each with as many fields as the header, from the first one on.
+
+        Raises InputError for NUL bytes, overlong lines, other encodings, stray carriage returns,
+        wrong field counts, too many rows, and files without data; memory stays bounded.
+        """
+        self.handle.seek(self._start)
+        delimiter, delimiters = self.delimiter.encode(), len(self.header) - 1
+        blank = b" \r\n" if self.delimiter == "\t" else b" \t\r\n"
+        number, blanks, rows, size = self._header_line, 0, 0, 0
+        lines: list[bytes] = []
+        numbers = array("q")
+        while line := self._line(number := number + 1):
+            if not line.strip(blank) or (self.comments and not self._counts(line)):
+                blanks += 1
+                if blanks > MAX_BLANK_LINES:
+                    raise InputError(
+                        f"{self.source}, line {number}: more than {MAX_BLANK_LINES} blank lines; "
+                        f"this is no {self.what}"
+                    )
+                continue
+            if line.count(delimiter) != delimiters or b'"' in line or not line.isascii():
+                self._check_fields(line, number)
+            lines.append(line)
+            numbers.append(number)
+            size += len(line)
+            if size >= CHUNK_BYTES:
+                rows += len(lines)
+                yield Chunk(b"".join(lines), numbers)
+                lines, numbers, size = [], array("q"), 0
+                if rows > MAX_ROWS:
+                    raise InputError(
+                        f"{self.source}: more than {MAX_ROWS:,} rows; split the table, or thin it "
+                        "out"
+                    )
+        if lines:
+            yield Chunk(b"".join(lines), numbers)
+        elif not rows:
+            raise InputError(f"{self.source}: has a header but no rows; add them below it")
+
+    def cells(self, chunk: Chunk) -> Iterator[tuple[int, list[str]]]:
+        """(line number, cells) of every line of a chunk."""
+        for number, line in zip(chunk.numbers, chunk.data.splitlines(), strict=True):
+            yield number, self._cells(number, line.decode())
+
+    def _counts(self, line: bytes) -> bool:
+        """Whether a line has cells that are not empty, and is no comment."""
+        bare = line.removeprefix(BOM).strip(b' \t\r\n,;"')
+        return bool(bare) and not bare.startswith(b"#")
+
+    def _check_fields(self, line: bytes, number: int) -> None:
+        if not line.isascii():
+            self._decoded(line, number)
+        if b'"' in line:
+            found = len(self._cells(number, self._decoded(line, number).rstrip("\r\n")))
+        else:
+            found = line.count(self.delimiter.encode()) + 1
+        expected = len(self.header)
+        if found != expected:
+            commas = found > expected and self.delimiter == ","
+            hint = "where decimals are written with a comma, separate the columns by ';'"
+            raise InputError(
+                f"{self.source}: line {number} has {found} fields, header has {expected}; "
+                f"{hint if commas else 'correct the line'}"
+            )
+
+    def _cells(self, number: int, text: str) -> list[str]:
+        """The cells of one line.  Raises InputError where quotes do not close or are stray."""
+        try:
+            return next(
+                csv.reader([text], delimiter=self.delimiter, strict=True, skipinitialspace=True)
+            )
+        except csv.Error:
+            raise InputError(
+                f"{self.source}, line {number}: quotation marks do not match in {quoted(text)}; "
+                "close them on the same line"
+            ) from None
+
+    def _line(self, number: int) -> bytes:
+        line = self.handle.readline(MAX_LINE + 1)
+        if b"\0" in line and not line.startswith((*UTF16, ARCHIVE)):
+            raise InputError(
+                f"{self.source}, line {number}: NUL bytes, so this is no UTF-8 text; save the "
+                "table as CSV in UTF-8"
+            )
+        if len(line) > MAX_LINE:
+            raise InputError(
+                f"{self.source}, line {number}: longer than {MAX_LINE // 1024} KiB; this is no "
+                f"{self.what}"
+            )
+        # A lone CR would end a line for some readers and not for others.
+        if b"\r" in line and b"\r" in line.removesuffix(b"\n").removesuffix(b"\r"):
+            raise InputError(
+                f"{self.source}, line {number}: a carriage return inside the line; save the table "
+                "with ordinary line ends (LF or CRLF)"
+            )
+        return line
+
+    def _decoded(self, line: bytes, number: int) -> str:
+        remedy = "save the table as CSV in UTF-8"
+        text = decoded(self.source, line, remedy, codec="utf-8", line=number)
+        if number > 1 and "\ufeff" in text:
+            raise InputError(
+                f"{self.source}, line {number}: a byte order mark inside the file; if files were "
+                "joined, remove the second header"
+            )
+        return text
+
+
+def first_bad_cell(
+    source: str,
+    rows: Iterable[tuple[int, list[str]]],
+    columns: Mapping[int, str],
+    comma_allowed: bool,
+    blanks: Container[str] = (),
+) -> InputError | None:
+    """What is wrong with the first bad cell of `rows` (line number, cells), or None.
+
+    `columns`: field index → header of the number columns; `comma_allowed`: decimal commas may
+    be used, then everywhere in the file; `blanks`: headers of columns whose cells may be empty.
+    """
+    marks: dict[str, str] = {}
+    for number, cells in rows:
+        for i, header in columns.items():
+            cell = cells[i].strip()
+            if not cell and header in blanks:
+                continue
+            problem = _problem(cell, comma_allowed)
+            if problem is not None:
+                return InputError(f"{source}, line {number}, column {header}: {problem}")
+            mark = next((m for m in ".," if m in cell), None)
+            if mark:
+                marks.setdefault(mark, f"line {number}, column {header}: {quoted(cell)}")
+            if len(marks) == 2:
+                return InputError(
+                    f"{source}: decimal points ({marks['.']}) and decimal commas ({marks[',']}) in "
+                    "one file; use one of them throughout"
+                )
+    return None
+
+
+def _problem(cell: str, comma_allowed: bool) -> str | None:
+    if not cell:
+        return "empty cell; fill it in, or drop the line"
+    if NUMBER.fullmatch(cell):
+        if "," in cell and not comma_allowed:
+            return f"{quoted(cell)} has a decimal comma; write a point, or separate columns by ';'"
+        if math.isfinite(float(cell.replace(",", "."))):
+            return None
+        return f"{quoted(cell)} is too large to be a number here; correct it"
+    if NOT_FINITE.fullmatch(cell):
+        return f"{quoted(cell)} is not a finite number; write a number, or drop the line"
+    if THOUSANDS.fullmatch(cell):
+        return f"{quoted(cell)} has thousands separators; write it without them"
+    return f"{quoted(cell)} is not a number; correct it"
 
 
 NO_UNIT = ("",)
@@ -245,24 +455,18 @@ class Labels:
     names: tuple[str, ...]
 
 
-class LabelCollector:
-    """Gathers the labels of a column piece by piece, coded by first appearance."""
+# Rows of a column of labels: codes (n,) index into names, which stand in order of appearance.
+Coded = tuple[NDArray[np.integer], Iterable[object]]
 
-    def __init__(self) -> None:
-        self._code_of: dict[str, int] = {}
-        self._pieces: list[IntArray] = []
 
-    def add(self, codes: NDArray[np.integer], names: Iterable[object]) -> None:
-        """More rows: `codes` (n,) index into `names`, which stand in order of appearance.
-
-        Blanks at the ends of a name are cut off.
-        """
-        new = [self._code_of.setdefault(str(n).strip(), len(self._code_of)) for n in names]
-        self._pieces.append(np.array(new, dtype=np.int64)[codes])
-
-    def labels(self) -> Labels:
-        """All rows so far."""
-        return Labels(np.concatenate(self._pieces), tuple(self._code_of))
+def joined_labels(pieces: Iterable[Coded]) -> Labels:
+    """The labels of a column from its pieces; blanks at the ends of a name are cut off."""
+    code_of: dict[str, int] = {}
+    codes = []
+    for piece, names in pieces:
+        new = [code_of.setdefault(str(n).strip(), len(code_of)) for n in names]
+        codes.append(np.array(new, dtype=np.int64)[piece])
+    return Labels(np.concatenate(codes), tuple(code_of))
 
 
 @dataclass(frozen=True)
@@ -359,23 +563,15 @@ def read_table(
 def _read_csv(lines: CsvLines, choose: ChooseLayout) -> RawTable:
     layout = choose(lines.header)
     parser = (_CellParser if layout.blanks or lines.comments else _PandasParser)(lines, layout)
-    rows: list[IntArray] = []
-    numbers: dict[str, list[Array]] = {name: [] for name in layout.numbers}
-    labels = {name: LabelCollector() for name in layout.labels}
-    for chunk in lines.chunks():
-        parsed = parser.parse(chunk)
-        rows.append(parsed.row)
-        for name, values in parsed.numbers.items():
-            numbers[name].append(values)
-        for name, found in parsed.labels.items():
-            labels[name].add(*found)
+    rows, numbers, labels = zip(*map(parser.parse, lines.chunks()), strict=True)
     table = RawTable(
         lines.source,
         "line",
         np.concatenate(rows),
         layout,
-        {name: np.concatenate(numbers.pop(name)) for name in layout.numbers},
-        {name: collector.labels() for name, collector in labels.items()},
+        # Taken out, so that no column is held twice for longer than it takes.
+        {name: np.concatenate([part.pop(name) for part in numbers]) for name in layout.numbers},
+        {name: joined_labels(part[name] for part in labels) for name in layout.labels},
     )
     table.check_labels()
     return table
@@ -434,21 +630,14 @@ def _parquet_labels(source: str, name: str, column: pd.Series) -> Labels:
         raise InputError(
             f"{source}, row {i + 1}, column {name}: empty cell; write a name or number"
         )
-    collector = LabelCollector()
-    collector.add(*column.astype(str).factorize())
-    return collector.labels()
+    return joined_labels([column.astype(str).factorize()])
 
 
 # Cells of CSV files
 
 
-@dataclass(frozen=True)
-class _Parsed:
-    """Columns of a chunk; `labels`: header → codes and the texts that they index."""
-
-    row: IntArray
-    numbers: dict[str, Array]
-    labels: dict[str, tuple[NDArray[np.integer], Iterable[object]]]
+# Columns of a chunk: lines of the rows, numbers and labels by header.
+Parsed = tuple[IntArray, dict[str, Array], dict[str, Coded]]
 
 
 class _CellParser:
@@ -456,17 +645,15 @@ class _CellParser:
 
     def __init__(self, lines: CsvLines, layout: Layout) -> None:
         self.lines, self.layout = lines, layout
-        self.columns = {
-            i: name for i, name in enumerate(lines.header) if name in set(layout.numbers)
-        }
+        self.columns = {i: name for i, name in enumerate(lines.header) if name in layout.numbers}
 
-    def parse(self, chunk: Chunk) -> _Parsed:
+    def parse(self, chunk: Chunk) -> Parsed:
         """The columns of a chunk; raises InputError for the first bad cell."""
         if problem := self.problem([chunk]):
             raise problem
         rows = [cells for _, cells in self.lines.cells(chunk)]
         texts = dict(zip(self.lines.header, zip(*rows, strict=True), strict=True))
-        return _Parsed(
+        return (
             np.array(chunk.numbers, dtype=np.int64),
             {name: np.array(list(map(_number, texts[name]))) for name in self.layout.numbers},
             {name: (np.arange(len(rows)), texts[name]) for name in self.layout.labels},
@@ -507,9 +694,10 @@ class _PandasParser(_CellParser):
         if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
             self.options["float_precision"] = "round_trip"  # from 3.1 on always so, and deprecated
 
-    def parse(self, chunk: Chunk) -> _Parsed:
+    def parse(self, chunk: Chunk) -> Parsed:
         """The columns of a chunk, numbers finite; raises InputError for the first bad cell."""
-        if chunk.truth_values and (problem := self.problem([chunk])):
+        truth_values = any(word in chunk.data for word in TRUTH_VALUES)
+        if truth_values and (problem := self.problem([chunk])):
             raise problem
         frame = self._frame(chunk)
         numbers = {name: frame[name].to_numpy() for name in self.layout.numbers}
@@ -518,7 +706,7 @@ class _PandasParser(_CellParser):
         self.first = False
         row = np.array(chunk.numbers, dtype=np.int64)
         labels = {name: frame[name].factorize() for name in self.layout.labels}
-        return _Parsed(row, numbers, labels)
+        return row, numbers, labels
 
     def _frame(self, chunk: Chunk) -> pd.DataFrame:
         import pandas as pd

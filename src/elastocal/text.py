@@ -42,11 +42,11 @@ def quoted(found: object) -> str:
 
 def is_label(text: str) -> bool:
     """Can this text stand in a table cell and be read back: one line, no blanks at its ends?"""
-    return bool(text) and text == text.strip() and not any(map(_is_control, text))
-
-
-def _is_control(character: str) -> bool:
-    return unicodedata.category(character) in ("Cc", "Cs") or character == "\ufeff"
+    return (
+        bool(text)
+        and text == text.strip()
+        and not any(c == "\ufeff" or unicodedata.category(c) in ("Cc", "Cs") for c in text)
+    )
 
 
 def plain(value: Any) -> Any:

@@ -27,7 +27,7 @@ from elastocal.text import did_you_mean, listed, quoted
 
 if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
-    from elastocal.compensation.tool_targets import Targets, ToolPoint
+    from elastocal.compensation.tool import Targets, ToolPoint
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.intervals import IntervalKind
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
@@ -600,14 +600,14 @@ def compensate(
 
 def check_frame(frame: str) -> None:
     """Raise InputError for a frame that targets cannot stand in."""
-    from elastocal.compensation.tool_targets import FRAMES
+    from elastocal.compensation.tool import FRAMES
 
     told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
     require(frame in FRAMES, told)
 
 
 def _tool_point(cell: Cell, point: str | ArrayLike | None) -> ToolPoint:
-    from elastocal.compensation.tool_targets import tool_point
+    from elastocal.compensation.tool import tool_point
 
     if point is None or isinstance(point, str):
         return tool_point(cell, point)
@@ -622,7 +622,7 @@ def _targets(
     frame: Literal["base", "tracker"],
     force: NDArray[np.float64] | None,
 ) -> Targets:
-    from elastocal.compensation.tool_targets import Targets, read_targets, targets_at
+    from elastocal.compensation.tool import Targets, read_targets, targets_at
 
     if isinstance(targets, Targets):
         return targets

@@ -95,7 +95,7 @@ def test_a_changed_study_is_refused_and_started_anew_on_demand(folder):
     study(folder, "--jobs", 1)
     told = study(folder, "--jobs", 1, "--seed", 4)
     assert told.exit_code == 2 and "the seed was 11, now it is 4" in told.stderr
-    assert "Run with --restart to discard them, or with -o NEW to keep them" in told.stderr
+    assert "Run with --restart to discard them, or with --output NEW to keep them" in told.stderr
     assert study(folder, "--jobs", 1, "--seed", 4, "--restart").exit_code == 0
     assert study(folder, "--jobs", 1, "--seed", 4).exit_code == 0
 

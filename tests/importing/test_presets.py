@@ -111,7 +111,7 @@ def test_no_unit_is_guessed(tmp_path, readings):
     _, degrees, points = readings
     text = spatialanalyzer(points).replace("// AXES", "// axes unknown")
     files = {"p.txt": text.replace("(mm)", ""), "j.dat": krl(degrees)}
-    with pytest.raises(InputError, match=r"column 3.*no unit.*--length-unit mm"):
+    with pytest.raises(InputError, match=r"column 3.*no unit.*length_unit='mm'"):
         imported(tmp_path, files, presets=("spatialanalyzer", "kuka"))
 
 

@@ -1,10 +1,10 @@
-"""Standstills are the longest runs from the start on, whatever the sampling."""
+"""Dwells are the longest runs from the start on, whatever the sampling."""
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.importing import groups_alike, standstills
+from elastocal.importing import dwells, groups_alike
 
 STEPS = st.lists(st.tuples(st.sampled_from([0.1, 0.5, 2.0]), st.integers(-2, 2),
                            st.integers(-1, 1)), min_size=1, max_size=40)  # fmt: skip
@@ -30,7 +30,7 @@ def test_as_the_definition_says(steps, shortest):
     time = np.cumsum([dt for dt, _, _ in steps])
     q = np.cumsum([(a, b) for _, a, b in steps], axis=0).astype(float)
     still = np.array([1.0, 0.0])
-    found = standstills(time, q, still, shortest)
+    found = dwells(time, q, still, shortest)
     assert [(s.first, s.last) for s in found] == plainly(time, q, still, shortest)
     for s in found:
         np.testing.assert_array_equal(s.q, np.median(q[s.first : s.last + 1], axis=0))
@@ -38,7 +38,7 @@ def test_as_the_definition_says(steps, shortest):
 
 def test_runs_longer_than_a_chunk():
     q = np.r_[np.zeros(5000), np.ones(3000)][:, None]
-    found = standstills(np.arange(8000.0), q, np.array([0.5]), 10.0)
+    found = dwells(np.arange(8000.0), q, np.array([0.5]), 10.0)
     assert [(s.first, s.last) for s in found] == [(0, 4999), (5000, 7999)]
 
 

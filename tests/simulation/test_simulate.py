@@ -11,10 +11,10 @@ from support.cells import COMPLIANCE, kr270_chain, random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, PolarNoise, Tracker
 from elastocal.errors import InputError
+from elastocal.measurements import position_covariance
 from elastocal.model import Model, observe
 from elastocal.simulation import draw_errors, expand_plan, values_from
 from elastocal.simulation.simulate import simulate
-from elastocal.tracker_noise import position_covariance
 
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 5e-5])))
 POLAR = Tracker(np.array([3.0, 0.5, 1.0]), PolarNoise(2e-6, 5e-6, 1e-5, 3e-5))

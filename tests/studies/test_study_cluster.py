@@ -184,7 +184,7 @@ def test_no_scheduler_is_told(monkeypatch):
         connect("config")
     with pytest.raises(InputError, match="no scheduler answers"):
         connect("tcp://127.0.0.1:9")
-    with pytest.raises(InputError, match="cluster=nowhere at all"):
+    with pytest.raises(InputError, match="cluster='nowhere at all'"):
         connect("nowhere at all")
 
 

@@ -89,14 +89,14 @@ def refused(folder, *options):
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("seed = 11", "sead = 11", "unknown key 'sead' (did you mean 'seed'?)"),
-        ("seed = 11", "", "key seed takes a whole number"),
+        ("seed = 11", "sead = 11", "unknown key sead; did you mean seed?"),
+        ("seed = 11", "", "key seed is missing; it takes a whole number"),
         ("seed = 11", "seed = -1", "key seed takes a whole number"),
         ("seed = 11", "seed = ", "not valid TOML"),
         ("seed = 11", "seed = 1\nfiles = ['../x']", "outside the folder"),
         ("seed = 11", "seed = 1\nfiles = ['x.csv']", "'x.csv', which is no file of the folder"),
         ('mean = "mm"', "mean = 3", "key columns.mean takes the unit"),
-        ("[columns]", "[colums]", "unknown key 'colums'"),
+        ("[columns]", "[colums]", "unknown key colums; did you mean columns?"),
     ],
 )
 def test_a_wrong_study_file_is_told_by_its_key(tmp_path, old, new, told):
@@ -139,7 +139,7 @@ def test_wrong_tasks_are_told(tmp_path, old, new, told):
         ("replicats=3", "no option 'replicats' (did you mean 'replicates'?)"),
         ("replicates=3.5", "takes a whole number"),
         ("replicates=true", "takes a whole number"),
-        ("replicates", "options: takes KEY=VALUE"),
+        ("replicates", "`options` takes KEY=VALUE"),
         ("scale=big", "takes a number"),
     ],
 )

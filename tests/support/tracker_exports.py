@@ -11,7 +11,7 @@ from support.robots import KR270
 
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.importing import Imported, read_mapping
-from elastocal.importing.import_files import import_files
+from elastocal.importing.assemble import import_files
 from elastocal.model import Model
 
 MARKERS = ("M1", "M2")

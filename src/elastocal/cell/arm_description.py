@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -41,11 +42,8 @@ Convention = Literal["standard", "modified"]
 Sigma = Annotated[Array, numbers(3, above=0, one_for_all=True)]
 Compliances = Annotated[Many[NonNegative], Field(min_length=1)]
 JointName = Annotated[str, Field(pattern=r"^joint[1-9][0-9]{0,2}$")]
+ZEROS = partial(np.zeros, 3)
 POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
-
-
-def _zeros() -> Array:
-    return np.zeros(3)
 
 
 @record
@@ -126,7 +124,7 @@ class Tool:
     """`load_point` (3,) and `markers` name → (3,), in m in the flange frame."""
 
     load_point: Vector3 = keyed(
-        "three numbers in m, in the flange frame", "load_point_m", default_factory=_zeros
+        "three numbers in m, in the flange frame", "load_point_m", default_factory=ZEROS
     )
     markers: dict[str, Vector3] = keyed(
         "three numbers in m per marker, flange frame", "markers_m", default_factory=dict
@@ -174,7 +172,7 @@ class Tracker:
     `rotation_sigma` rad and `distance_sigma` m: noise of pose and distance readings, if known.
     """
 
-    position: Vector3 = keyed("three numbers in m", "position_m", default_factory=_zeros)
+    position: Vector3 = keyed("three numbers in m", "position_m", default_factory=ZEROS)
     noise: CartesianNoise | PolarNoise | None = keyed(
         keys=keys_of(CartesianNoise, PolarNoise), default=None
     )

@@ -206,15 +206,15 @@ def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     return found
 
 
+fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)
+
+
 def _choice(hint: Any) -> str:
     """The members of a Literal as a sentence lists them, or true or false."""
     if get_origin(hint) is not Literal:
         return "true or false"
     *first, last = (f'"{name}"' for name in get_args(hint))
     return f"{', '.join(first)} or {last}"
-
-
-fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)
 
 
 def _notes(hint: Any) -> Iterator[Any]:
@@ -416,14 +416,11 @@ def _direction(value: object) -> Array:
     return vector if np.abs(vector - unit).max() < 1e-12 else unit
 
 
-def _path(value: object) -> object:
-    return Path(value) if isinstance(value, str) else value
-
-
 TUPLE = BeforeValidator(_tuple)
 AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]
-File = Annotated[Path, BeforeValidator(_path), FromFile(Text, existing_file)]
+AS_PATH = BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)
+File = Annotated[Path, AS_PATH, FromFile(Text, existing_file)]
 Rotation = Annotated[Array, matrix(3, 3), FromFile(Vector3, rotation_from_rpy)]
 Transform = Annotated[Array, matrix(4, 4)]
 Direction = Annotated[Array, PlainValidator(_direction), FromFile(Vector3, direction)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,10 +46,6 @@ def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
     return tuple(str(spot.path.parent / m) if is_plugin_file(m) else m for m in modules)
 
 
-def _limits(table: Mapping[str, Any], spot: Spot, name: str) -> dict[str, tuple[float, float]]:
-    return {joint: (low, high) for joint, (low, high) in joint_values(table, spot, name).items()}
-
-
 @record
 class Cell:
     """Everything known about arm, tool, tracker and model before measuring.
@@ -70,7 +66,7 @@ class Cell:
     limits: dict[str, Annotated[tuple[float, float], TUPLE]] = keyed(
         "two numbers per joint, as in joint1_deg = [-170.0, 170.0]",
         form=dict[str, Vector2],
-        into=_limits,
+        into=joint_values,
         default_factory=dict,
     )
     workspace: Workspace = keyed("a table", default_factory=Workspace)

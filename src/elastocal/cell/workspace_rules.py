@@ -38,13 +38,7 @@ from elastocal.units import Array
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 Part = Annotated[str, Field(pattern=r"^(base|flange|link[1-9][0-9]{0,2})$")]
 Pair = Annotated[tuple[Text, Text], TUPLE]
-Angle = Annotated[
-    float,
-    Field(
-        gt=0,
-        le=180,
-    ),
-]
+Angle = Annotated[float, Field(gt=0, le=180)]
 Edges = Annotated[Array, numbers(3, above=0)]
 Scale = Annotated[Array, numbers(3, above=0, one_for_all=True)]
 Radii = Positive | Annotated[Array, numbers(least=0)]
@@ -186,10 +180,6 @@ class HangingLoad:
         return {"solid": from_table(Solid, table, spot, name="load")}
 
 
-def _normals(found: dict[str, Array], spot: Spot, name: str) -> dict[str, Array]:
-    return {marker: direction(axis, spot / name, marker) for marker, axis in found.items()}
-
-
 @record
 class Visibility:
     """What the tracker must see: all markers, past arm and obstacles.
@@ -201,7 +191,7 @@ class Visibility:
     normals: dict[str, Direction] = keyed(
         "three numbers per marker, in the flange frame",
         form=dict[str, Vector3],
-        into=_normals,
+        into=lambda found, spot, name: {m: direction(v, spot / name, m) for m, v in found.items()},
         default_factory=dict,
     )
     max_incidence: float | None = keyed(ANGLE, "max_incidence_deg", form=Angle, default=None)

@@ -99,7 +99,7 @@ def compensate(
     Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
     """
     from elastocal import verbs
-    from elastocal.compensation.tool_targets import one_target, tool_point
+    from elastocal.compensation.tool import one_target, tool_point
     from elastocal.files import atomic_write_text
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
@@ -179,7 +179,7 @@ def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
     import numpy as np
 
     from elastocal.compensation.compensate import in_file_units
-    from elastocal.compensation.tool_targets import numbers
+    from elastocal.compensation.tool import numbers
     from elastocal.model.chain import joint_limits
 
     if text is None:
@@ -201,7 +201,7 @@ def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) 
     from scipy.spatial.transform import Rotation
 
     from elastocal.compensation.correction_table import box_grid, joint_grid
-    from elastocal.compensation.tool_targets import numbers
+    from elastocal.compensation.tool import numbers
 
     try:
         counts = tuple(int(part) for part in grid.split(","))

@@ -56,7 +56,7 @@ def import_(
     """
     from elastocal.cell.work_cell import read_cell
     from elastocal.cli.import_preview import left_out, print_preview, summary
-    from elastocal.importing.import_files import import_files
+    from elastocal.importing.assemble import import_files
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
     from elastocal.model.effects import CATALOGUE
 

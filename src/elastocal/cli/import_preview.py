@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from elastocal.importing.import_files import Imported
+from elastocal.importing.assemble import Imported
 from elastocal.importing.records import Understood
 from elastocal.report.formatting import ShownTable, counted, printable
 from elastocal.report.terminal import table_of

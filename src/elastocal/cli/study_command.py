@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
 from elastocal.cli.app import command, console
-from elastocal.errors import InputError, require
+from elastocal.errors import require
 
 if TYPE_CHECKING:
     from elastocal.studies.study_run import Ending
 
 EVERY = 10.0  # s between plain lines of progress
-# The library's keyword arguments, as its messages name them, and what they are here.
-FLAGS = {
-    "restart=True": "--restart", "output=NEW": "-o NEW", "cluster=": "--cluster ",
-    "options: ": "--set ",
-}  # fmt: skip
 
 
 @command(short_help="What happens in a thousand simulated campaigns?")
@@ -77,13 +71,12 @@ def study(
     results = folder / "results" if output is None else output
     # Beside the results, not among them: their folder is a dataset that others read whole.
     page = folder / "result.md" if output is None else output.with_name(f"{output.name}.md")
-    with _naming_flags():
-        prepared = read_study(folder, seed, set_ or ())
-        with StudyStop() as stop, StudyProgress(progress and not quiet) as shown:
-            ending = run_study(
-                prepared, results, jobs=jobs, cluster=cluster, only=only, restart=restart,
-                retry_failed=retry_failed, stop=stop, progress=shown.show, tell=shown.tell,
-            )  # fmt: skip
+    prepared = read_study(folder, seed, set_ or ())
+    with StudyStop() as stop, StudyProgress(progress and not quiet) as shown:
+        ending = run_study(
+            prepared, results, jobs=jobs, cluster=cluster, only=only, restart=restart,
+            retry_failed=retry_failed, stop=stop, progress=shown.show, tell=shown.tell,
+        )  # fmt: skip
     typer.echo(_told(ending, results))
     if ending.stopped and not ending.complete:
         raise typer.Exit(130)
@@ -93,17 +86,6 @@ def study(
         text = summarise(prepared, results, page)
         if text is not None:
             typer.echo(f"\n{text}")
-
-
-@contextmanager
-def _naming_flags() -> Iterator[None]:
-    try:
-        yield
-    except InputError as error:
-        text = str(error)
-        for keyword, flag in FLAGS.items():
-            text = text.replace(keyword, flag)
-        raise InputError(text) from error.__cause__
 
 
 def _told(ending: Ending, results: Path) -> str:

@@ -7,13 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.work_cell import Cell
 from elastocal.compensation.tool import CalibratedTool
-from elastocal.compensation.tool_targets import Targets
-from elastocal.errors import option
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
-from elastocal.model.effects import effect_of
 from elastocal.model.inverse_kinematics import (
     ARM_LENGTH,
     BoundedSearch,
@@ -23,7 +19,6 @@ from elastocal.model.inverse_kinematics import (
     unwound,
 )
 from elastocal.model.inverse_kinematics import TOLERANCE as NOMINAL_TOLERANCE
-from elastocal.text import listed
 from elastocal.units import Array, IntArray
 
 # What the robot would be commanded without calibration: nominal joints along a path.
@@ -31,15 +26,6 @@ from elastocal.units import Array, IntArray
 STEP = 0.1  # rad or m between neighbours that count as one smooth piece
 LARGE = np.radians(20.0)  # a step beyond which another posture may be nearer
 LONGEST_PIECE = 256  # rows solved at once
-
-
-@dataclass(frozen=True)
-class NominalPath:
-    """`q` (n, joints) and whether the nominal arm `reached` (n,) each place; where it did not,
-    q is the posture that comes nearest."""
-
-    q: Array
-    reached: NDArray[np.bool_]
 
 
 def nominal_path(
@@ -50,8 +36,9 @@ def nominal_path(
     limits: tuple[Array, Array],
     near: Array | None,
     seed: int = 0,
-) -> NominalPath:
-    """Nominal joints that bring `point` (3,) of the flange to places along a path.
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Nominal joints (n, joints) that bring `point` (3,) of the flange to places along a path, and
+    whether the nominal arm reaches each place (n,); where not, the nearest posture stands there.
 
     `position` (n, 3) m and `rotation` (n, 3, 3) of the flange, or None for any, in the base
     frame.  The first place is reached in the posture nearest to `near` (default: the middle of
@@ -68,7 +55,7 @@ def nominal_path(
         if not taken:
             walk.leap(first, walk.last)
         first += max(taken, 1)
-    return NominalPath(walk.q, walk.reached)
+    return walk.q, walk.reached
 
 
 class _Walk:
@@ -114,8 +101,7 @@ class _Walk:
             q = q[np.argmin(np.linalg.norm(q - near, axis=1))][None]
             if self.chain.n_joints > self._task.equations:
                 q = self._task.nearest(q, np.array([i]), near)
-            self._keep(i, q, np.ones(1, dtype=bool))
-            return
+            good = np.ones(1, dtype=bool)
         self._keep(i, q[:1], good[:1])
 
     def _many(self, i: int, near: Array | None) -> Postures:
@@ -172,6 +158,12 @@ class Goals:
     position: Array
     rotation: Array | None
 
+    def in_base(self, T: Array) -> Goals:
+        """The same in the base frame, which stands at T (n, 4, 4) in the data's frame."""
+        back = T[:, :3, :3].transpose(0, 2, 1)
+        position = np.einsum("nij,nj->ni", back, self.position - T[:, :3, 3])
+        return Goals(position, None if self.rotation is None else back @ self.rotation)
+
 
 @dataclass(frozen=True)
 class Solved:
@@ -183,9 +175,9 @@ class Solved:
 
     def replaced(self, rows: IntArray, other: Solved) -> Solved:
         """The same with `other` in the rows named."""
-        q, miss, turn = self.q.copy(), self.miss.copy(), self.turn.copy()
-        q[rows], miss[rows], turn[rows] = other.q, other.miss, other.turn
-        return Solved(q, miss, turn)
+        new = Solved(self.q.copy(), self.miss.copy(), self.turn.copy())
+        new.q[rows], new.miss[rows], new.turn[rows] = other.q, other.miss, other.turn
+        return new
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -221,6 +213,10 @@ class Commanding(BoundedSearch):
         equations = 3 if self.goals.rotation is None else 6
         if self.tool.chain.n_joints > equations:
             q = self.least_correction(q, nominal, target)
+        return self.judged(q, target)
+
+    def judged(self, q: Array, target: IntArray) -> Solved:
+        """Commands q with what they miss."""
         return Solved(q, *self.misses(q, target))
 
     def least_correction(self, q: Array, nominal: Array, target: IntArray) -> Array:
@@ -259,7 +255,7 @@ class Commanding(BoundedSearch):
 
     def _better(self, q: Array, started: Array, nominal: Array, target: IntArray) -> Array:
         """Of two sets of commands, row by row those that reach with the smaller correction."""
-        now, before = (Solved(v, *self.misses(v, target)) for v in (q, started))
+        now, before = (self.judged(v, target) for v in (q, started))
         shorter = np.linalg.norm(q - nominal, axis=1) <= np.linalg.norm(started - nominal, axis=1)
         take = now.reached & (shorter | ~before.reached)
         return np.where(take[:, None], q, started)
@@ -367,108 +363,3 @@ def position_uncertainty(arm: CalibratedArm, A: Array, left: Undetermined) -> Un
         np.sqrt((off**2).sum(axis=(1, 2))),
         tuple(arm.model.names[left.open[i]] for i in order),
     )
-
-
-# Sentences about commands that are right but that somebody should look at.
-
-AT_LIMIT = 1e-9  # rad or m
-FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
-LARGE_CORRECTION = np.radians(2.0)
-LEVEL_SLACK = 0.01  # rad or m
-WORTH_TELLING = 10e-6  # m
-
-
-def notices_of(
-    cell: Cell,
-    chain: Chain,
-    targets: Targets,
-    limits: tuple[Array, Array],
-    q: Array,
-    nominal: Array,
-    before: Array,
-    reached: NDArray[np.bool_],
-    jumps: NDArray[np.int64],
-    uncertainty: Uncertainty,
-) -> tuple[str, ...]:
-    """What the rows that are reached give reason to say; each sentence names rows and remedy."""
-    told = []
-    lower, upper = limits
-    held = ((q <= lower + AT_LIMIT) | (q >= upper - AT_LIMIT)) & reached[:, None]
-    for limited in np.flatnonzero(held.any(axis=0)):
-        told.append(
-            f"{_rows(targets, held[:, limited])}: joint {limited + 1} stands at its limit; the "
-            "target is reached by the other joints"
-        )
-    if len(jumps):
-        i = int(jumps[0])
-        j = int(np.abs(q[i] - q[i - 1]).argmax())
-        revolute = chain.kinds[j] == "revolute"
-        size = np.abs(q[i, j] - q[i - 1, j])
-        by = f"{np.degrees(size):.0f}°" if revolute else f"{size * 1e3:.0f} mm"
-        told.append(
-            f"{_rows(targets, jumps)}: the solution branch changes (joint {j + 1} moves by {by} to "
-            f"line {targets.table.row[i]}, much more than the tool's motion asks for); where the "
-            "rows are a path, move it away from limits and singular postures, or give q1_deg … of "
-            "the posture wanted"
-        )
-    change = np.where([kind == "revolute" for kind in chain.kinds], np.abs(q - nominal), 0.0)
-    large = reached & (change.max(axis=1) > LARGE_CORRECTION)
-    if large.any():
-        told.append(
-            f"{_rows(targets, large)}: a joint is corrected by up to "
-            f"{np.degrees(change[large].max()):.1f}°, as beside a singular posture; check that the "
-            "path may be moved there"
-        )
-    if targets.q is not None and targets.position is not None:
-        far = before > FAR
-        if far.any():
-            told.append(
-                f"{_rows(targets, far)}: the nominal command q1_deg … puts the tool up to "
-                f"{before[far].max() * 1e3:.0f} mm from its target; check {option('frame')}, "
-                f"{option('point')} and units"
-            )
-    told += _without_load(cell, targets)
-    told += _beyond_levels(cell, targets, q, reached)
-    unknown = uncertainty.unknown[reached]
-    rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
-    stated = float(np.sqrt(np.mean(uncertainty.std[reached] ** 2))) if len(unknown) else 0.0
-    if rms > max(WORTH_TELLING, stated):
-        told.append(
-            f"The data do not determine {listed(uncertainty.blamed, 4)}, on which the place of "
-            f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm "
-            "rms, which the stated uncertainty leaves out; choose a marker that was fitted "
-            f"({option('point')}), or measure what is missing"
-        )
-    return tuple(told)
-
-
-def _without_load(cell: Cell, targets: Targets) -> list[str]:
-    """A load that was forgotten: the commands are then those of the arm without it."""
-    spec = cell.model
-    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
-    if not elastic or targets.table.force.any() or spec.link_gravity or spec.torque != "computed":
-        return []
-    return [
-        f"{targets.table.source}: no load is stated, so no compliance is compensated; where the "
-        f"tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
-    ]
-
-
-def _beyond_levels(cell: Cell, targets: Targets, q: Array, reached: NDArray[np.bool_]) -> list[str]:
-    told = []
-    for name, values in cell.model.compliance_levels.items():
-        angle = q[:, int(name.removeprefix("joint")) - 1]
-        off = (angle < min(values) - LEVEL_SLACK) | (angle > max(values) + LEVEL_SLACK)
-        if (off & reached).any():
-            told.append(
-                f"{_rows(targets, off & reached)}: {name} stands beyond its levels in "
-                "[model.compliance_levels], where the compliance of the nearest level is assumed"
-            )
-    return told
-
-
-def _rows(targets: Targets, which: NDArray) -> str:
-    """ "targets.csv, line 7 and 3 more" of a mask or of row indices."""
-    rows = np.flatnonzero(which) if which.dtype == bool else which
-    more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-    return f"{targets.place(int(rows[0]))}{more}"

@@ -11,33 +11,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.above import Result
+from elastocal.cell.work_cell import Cell
 from elastocal.compensation.commands import (
-    TOLERANCE,
     Commanding,
     Goals,
     Solved,
     Uncertainty,
     jumps,
     nominal_path,
-    notices_of,
     position_uncertainty,
     undetermined,
 )
-from elastocal.compensation.tool import CalibratedTool
-from elastocal.compensation.tool_targets import Targets, ToolPoint
+from elastocal.compensation.tool import CalibratedTool, Targets, ToolPoint
 from elastocal.errors import InsufficientDataError, option
 from elastocal.identification.start import check_limits
 from elastocal.measurements import families
 from elastocal.model import rigid
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain, joint_limits
+from elastocal.model.effects import effect_of
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
 from elastocal.tables import column, csv_text
-from elastocal.text import plain
-from elastocal.units import Array
-
-# From targets to commands: nominal joints, their error, the command that undoes it.
+from elastocal.text import listed, plain
+from elastocal.units import Array, IntArray
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
@@ -134,10 +131,12 @@ def compensate(
         force = np.einsum("nij,nj->ni", T[:, :3, :3], force)
     rows = tool.rows(replace(targets.table, force=force))
     goals = _goals(targets, chain, T, place, turn)
-    in_base, flange = _seen_from_base(goals, T, turn)
+    aimed = goals.in_base(T)
+    in_base = aimed.position
+    flange = None if aimed.rotation is None else aimed.rotation @ turn.transpose(0, 2, 1)
     if targets.q is None:
         progress("nominal commands")
-        nominal = nominal_path(chain, in_base, flange, place[0], limits, near, seed).q
+        nominal = nominal_path(chain, in_base, flange, place[0], limits, near, seed)[0]
     else:
         check_limits(arm.model, replace(targets.table, q=targets.q))
         nominal = np.clip(targets.q, *limits)
@@ -164,10 +163,7 @@ def compensate(
         np.column_stack([before[1], found.turn]), status, goals, force, T, place, turn,
         task.errors(nominal, every)[0], uncertainty, (),
     )  # fmt: skip
-    told = notices_of(
-        tool.cell, chain, targets, limits, found.q, nominal, before[0], reached, path, uncertainty
-    )
-    return replace(result, warnings=told)
+    return replace(result, warnings=notices_of(tool.cell, result, limits, path))
 
 
 def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
@@ -183,15 +179,6 @@ def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) 
         position = T[:, :3, 3] + np.einsum("nij,nj->ni", T[:, :3, :3], position)
         rotation = None if rotation is None else T[:, :3, :3] @ rotation
     return Goals(position, rotation)
-
-
-def _seen_from_base(goals: Goals, T: Array, turn: Array) -> tuple[Array, Array | None]:
-    """Position (n, 3) of the point and rotation (n, 3, 3) of the flange in the base frame."""
-    back = T[:, :3, :3].transpose(0, 2, 1)
-    position = np.einsum("nij,nj->ni", back, goals.position - T[:, :3, 3])
-    if goals.rotation is None:
-        return position, None
-    return position, back @ goals.rotation @ turn.transpose(0, 2, 1)
 
 
 def nominal_flanges(chain: Chain, q: Array) -> Array:
@@ -214,8 +201,7 @@ def _other_postures(
     starts = found.q.reshape(len(lost) * count, -1)
     target = np.repeat(lost, count)
     q, _ = search.solve(starts, target)
-    miss, turn = search.misses(q, target)
-    good = np.asarray((miss <= TOLERANCE) & (turn <= TOLERANCE)).reshape(len(lost), count)
+    good = search.judged(q, target).reached.reshape(len(lost), count)
     far = np.linalg.norm(found.q - nominal[lost][:, None], axis=2)
     best = np.where(good, far, np.inf).argmin(axis=1)
     chosen = found.q[np.arange(len(lost)), best]
@@ -233,9 +219,7 @@ def _status(search: Commanding, found: Solved, nominal: Array) -> tuple[str, ...
         wide = np.full(nominal.shape[1], np.inf)
         free = Commanding(search.tool, search.rows, search.goals, -wide, wide)
         q, _ = free.solve(nominal[left], left)
-        miss, turn = free.misses(q, left)
-        within = (miss <= TOLERANCE) & (turn <= TOLERANCE)
-        status[left[within]] = LIMIT
+        status[left[free.judged(q, left).reached]] = LIMIT
     return tuple(status)
 
 
@@ -254,6 +238,107 @@ def _uncertainty(
         covariance[some], unknown[some] = part.covariance, part.unknown
         blamed |= dict.fromkeys(part.blamed)
     return Uncertainty(covariance, unknown, tuple(blamed))
+
+
+# Sentences about commands that are right but that somebody should look at.
+
+AT_LIMIT = 1e-9  # rad or m
+FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
+LARGE_CORRECTION = np.radians(2.0)
+LEVEL_SLACK = 0.01  # rad or m
+WORTH_TELLING = 10e-6  # m
+
+
+def notices_of(
+    cell: Cell, result: Compensation, limits: tuple[Array, Array], jumps: IntArray
+) -> tuple[str, ...]:
+    """What the rows that are reached give reason to say; each sentence names rows and remedy.
+
+    `jumps`: the rows at which the solution branch changes.
+    """
+    chain, targets, q, before = result.chain, result.targets, result.q, result.before
+    reached, uncertainty = result.reached, result.uncertainty
+    told = []
+    lower, upper = limits
+    held = ((q <= lower + AT_LIMIT) | (q >= upper - AT_LIMIT)) & reached[:, None]
+    for limited in np.flatnonzero(held.any(axis=0)):
+        told.append(
+            f"{_rows(targets, held[:, limited])}: joint {limited + 1} stands at its limit; the "
+            "target is reached by the other joints"
+        )
+    if len(jumps):
+        i = int(jumps[0])
+        j = int(np.abs(q[i] - q[i - 1]).argmax())
+        revolute = chain.kinds[j] == "revolute"
+        size = np.abs(q[i, j] - q[i - 1, j])
+        by = f"{np.degrees(size):.0f}°" if revolute else f"{size * 1e3:.0f} mm"
+        told.append(
+            f"{_rows(targets, jumps)}: the solution branch changes (joint {j + 1} moves by {by} to "
+            f"line {targets.table.row[i]}, much more than the tool's motion asks for); where the "
+            "rows are a path, move it away from limits and singular postures, or give q1_deg … of "
+            "the posture wanted"
+        )
+    change = np.where([kind == "revolute" for kind in chain.kinds], np.abs(q - result.nominal), 0.0)
+    large = reached & (change.max(axis=1) > LARGE_CORRECTION)
+    if large.any():
+        told.append(
+            f"{_rows(targets, large)}: a joint is corrected by up to "
+            f"{np.degrees(change[large].max()):.1f}°, as beside a singular posture; check that the "
+            "path may be moved there"
+        )
+    if targets.q is not None and targets.position is not None:
+        far = before > FAR
+        if far.any():
+            told.append(
+                f"{_rows(targets, far)}: the nominal command q1_deg … puts the tool up to "
+                f"{before[far].max() * 1e3:.0f} mm from its target; check {option('frame')}, "
+                f"{option('point')} and units"
+            )
+    told += _without_load(cell, targets)
+    told += _beyond_levels(cell, targets, q, reached)
+    unknown = uncertainty.unknown[reached]
+    rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
+    stated = float(np.sqrt(np.mean(uncertainty.std[reached] ** 2))) if len(unknown) else 0.0
+    if rms > max(WORTH_TELLING, stated):
+        told.append(
+            f"The data do not determine {listed(uncertainty.blamed, 4)}, on which the place of "
+            f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm "
+            "rms, which the stated uncertainty leaves out; choose a marker that was fitted "
+            f"({option('point')}), or measure what is missing"
+        )
+    return tuple(told)
+
+
+def _without_load(cell: Cell, targets: Targets) -> list[str]:
+    """A load that was forgotten: the commands are then those of the arm without it."""
+    spec = cell.model
+    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
+    if not elastic or targets.table.force.any() or spec.link_gravity or spec.torque != "computed":
+        return []
+    return [
+        f"{targets.table.source}: no load is stated, so no compliance is compensated; where the "
+        f"tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
+    ]
+
+
+def _beyond_levels(cell: Cell, targets: Targets, q: Array, reached: NDArray[np.bool_]) -> list[str]:
+    told = []
+    for name, values in cell.model.compliance_levels.items():
+        angle = q[:, int(name.removeprefix("joint")) - 1]
+        off = (angle < min(values) - LEVEL_SLACK) | (angle > max(values) + LEVEL_SLACK)
+        if (off & reached).any():
+            told.append(
+                f"{_rows(targets, off & reached)}: {name} stands beyond its levels in "
+                "[model.compliance_levels], where the compliance of the nearest level is assumed"
+            )
+    return told
+
+
+def _rows(targets: Targets, which: NDArray) -> str:
+    """ "targets.csv, line 7 and 3 more" of a mask or of row indices."""
+    rows = np.flatnonzero(which) if which.dtype == bool else which
+    more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+    return f"{targets.place(int(rows[0]))}{more}"
 
 
 # Commands as files: the table that a robot program is made from, and a summary.
@@ -318,10 +403,9 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
     Joints and corrections of a row that is not reached are left empty.  Forces stand in the
     data's frame, as in every plan, so that `simulate` can read the table.
     """
-    blocks: list[tuple[list[str], Array, str]] = []
     held = np.where(result.reached[:, None], 1.0, np.nan)
     q = in_file_units(result.q, kinds)
-    blocks.append((joint_columns(kinds), held * q, f".{DIGITS}f"))
+    blocks = [(joint_columns(kinds), held * q, f".{DIGITS}f")]
     table = result.targets.table
     if result.force.any():
         blocks.append((["force_x_N", "force_y_N", "force_z_N"], result.force, ".9g"))
@@ -348,20 +432,20 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
     header = ["configuration", *(h for heads, _, _ in blocks for h in heads), "status"]
     rows = []
     for i in range(len(table)):
-        cells = [_cell(v, form) for _, values, form in blocks for v in values[i]]
+        cells = [
+            format(v + 0.0, form) if np.isfinite(v) else ""
+            for _, values, form in blocks
+            for v in values[i]
+        ]
         label = table.configuration_labels[table.configuration[i]]
         rows.append([label, *cells, result.status[i]])
     return csv_text(header, rows)
 
 
-def _cell(value: float, form: str) -> str:
-    return format(value + 0.0, form) if np.isfinite(value) else ""
-
-
 def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[str, Any]:
     """What was done, JSON-ready; with `commands` also every command."""
-    good = result.reached
-    names = joint_columns(kinds)
+    good, names = result.reached, joint_columns(kinds)
+    change = in_file_units(result.q - result.nominal, kinds)
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "targets": result.targets.table.source,
@@ -373,7 +457,7 @@ def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[
         "error_after_um": spread(result.after[good]),
         "std_um": spread(result.uncertainty.std[good]),
         "largest_correction": dict(
-            zip(names, _largest(in_file_units(result.q - result.nominal, kinds)[good]), strict=True)
+            zip(names, plain(np.abs(change[good]).max(axis=0, initial=-np.inf)), strict=True)
         ),
         "not_reached": [
             {"line": int(result.targets.table.row[i]), "status": result.status[i],
@@ -391,12 +475,6 @@ def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[
             for i, status in enumerate(result.status)
         ]
     return content
-
-
-def _largest(values: Array) -> list[float | None]:
-    if not len(values):
-        return [None] * values.shape[1]
-    return [float(v) for v in np.abs(values).max(axis=0)]
 
 
 def spread(values: Array) -> dict[str, float | None]:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
+from elastocal.compensation.commands import Goals
 from elastocal.compensation.compensate import Compensation, compensate, nominal_flanges
-from elastocal.compensation.tool import CalibratedTool
-from elastocal.compensation.tool_targets import Targets, ToolPoint, targets_at
+from elastocal.compensation.tool import CalibratedTool, Targets, ToolPoint, targets_at
 from elastocal.errors import InputError, option
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import finite_ranges, joint_limits
@@ -154,7 +155,8 @@ def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Target
 
 def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:
     """(N, 6) along the axes of the base frame, and how each was found."""
-    position, rotation = _goals_in_base(result)
+    aimed = result.goals.in_base(result.T_data_base)
+    position, rotation = aimed.position, aimed.rotation
     flange = nominal_flanges(tool.chain, result.q)
     there = flange[:, :3, 3] + np.einsum("nij,nj->ni", flange[:, :3, :3], result.place)
     exact = _between(position, rotation, there, flange[:, :3, :3] @ result.turned)
@@ -173,21 +175,11 @@ def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tup
     return correction, status
 
 
-def _goals_in_base(result: Compensation) -> tuple[Array, Array | None]:
-    T = result.T_data_base
-    back = T[:, :3, :3].transpose(0, 2, 1)
-    rotation = result.goals.rotation
-    position = np.einsum("nij,nj->ni", back, result.goals.position - T[:, :3, 3])
-    return position, None if rotation is None else back @ rotation
-
-
-def _achieved(tool: CalibratedTool, result: Compensation, q: Array) -> tuple[Array, Array]:
+def _achieved(tool: CalibratedTool, result: Compensation, q: Array) -> tuple[Array, Any]:
     """Position (n, 3) and rotation (n, 3, 3) of the calibrated tool in the base frame at q."""
     rows = tool.rows(replace(result.targets.table, force=result.force))
-    p, R = tool.poses(rows, q)
-    T = result.T_data_base
-    back = T[:, :3, :3].transpose(0, 2, 1)
-    return np.einsum("nij,nj->ni", back, p - T[:, :3, 3]), back @ R
+    there = Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
+    return there.position, there.rotation
 
 
 def _between(p: Array, R: Array | None, p_new: Array, R_new: Array | None) -> Array:
@@ -204,7 +196,8 @@ def _with_table(
     tool: CalibratedTool, check: Compensation, correction: Array
 ) -> tuple[Array, Array]:
     """Errors (M, 2) of the tool at the nominal commands, and at those of the corrected targets."""
-    position, rotation = _goals_in_base(check)
+    aimed = check.goals.in_base(check.T_data_base)
+    position, rotation = aimed.position, aimed.rotation
     known = np.flatnonzero(
         np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
     )

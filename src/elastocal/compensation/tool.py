@@ -1,26 +1,192 @@
-"""Where the calibrated arm puts its tool, as a function of the commanded joints."""
+"""The tool: which point of it is to be where, and where the calibrated arm puts it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from elastocal.compensation.tool_targets import ToolPoint
-from elastocal.measurements import Measurements
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError, option, require
+from elastocal.measurements import Measurements, read_measurements
 from elastocal.model import rigid
 from elastocal.model.arm import row_inputs
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.inverse_kinematics import ARM_LENGTH
 from elastocal.model.symbolic import SymbolicArm
+from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
-# Between the levels of a joint whose compliance is known at levels alone.
+
+@dataclass(frozen=True)
+class ToolPoint:
+    """`place` (3,) m in the flange frame; with `marker`, the identified place of that marker."""
+
+    place: Array
+    marker: str | None
+    told: str
+
+
+def tool_point(cell: Cell, text: str | None) -> ToolPoint:
+    """The point that `text` names: a marker, or "x,y,z" in m in the flange frame.
+
+    Without a text the cell's `load_point_m`, or where that is not stated its only marker.
+    Raises InputError for an unknown marker, and where the cell leaves the choice open.
+    """
+    markers = cell.tool.markers
+    if text is None:
+        if cell.tool.load_point.any():
+            return ToolPoint(cell.tool.load_point, None, "load point")
+        if len(markers) == 1:
+            return _marker(cell, next(iter(markers)))
+        raise InputError(
+            f"{cell.path or cell.name}: which point of the tool is to be at the targets? Give "
+            f"{option('point')} with a marker ({listed(markers)}) or with x,y,z in m in the flange "
+            "frame, or state [tool] load_point_m"
+        )
+    if text in markers:
+        return _marker(cell, text)
+    parts = text.split(",")
+    if len(parts) == 1:
+        raise InputError(
+            f"{option('point')}: '{text}' is no marker of the cell{did_you_mean(text, markers)}; "
+            f"its markers: {listed(markers)}; or give x,y,z in m in the flange frame"
+        )
+    place = numbers(option("point"), text, (3,), "x,y,z in m in the flange frame")
+    if np.abs(place).max() > 10:
+        raise InputError(
+            f"{option('point')}: '{text}' is more than 10 m from the flange; give x,y,z in m"
+        )
+    return ToolPoint(place, None, f"point {text} m in the flange frame")
+
+
+def _marker(cell: Cell, name: str) -> ToolPoint:
+    return ToolPoint(cell.tool.markers[name], name, f"marker {name}")
+
+
+def numbers(option: str, text: str, counts: tuple[int, ...], what: str) -> Array:
+    """The numbers of an option like "1,2,3"; InputError where they are others than `what`."""
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        values = np.full(1, np.nan)
+    if len(values) not in counts or not np.isfinite(values).all():
+        raise InputError(f"{option} takes {what}; found '{text}'")
+    return values
+
+
+Frame = Literal["base", "tracker"]
+FRAMES: tuple[Frame, ...] = ("base", "tracker")
+
+
+@dataclass(frozen=True)
+class Targets:
+    """n targets; `table` holds their force (n, 3) N and circumstances, one row each.
+
+    `position` (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`;
+    rotation None: any.  `q` (n, joints) is the nominal command, None where it is to be found;
+    without a position the tool is to be where the nominal arm has it at q.
+    """
+
+    table: Measurements
+    frame: Frame
+    position: Array | None
+    rotation: Array | None
+    q: Array | None
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def place(self, i: int) -> str:
+        """Where row i stands, as messages begin: file and line."""
+        return f"{self.table.source}, line {self.table.row[i]}"
+
+
+def read_targets(
+    path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None
+) -> Targets:
+    """Targets of a CSV or Parquet file whose columns are those of the measurement table.
+
+    x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone,
+    or both: joints are then the nominal command to start from.  force_x_N … and circumstances
+    (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force`
+    (3,) N acts where the table states none.
+
+    Raises InputError that names file, line, column and the offending text.
+    """
+    table = read_measurements(path, joint_kinds=joint_kinds, observe="targets")
+    q = table.q if table.q.shape[1] else None
+    if table.position is None:
+        extra = (
+            "; a rotation alone is no target" if table.rotation is not None and q is None else ""
+        )
+        require(
+            q is not None and table.rotation is None,
+            f"{path}: the columns x_mm,y_mm,z_mm are missing; a target needs its position, or the "
+            f"nominal command q1_deg … alone{extra}",
+        )
+        require(
+            frame == "base",
+            f"{path}: targets by q1_deg … alone are where the nominal arm has the tool, which "
+            f"stands in the base frame; leave {option('frame', 'tracker')} away, or give "
+            "x_mm,y_mm,z_mm",
+        )
+    require(
+        len(table.marker_names) == 1,
+        f"{path}: targets of the markers {', '.join(table.marker_names[:4])} … in one table; the "
+        f"point of the tool is chosen by {option('point')}: split the table by marker",
+    )
+    if force is not None:
+        require(
+            not table.force.any(),
+            f"{path}: the table has forces of its own; leave {option('load')} away or drop them",
+        )
+        table = replace(table, force=np.tile(force, (len(table), 1)))
+    rotation = table.rotation
+    matrices = None if rotation is None else Rotation.from_rotvec(rotation).as_matrix()
+    return Targets(table, frame, table.position, matrices, q)
+
+
+def one_target(text: str, frame: Frame, force: Array | None = None) -> Targets:
+    """The target "x,y,z" in mm, or "x,y,z,rx,ry,rz" with a rotation vector in degrees."""
+    what = "x,y,z in mm, or x,y,z,rx,ry,rz in mm and degrees (rotation vector)"
+    values = numbers(option("target"), text, (3, 6), what)
+    position = values[None, :3] / 1e3
+    rotation = None
+    if len(values) == 6:
+        rotation = Rotation.from_rotvec(np.radians(values[None, 3:])).as_matrix()
+    return targets_at(option("target"), position, rotation, frame, force)
+
+
+def targets_at(
+    source: str, position: Array | None, rotation: Array | None, frame: Frame,
+    force: Array | None = None, q: Array | None = None,
+) -> Targets:  # fmt: skip
+    """Targets that no table states, all under one `force` (3,) N; errors name `source`."""
+    known = position if position is not None else q
+    if known is None:
+        raise InputError(f"{source}: neither positions nor joints")
+    n = len(known)
+    table = Measurements(
+        source=source,
+        row=np.arange(1, n + 1),
+        q=np.zeros((n, 0)),
+        configuration=np.arange(n),
+        configuration_labels=tuple(map(str, range(1, n + 1))),
+        repeat=np.zeros(n, dtype=np.int64),
+        marker=np.zeros(n, dtype=np.int64),
+        marker_names=("M1",),
+        force=np.tile(np.zeros(3) if force is None else force, (n, 1)),
+    )
+    return Targets(table, frame, position, rotation, q)
 
 
 def share_of_levels(angle: Array, levels: Array) -> Array:
@@ -41,15 +207,12 @@ def share_of_levels(angle: Array, levels: Array) -> Array:
     return share
 
 
-# An expression of the elastic arm and its total derivative, through the equilibrium.
-
-
 class Total:
     """y(inputs, X, extra; θ) and dy/dz at the static equilibrium F(inputs, X; θ) = 0.
 
     dy/dz = ∂y/∂z − ∂y/∂θ F_θ⁻¹ ∂F/∂z, by the adjoint λ = F_θ⁻ᵀ (∂y/∂θ)ᵀ as the partial
-    derivative of y − λᵀF.  `y` (m, 1) and `z` (k, 1) are expressions of `arm`, whose tapes follow
-    the backend; `extra` are further symbols in y.  Where the model is linear (eq. 3) or rigid,
+    derivative of y − λᵀF.  `y` (m, 1) and `z` (k, 1) are expressions of `arm`, compiled for
+    its backend; `extra` are further symbols in y.  Where the model is linear (eq. 3) or rigid,
     y is explicit and nothing is solved.
     """
 
@@ -60,12 +223,12 @@ class Total:
         if not arm.implicit:
             y = arm.explicit(y, 0)
             self._slopes = None
-            self._tape = BatchFunction(inputs, [y, ca.jacobian(y, z)], arm.backend)
+            self._function = BatchFunction(inputs, [y, ca.jacobian(y, z)], arm.backend)
             return
         adjoint = ca.SX.sym("adjoint", y.shape[0], theta.shape[0])
         lagrangian = y - adjoint @ arm.residual
         self._slopes = BatchFunction(inputs, [ca.jacobian(y, theta)], arm.backend)
-        self._tape = BatchFunction(
+        self._function = BatchFunction(
             [*inputs, ca.vec(adjoint.T)], [y, ca.jacobian(lagrangian, z)], arm.backend
         )
 
@@ -75,19 +238,17 @@ class Total:
         """y (n, m) and dy/dz (n, m, k) of every row; y is NaN where there is no equilibrium."""
         springs = self._arm.arm.theta.shape[0]
         if self._slopes is None:
-            y, slope = self._tape(*inputs, *extra, x, np.zeros((len(inputs[0]), springs)))
+            y, slope = self._function(*inputs, *extra, x, np.zeros((len(inputs[0]), springs)))
             return y[..., 0], slope
         theta, F_theta = self._arm.equilibrium.solve(inputs, x)
         y_theta = self._slopes(*inputs, *extra, x, theta)[0]
         y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
         adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
         adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
-        y, slope = self._tape(*inputs, *extra, x, theta, adjoint)
+        y, slope = self._function(*inputs, *extra, x, theta, adjoint)
         y[~np.isfinite(theta).all(axis=1)] = np.nan
         return y[..., 0], slope
 
-
-# Where the calibrated arm puts its tool, as a function of the commanded joints.
 
 LEVEL = "level:"
 

@@ -20,10 +20,9 @@ from elastocal.identification.weighted_problem import (
     stated_covariance,
     weights_for,
 )
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, available_noise
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
-from elastocal.tracker_noise import available_noise
 from elastocal.units import Array, IntArray
 
 

@@ -4,10 +4,9 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "dh_table": "split",
-    "export": "Exported Wish flanges",
+    "export": "Exported Wish flanges to_yaml",
     "exportable": "Conditions cost_of evaluate_pieces keep random_table rpy",
     "mjcf_file": "MujocoRest",
-    "parameter_file": "to_yaml",
     "urdf_file": "Frames read_urdf_text",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]

@@ -127,16 +127,15 @@ def _same_turns(row: DhRow, near: DhRow) -> DhRow:
     )
 
 
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
 def _turn(axis: str, angle: float) -> ca.SX:
-    return rigid.joint_motion("revolute", _unit(axis), angle)
+    return rigid.joint_motion("revolute", AXES[axis], angle)
 
 
 def _shift(axis: str, length: float) -> ca.SX:
-    return rigid.joint_motion("prismatic", _unit(axis), length)
-
-
-def _unit(axis: str) -> tuple[float, float, float]:
-    return {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}[axis]
+    return rigid.joint_motion("prismatic", AXES[axis], length)
 
 
 def _product(*factors: ca.SX) -> Array:
@@ -185,18 +184,17 @@ def dh_lines(robot: Robot, pieces: ExportNumbers, convention: Convention) -> lis
     first, *joints = [row.near(old) for row, old in zip(rows, ideal, strict=True)]
     end, last = split(F)
     flange = [end, DhRow(theta=math.atan2(last[1, 0], last[0, 0]), d=float(last[2, 3]))]
-    # (what moves, L and X) in the order of the chain
-    whole: list[tuple[str, Joint | None, DhRow]] = [("base", None, first)]
-    whole += [(j.name, j, row) for j, row in zip(nominal.joints, joints, strict=True)]
-    whole += [(f"flange{k}", None, row) for k, row in enumerate(flange, start=1)]
+    lines = [
+        Line("base", None, first),
+        *(Line(j.name, j, row) for j, row in zip(nominal.joints, joints, strict=True)),
+        *(Line(f"flange{k}", None, row) for k, row in enumerate(flange, start=1)),
+    ]
     if convention == "modified":
-        before = [DhRow(), *(row for _, _, row in whole[:-1])]
-        whole = [
-            (name, joint, replace(b, theta=row.theta, d=row.d))
-            for (name, joint, row), b in zip(whole, before, strict=True)
-        ]
-    cleaned = [Line(name, joint, row.near(DhRow(), ZERO)) for name, joint, row in whole]
-    return [line for line in cleaned if line.joint is not None or line.row != DhRow()]
+        before = [DhRow(), *(line.row for line in lines[:-1])]
+        pairs = zip(lines, before, strict=True)
+        lines = [replace(k, row=replace(b, theta=k.row.theta, d=k.row.d)) for k, b in pairs]
+    lines = [replace(line, row=line.row.near(DhRow(), ZERO)) for line in lines]
+    return [line for line in lines if line.joint is not None or line.row != DhRow()]
 
 
 FORMULA = {
@@ -282,13 +280,8 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Dh
     n = len(table.row)
     if any(table.text(i, "type") == FIXED for i in range(n)):
         return nothing
-    keys = (
-        ("angle", "theta0"),
-        ("length", "d"),
-        ("length", "a"),
-        ("angle", "alpha"),
-        ("angle", "beta"),
-    )
+    stems = ("theta0", "d", "a", "alpha", "beta")
+    keys = [("length" if len(stem) == 1 else "angle", stem) for stem in stems]
     numbers = np.nan_to_num([[dh_number(table, i, *key) for key in keys] for i in range(n)])
     own = [DhRow(*row) for row in numbers.tolist()]
     if convention == "standard":

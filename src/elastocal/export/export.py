@@ -1,7 +1,11 @@
-"""A calibrated arm written in one of the formats, read back, and with what that costs."""
+"""A calibrated arm written in one of the formats, read back, and with what that costs.
+
+The formats of geometry have rooms of their own; the parameters as YAML or JSON are written here.
+"""
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,22 +29,159 @@ from elastocal.export.exportable import (
     keep,
     link_inertias,
     random_table,
+    rpy,
 )
 from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
-from elastocal.export.parameter_file import (
-    cost_json,
-    estimates_of,
-    held_values,
-    parameter_document,
-    to_yaml,
-)
 from elastocal.export.urdf_file import BASE, FLANGE, Frames, calibrated_urdf, new_urdf
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain
 from elastocal.model.effects import effect_of
 from elastocal.model.rigid import nominal_flange
-from elastocal.text import did_you_mean, json_text
+from elastocal.text import did_you_mean, json_text, plain
 from elastocal.units import Array
+
+# YAML of plain data: mappings, sequences, texts, numbers.  Reading YAML would need a library;
+# writing this much of it does not.
+
+
+def to_yaml(data: Any) -> str:
+    """`data` (dicts with text keys, lists, texts, numbers, booleans, None) as YAML 1.1 and 1.2.
+
+    Lists of plain values stand on one line; texts are quoted wherever YAML might take them for
+    something else.
+    """
+    return "\n".join(_lines(data)) + "\n"
+
+
+def _lines(data: Any) -> list[str]:
+    if isinstance(data, dict) and data:
+        lines = []
+        for key, value in data.items():
+            if _is_flow(value):
+                lines.append(f"{_scalar(key)}: {_flow(value)}")
+            else:
+                lines += [f"{_scalar(key)}:", *(f"  {line}" for line in _lines(value))]
+        return lines
+    if isinstance(data, list) and not _is_flow(data):
+        lines = []
+        for item in data:
+            first, *rest = _lines(item)
+            lines += [f"- {first}", *(f"  {line}" for line in rest)]
+        return lines
+    return [_flow(data)]
+
+
+def _is_flow(data: Any) -> bool:
+    if isinstance(data, dict):
+        return not data
+    return not isinstance(data, list) or not any(isinstance(v, dict | list) for v in data)
+
+
+def _flow(data: Any) -> str:
+    if isinstance(data, list):
+        return f"[{', '.join(_scalar(v) for v in data)}]"
+    return "{}" if isinstance(data, dict) else _scalar(data)
+
+
+def _scalar(value: Any) -> str:
+    if isinstance(value, float):
+        text = repr(value)
+        # YAML 1.1 takes 1e-07 for a text: a number needs a point before the exponent.
+        mantissa, e, exponent = text.partition("e")
+        return text if not e or "." in mantissa else f"{mantissa}.0e{exponent}"
+    if isinstance(value, str) and _is_plain(value):
+        return value
+    # A JSON text, number or null is one in YAML too, except that YAML knows no surrogate pairs
+    # and wants more characters escaped.
+    text = json.dumps(value, allow_nan=False, ensure_ascii=False)
+    return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in text)
+
+
+def _is_plain(text: str) -> bool:
+    """Letters first, then letters, digits, and _ . : - / inside: no YAML reads it otherwise."""
+    if not text.isascii() or text.lower() in {
+        "true", "false", "yes", "no", "on", "off", "null", "y", "n", "nan", "inf",
+    }:  # fmt: skip
+        return False
+    rest = text.translate(str.maketrans("", "", "_./-"))
+    return text[:1].isalpha() and rest.isalnum()
+
+
+# The parameters as YAML or JSON, to be read by people and by programs of their own.
+
+PARAMETERS = "elastocal/parameters/1"
+KEYS = ("value", "unit", "std", "ci95", "identifiable", "combined_with", "nominal", "held", "note")
+
+
+def estimates_of(calibrated: CalibratedArm) -> list[dict[str, Any]]:
+    """Per parameter, in the model's order: name and what identify says of it.
+
+    What an older result does not have is null.
+    """
+    return [
+        {"name": name} | {key: plain(entry.get(key)) for key in KEYS}
+        for name, entry in zip(calibrated.model.names, calibrated.entries, strict=True)
+    ]
+
+
+def held_values(estimates: list[dict[str, Any]]) -> dict[str, float]:
+    """Parameters that the data did not determine, with the values used for them (SI)."""
+    return {e["name"]: e["held"] for e in estimates if e["identifiable"] is not True}
+
+
+def parameter_document(
+    calibrated: CalibratedArm, estimates: list[dict[str, Any]], pieces: ExportNumbers, cost: Cost
+) -> dict[str, Any]:
+    """Everything to be written: estimates, the geometry they make, and that geometry's cost.
+
+    Joint and flange placements are those of the calibrated URDF: in the frame before, in m and
+    rad (roll, pitch, yaw), offsets included, so that joint values stay commanded ones.
+    """
+    chain = pieces.calibrated_chain()
+    cell = calibrated.model.cell
+    return {
+        "schema": PARAMETERS,
+        "robot": chain.name,
+        "cell": None if cell.path is None else Path(cell.path).name,
+        "result": Path(calibrated.source).name,
+        "units": "SI: m, rad, N, kg",
+        "parameters": estimates,
+        "geometry": {
+            "tracker_to_base": _placed(pieces.T_tracker_base),
+            "joints": [
+                {"name": joint.name, "kind": joint.kind, **_placed(joint.placement),
+                 "axis": [float(v) for v in joint.axis]}
+                for joint in chain.joints
+            ],
+            "flange": _placed(chain.flange_placement),
+            "markers": {name: _placed(T) for name, T in pieces.markers.items()},
+            "load_point_m": [float(v) for v in pieces.load_point],
+        },
+        "geometry_alone": cost_json(cost),
+    }  # fmt: skip
+
+
+def cost_json(cost: Cost) -> dict[str, Any]:
+    """A cost in µm, with what it was found under."""
+    return {
+        "poses": cost.poses,
+        "poses_without_equilibrium": cost.unsettled,
+        "force_N": [float(v) for v in cost.force],
+        "total": cost.total.to_json(),
+        "effects": [
+            {"effect": e.effect, "note": e.note,
+             "difference": None if e.difference is None else e.difference.to_json()}
+            for e in cost.effects
+        ],
+    }  # fmt: skip
+
+
+def _placed(T: Array) -> dict[str, list[float]]:
+    return {
+        "xyz_m": [float(v) + 0.0 for v in T[:3, 3]],
+        "rpy_rad": [v + 0.0 for v in rpy(T[:3, :3])],
+    }
+
 
 # Which format a file is written in: by its ending, or as asked for.
 
@@ -130,12 +271,11 @@ def check_rest(
     if not base_frame:
         expected = np.linalg.inv(pieces.T_tracker_base) @ expected
     names = ["flange", *(f"marker_{name}" for name in pieces.markers)]
-    points = np.array([np.zeros(3), *(T[:3, 3] for T in pieces.markers.values())])
     worst = 0.0
     for q, T in zip(table.q, expected, strict=True):
         if np.isfinite(T).all():
             found = arm.sites(q, force, names)
-            away = found - (points @ T[:3, :3].T + T[:3, 3])
+            away = found - (pieces.points @ T[:3, :3].T + T[:3, 3])
             worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
     return _accepted(worst, LARGEST_AT_REST)
 
@@ -148,8 +288,6 @@ def _accepted(distance: float, largest: float) -> float:
         )
     return distance
 
-
-# A calibrated arm written in one of the formats, checked, and with what that costs.
 
 SCHEMA = "elastocal/export/1"
 POSES_AT_REST = 20
@@ -213,7 +351,13 @@ def export(
     progress("what the format cannot hold")
     cost = cost_of(kept, wish.poses, wish.seed)
     progress("writing and reading back")
-    text, checked, tool, warnings, beta = _written(calibrated, wish, kept, pieces, cost, estimates)
+    written: Written = "", None, "", [], None
+    if wish.format in WRITERS:
+        written = WRITERS[wish.format](calibrated, wish, kept, pieces)
+    text, checked, tool, warnings, beta = written
+    if not text:
+        document = parameter_document(calibrated, estimates, pieces, cost)
+        text = to_yaml(document) if wish.format == "yaml" else json_text(document) + "\n"
     return Exported(
         text=text,
         format=wish.format,
@@ -227,28 +371,8 @@ def export(
     )
 
 
+# Text, distance when read back, by what, warnings, distance without beta.
 Written = tuple[str, float | None, str, list[str], float | None]
-
-
-def _written(
-    calibrated: CalibratedArm,
-    wish: Wish,
-    kept: Kept,
-    pieces: ExportNumbers,
-    cost: Cost,
-    estimates: list[dict[str, Any]],
-) -> Written:
-    """Text, distance when read back, by what, warnings, distance without beta."""
-    if wish.format == "urdf":
-        return _urdf(calibrated, wish, kept, pieces)
-    if wish.format == "mjcf":
-        return _mjcf(calibrated, wish, kept, pieces)
-    if wish.format in CONVENTIONS:
-        return _dh(calibrated, wish, kept, pieces)
-    document = parameter_document(calibrated, estimates, pieces, cost)
-    if wish.format == "yaml":
-        return to_yaml(document), None, "", [], None
-    return json_text(document) + "\n", None, "", [], None
 
 
 def _note(calibrated: CalibratedArm, wish: Wish) -> str:
@@ -264,7 +388,7 @@ def _note(calibrated: CalibratedArm, wish: Wish) -> str:
 
 
 def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
-    from elastocal.model.urdf import read_urdf
+    from elastocal.model.urdf import check_urdf, read_urdf
 
     robot = calibrated.model.cell.robot
     note = _note(calibrated, wish)
@@ -272,8 +396,6 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
         text = calibrated_urdf(robot, pieces, wish.frames, note)
         base, flange = robot.base, robot.flange
         if wish.frames.base and base is None:
-            from elastocal.model.urdf import check_urdf
-
             base = check_urdf(robot.urdf).root
     else:
         text = new_urdf(pieces, wish.frames, note)
@@ -299,10 +421,8 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
             "identify anew for an arm with weights"
         )
     springs = {s.site for s in pieces.springs if s.compliance > 0}
-    rigid = [
-        f"joint{i + 1}" for i in range(pieces.chain.n_joints) if f"joint{i + 1}" not in springs
-    ]
-    if rigid:
+    joints = [f"joint{i + 1}" for i in range(pieces.chain.n_joints)]
+    if rigid := [joint for joint in joints if joint not in springs]:
         warnings.append(
             f"no compliance was identified for {', '.join(rigid)}: rigid in this file "
             f"(gain {RIGID:g})"
@@ -345,6 +465,9 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
     text = dh_csv(lines, comments)
     check_chain(text, ".csv", read, chain, kept, wish.seed)
     return text, checked, "elastocal's own reader of DH tables", [], beta
+
+
+WRITERS = {"urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh}
 
 
 def _warnings(calibrated: CalibratedArm, cost: Cost) -> list[str]:

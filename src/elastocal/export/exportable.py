@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections import defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements
 from elastocal.model import rigid
@@ -25,8 +25,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.simulation.mujoco_arm import numbers
 from elastocal.units import Array
-
-# Rigid transforms as URDF writes them.
 
 
 def rpy(R: Array) -> tuple[float, float, float]:
@@ -55,6 +53,7 @@ def origin_attributes(T: Array) -> dict[str, str]:
 
 # What a spring in a file cannot follow, named like effects among the omissions.
 LEVELS, LINEAR, NEGATIVE = "levels of a joint", "linear deflections", "negative compliance"
+OPTIONS = {"time": "time_s", "temperature": "temperature_c"}  # which state what an effect needs
 
 
 @dataclass(frozen=True)
@@ -68,10 +67,7 @@ class Conditions:
 
     def state(self, need: str) -> bool:
         """Is what an effect needs ("time", "temperature", …) stated here?"""
-        return not (
-            (need == "time" and self.time is None)
-            or (need == "temperature" and self.temperature is None)
-        )
+        return getattr(self, need, 0.0) is not None
 
 
 @dataclass(frozen=True)
@@ -97,15 +93,31 @@ class Valued:
 
 
 @dataclass(frozen=True)
+class Difference:
+    """Distance between two predictions over the poses, in m: of the flange and of the markers."""
+
+    flange_rms: float
+    flange_max: float
+    marker_rms: float
+    marker_max: float
+
+    def to_json(self) -> dict[str, float]:
+        """The four numbers in µm."""
+        return {f"{name}_um": value * 1e6 for name, value in vars(self).items()}
+
+
+@dataclass(frozen=True)
 class Omission:
     """One thing that the file cannot hold; `without` is the full model without it.
 
-    `without` is None where its cost cannot be stated, and `note` says why.
+    `without` is None where its cost cannot be stated, and `note` says why.  `difference` is what
+    leaving it out changes, once that is found.
     """
 
     effect: str
     note: str
     without: Valued | None
+    difference: Difference | None = None
 
 
 @dataclass(frozen=True)
@@ -136,34 +148,33 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         for name in chosen
         if name not in instrument
     }
-    whole = [name for name, needs in unstated.items() if not needs]
-    full = _part(calibrated, whole)
+    stated = [name for name, needs in unstated.items() if not needs]
+    full = _part(calibrated, stated)
     format: Format = "elastic" if elastic else "rigid"
-    dropped = _cannot_be_springs(full) if elastic else {}
+    dropped = {}  # effects whose values no physical spring or body has, with the reason
+    for name in full.effects if elastic else ():
+        if reason := CATALOGUE[name].unphysical(full.values, full.model.chain, full.model.cell):
+            dropped[name] = reason
     kept_names = [
-        name for name in whole if format in CATALOGUE[name].formats and name not in dropped
+        name for name in stated if format in CATALOGUE[name].formats and name not in dropped
     ]
     omissions = [
-        Omission(name, dropped.get(name, ""), _part(calibrated, set(whole) - {name}))
-        for name in whole
+        Omission(name, dropped.get(name, ""), _part(calibrated, set(stated) - {name}))
+        for name in stated
         if name not in kept_names
     ]
     omissions += [
-        Omission(name, f"no cost without {' and '.join(map(_option, needs))}", None)
+        Omission(name, f"no cost without {' and '.join(option(OPTIONS[n]) for n in needs)}", None)
         for name, needs in unstated.items()
         if needs
     ]
-    exported = full if len(kept_names) == len(whole) else _part(calibrated, kept_names)
+    exported = full if len(kept_names) == len(stated) else _part(calibrated, kept_names)
     if elastic:
         exported, changed = _as_springs(exported)
         omissions += [
             Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
         ]
     return Kept(full, exported, conditions, tuple(omissions), instrument)
-
-
-def _option(need: str) -> str:
-    return option({"time": "time_s", "temperature": "temperature_c"}[need])
 
 
 def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
@@ -177,21 +188,8 @@ def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
         observe="position",
         torque="computed",
     )
-    return _valued(calibrated.model, replace(cell, model=spec), calibrated.values)
-
-
-def _valued(like: Model, cell: Cell, values: dict[str, float]) -> Valued:
-    model = Model.assembled(like.chain, cell)
-    return Valued(model, np.array([values[name] for name in model.names]))
-
-
-def _cannot_be_springs(full: Valued) -> dict[str, str]:
-    """Effects whose values no physical spring or body has, with the reason."""
-    values, model = full.values, full.model
-    reasons = {
-        name: CATALOGUE[name].unphysical(values, model.chain, model.cell) for name in full.effects
-    }
-    return {name: reason for name, reason in reasons.items() if reason}
+    model = Model.assembled(calibrated.model.chain, replace(cell, model=spec))
+    return Valued(model, np.array([calibrated.values[name] for name in model.names]))
 
 
 def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tuple[str, str]]]:
@@ -201,7 +199,7 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     are those at the deflected pose.  `only` makes the change of one of them alone.
     """
     cell, values = part.model.cell, part.values
-    changed = []
+    changed = defaultdict[str, list[str]](list)
     spec = cell.model
     if spec.compliance_levels and JointCompliance.name in part.effects and only in (None, LEVELS):
         for joint, levels in spec.compliance_levels.items():
@@ -209,24 +207,18 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
             if names[0] in values:
                 values[f"{joint}.compliance"] = float(np.mean([values[name] for name in names]))
                 told = f"one spring with the mean compliance of {joint}'s {len(names)} levels"
-                changed.append((LEVELS, told))
+                changed[LEVELS].append(told)
         spec = replace(spec, compliance_levels={})
     if spec.deflection_model == "linear" and only in (None, LINEAR):
         spec = replace(spec, deflection_model="equilibrium")
-        changed.append((LINEAR, "springs settle under the load at the deflected pose, eq. (3) not"))
+        changed[LINEAR] = ["springs settle under the load at the deflected pose, eq. (3) not"]
     model = Model.assembled(part.model.chain, replace(cell, model=spec))
     negative = [p.name for p in model.parameters if p.lower == 0.0 and values[p.name] < 0.0]
     if negative and only in (None, NEGATIVE):
         values |= dict.fromkeys(negative, 0.0)
-        changed.append((NEGATIVE, f"rigid, as no spring yields so: {', '.join(negative)}"))
-    return Valued(model, np.array([values[name] for name in model.names])), _once(changed)
-
-
-def _once(changed: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    told: dict[str, list[str]] = {}
-    for effect, sentence in changed:
-        told.setdefault(effect, []).append(sentence)
-    return [(effect, "; ".join(sentences)) for effect, sentences in told.items()]
+        changed[NEGATIVE] = [f"rigid, as no spring yields so: {', '.join(negative)}"]
+    omitted = [(effect, "; ".join(sentences)) for effect, sentences in changed.items()]
+    return Valued(model, np.array([values[name] for name in model.names])), omitted
 
 
 # The numbers of an exported model: joint placements, markers, springs, masses.
@@ -272,6 +264,11 @@ class ExportNumbers:
         """Motion (4, 4) of joint i (0-based) by its offset: what stands at encoder zero."""
         joint = self.chain.joints[i]
         return ca.DM(rigid.joint_motion(joint.kind, joint.axis, float(self.offsets[i]))).full()
+
+    @property
+    def points(self) -> Array:
+        """(1 + markers, 3) m in the flange frame: its origin and the markers."""
+        return np.array([np.zeros(3), *(T[:3, 3] for T in self.markers.values())])
 
     def placement(self, i: int) -> Array:
         """Joint i's frame (0-based) in the frame before it, without its offset."""
@@ -348,9 +345,6 @@ def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple
     return tuple(bodies)
 
 
-# Inertia tensors of the bodies that each joint carries, from the robot's URDF.
-
-
 def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
     """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes.
 
@@ -360,40 +354,17 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
     import pinocchio as pin
 
     try:
-        whole = pin.buildModelFromXML(path.read_text(encoding="utf-8-sig"))
+        robot = pin.buildModelFromXML(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RuntimeError):
         return ()
     moving = {joint.name for joint in chain.joints}
-    held = [i for i in range(1, whole.njoints) if whole.names[i] not in moving]
-    model = pin.buildReducedModel(whole, held, pin.neutral(whole)) if held else whole
+    held = [i for i in range(1, robot.njoints) if robot.names[i] not in moving]
+    model = pin.buildReducedModel(robot, held, pin.neutral(robot)) if held else robot
     tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
     return tuple(tensors) if len(tensors) == chain.n_joints else ()
 
 
 # What an export costs: how far the file's arm is from the calibrated one, effect by effect.
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Distance between two predictions over the poses, in m: of the flange and of the markers."""
-
-    flange_rms: float
-    flange_max: float
-    marker_rms: float
-    marker_max: float
-
-    def to_json(self) -> dict[str, float]:
-        """The four numbers in µm."""
-        return {f"{name}_um": value * 1e6 for name, value in vars(self).items()}
-
-
-@dataclass(frozen=True)
-class EffectCost:
-    """What leaving one effect out changes; `difference` is None where that cannot be said."""
-
-    effect: str
-    note: str
-    difference: Difference | None
 
 
 @dataclass(frozen=True)
@@ -405,7 +376,7 @@ class Cost:
     """
 
     total: Difference
-    effects: tuple[EffectCost, ...]
+    effects: tuple[Omission, ...]
     poses: int
     unsettled: int
     force: Array
@@ -419,8 +390,7 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
     """
     table = random_table(kept.full.model, kept.conditions, poses, seed)
     # No omission touches the tool, so one set of markers serves every model.
-    tool = evaluate_pieces(kept.exported, kept.conditions).markers
-    markers = np.array([np.zeros(3), *(T[:3, 3] for T in tool.values())])
+    markers = evaluate_pieces(kept.exported, kept.conditions).points
     full = _positions(kept.full, table, markers)
     exported = _positions(kept.exported, table, markers)
     settled = np.isfinite(full).all(axis=(1, 2)) & np.isfinite(exported).all(axis=(1, 2))
@@ -432,11 +402,11 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
         )
     effects = []
     for omission in kept.omissions:
-        difference = None
         if omission.without is not None:
             without = _positions(omission.without, table, markers)
             difference = _difference(full[settled], without[settled])
-        effects.append(EffectCost(omission.effect, omission.note, difference))
+            omission = replace(omission, difference=difference)
+        effects.append(omission)
     effects.sort(key=lambda e: -np.inf if e.difference is None else -e.difference.marker_rms)
     return Cost(
         total=_difference(full[settled], exported[settled]),
@@ -466,13 +436,11 @@ def random_table(model: Model, conditions: Conditions, poses: int, seed: int) ->
         marker_names=tuple(cell.tool.markers)[:1],
         force=np.tile(conditions.force, (poses, 1)),
         approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)),
-        time=_column(conditions.time, poses),
-        temperature=_column(conditions.temperature, poses),
+        time=None if conditions.time is None else np.full(poses, conditions.time),
+        temperature=None
+        if conditions.temperature is None
+        else np.full(poses, conditions.temperature),
     )
-
-
-def _column(value: float | None, n: int) -> Array | None:
-    return None if value is None else np.full(n, value)
 
 
 def _positions(part: Valued, table: Measurements, points: Array) -> Array:
@@ -483,9 +451,7 @@ def _positions(part: Valued, table: Measurements, points: Array) -> Array:
 
 def _difference(a: Array, b: Array) -> Difference:
     distance = np.linalg.norm(a - b, axis=2)
-    flange, markers = distance[:, :1], distance[:, 1:]
-    return Difference(_rms(flange), float(flange.max()), _rms(markers), float(markers.max()))
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    parts = distance[:, :1], distance[:, 1:]
+    return Difference(
+        *(float(v) for part in parts for v in (np.sqrt(np.mean(part**2)), part.max()))
+    )

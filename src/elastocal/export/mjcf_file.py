@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -17,8 +16,6 @@ from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.simulation.mujoco_arm import NO_INERTIA, NO_MASS, numbers, placed_body
 from elastocal.units import Array
 
-# The calibrated arm as MJCF, whose rest under load is the model's static equilibrium.
-#
 # Each joint is a hinge or slide that a position actuator drives: its control is the commanded
 # joint value, its gain kp = 1/k the identified stiffness, so that at rest q − q_commanded = k τ.
 # Springs that no motor holds (bearings across the axis, links, pedestal) are passive joints of
@@ -33,6 +30,7 @@ SETTLING = 0.02
 # Keeps the mass matrix regular where links weigh nothing, and the accelerations of a stiff drive
 # after a step of its command below the 1e10 rad/s² beyond which MuJoCo gives up.
 ARMATURE, ARMATURE_PER_STIFFNESS = 0.1, 1e-8  # kg m² (kg), s²
+MOTIONS = {"revolute": "hinge", "prismatic": "slide"}
 SHORTEST = 1e-3  # m; a shorter link is not drawn
 
 
@@ -140,16 +138,11 @@ def _passive(body: ET.Element, spring: SpringValue, offset: Array) -> None:
     back = np.linalg.inv(offset)
     stiffness = 1.0 / spring.compliance
     ET.SubElement(
-        body,
-        "joint",
-        name=f"spring_{spring.name}",
-        type="slide" if spring.kind == "prismatic" else "hinge",
-        pos=numbers(back[:3, 3]),
-        axis=numbers(back[:3, :3] @ spring.axis),
-        stiffness=repr(stiffness),
-        damping=repr(SETTLING * stiffness),
+        body, "joint", name=f"spring_{spring.name}", type=MOTIONS[spring.kind],
+        pos=numbers(back[:3, 3]), axis=numbers(back[:3, :3] @ spring.axis),
+        stiffness=repr(stiffness), damping=repr(SETTLING * stiffness),
         armature=_armature(stiffness),
-    )
+    )  # fmt: skip
 
 
 def _armature(stiffness: float) -> str:
@@ -163,13 +156,9 @@ def _motor(
     name = f"joint{i + 1}"
     kp = 1.0 / compliance if compliance > 0 else RIGID
     ET.SubElement(
-        body,
-        "joint",
-        name=name,
-        type="slide" if joint.kind == "prismatic" else "hinge",
-        axis=numbers(joint.axis),
+        body, "joint", name=name, type=MOTIONS[joint.kind], axis=numbers(joint.axis),
         armature=_armature(kp),
-    )
+    )  # fmt: skip
     drive = {"name": name, "joint": name, "kp": repr(kp), "kv": repr(SETTLING * kp)}
     # Limits are stated for what is commanded; the joint itself may yield past them.
     if math.isfinite(joint.lower) and math.isfinite(joint.upper):
@@ -260,7 +249,8 @@ class MujocoRest:
         except ValueError as error:
             raise InputError(f"MuJoCo refuses the exported MJCF: {error}") from None
         self._data = mujoco.MjData(self.model)
-        self._drives = [k for k in range(self.model.nu) if self._is_drive(k)]
+        joint, kinds = mujoco.mjtTrn.mjTRN_JOINT, self.model.actuator_trntype
+        self._drives = [k for k in range(self.model.nu) if kinds[k] == joint]
         self._driven = [
             int(self.model.jnt_dofadr[self.model.actuator_trnid[k, 0]]) for k in self._drives
         ]
@@ -268,11 +258,9 @@ class MujocoRest:
         stiffness[self._driven] = self.model.actuator_gainprm[self._drives, 0]
         self._compliance = 1.0 / stiffness
 
-    def _is_drive(self, k: int) -> bool:
-        return bool(self.model.actuator_trntype[k] == self._mujoco.mjtTrn.mjTRN_JOINT)
-
-    def settle(self, q: Array, force: Array) -> Any:
-        """MuJoCo's data (frames, sites) at rest, commanded to q (n,) under `force` (3,) N.
+    def sites(self, q: Array, force: Array, names: Sequence[str]) -> Array:
+        """Positions (len(names), 3) in m in the MJCF's world, at rest: commanded to q (n,) under
+        `force` (3,) N.
 
         Raises ElastocalError where no rest is found.
         """
@@ -285,20 +273,17 @@ class MujocoRest:
         x[self._driven] = q
         for _ in range(MAX_STEPS):
             r = self._residual(x)
-            slope = np.column_stack([self._slope(x, j) for j in range(len(x))])
+            h = DIFFERENCE_STEP * np.eye(len(x))
+            apart = [self._residual(x + dx) - self._residual(x - dx) for dx in h]
+            slope = np.column_stack(apart) / (2 * DIFFERENCE_STEP)
             step = np.linalg.solve(slope, r)
             x = x - step
             if not np.isfinite(x).all():
                 break
             if np.max(np.abs(step)) < TOLERANCE:
                 self._residual(x)
-                return self._data
+                return np.array([self._data.site(name).xpos.copy() for name in names])
         raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")
-
-    def sites(self, q: Array, force: Array, names: Sequence[str]) -> Array:
-        """Positions (len(names), 3) in m in the MJCF's world, at rest."""
-        data = self.settle(q, force)
-        return np.array([data.site(name).xpos.copy() for name in names])
 
     def _residual(self, x: Array) -> Array:
         data = self._data
@@ -309,8 +294,3 @@ class MujocoRest:
         self._mujoco.mj_fwdActuation(self.model, data)
         force = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
         return np.asarray(self._compliance * force)
-
-    def _slope(self, x: Array, j: int) -> Array:
-        h = np.zeros(len(x))
-        h[j] = DIFFERENCE_STEP
-        return (self._residual(x + h) - self._residual(x - h)) / (2 * DIFFERENCE_STEP)

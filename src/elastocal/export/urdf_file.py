@@ -27,41 +27,34 @@ from elastocal.units import Array
 # An XML library would write the whole file anew: other quotes, no comments before the root, other
 # white space.  Here a parser only says where the start tags stand; the text between is not touched.
 
+TAG = re.compile(rb"""(?:[^"'>]|"[^"]*"|'[^']*')*>""")
 DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')""")
 
 
 @dataclass
-class JointTags:
-    """Offsets of a joint's start tags in the UTF-8 bytes of the file; None where it has none."""
-
-    start: int
-    origin: int | None = None
-    child: int | None = None
-
-
-@dataclass
 class UrdfText:
-    """The text of a URDF and the edits to make; offsets count bytes of `data`, which is UTF-8."""
+    """The text of a URDF and the edits to make; offsets count bytes of `data`, which is UTF-8.
+
+    `joints`: joint → the offset of its start tag ("joint"), and of the first of each tag in it.
+    """
 
     data: bytes
-    joints: dict[str, JointTags]
+    joints: dict[str, dict[str, int]]
     end: int  # of the robot's content: where its end tag starts
     edits: list[tuple[int, int, bytes]] = field(default_factory=list)
 
     def set_origin(self, joint: str, attributes: Mapping[str, str]) -> None:
         """Replace xyz and rpy of a joint's <origin>, or give it one."""
         tags = self.joints[joint]
-        if tags.origin is not None:
-            self._set_attributes(tags.origin, attributes)
+        if "origin" in tags:
+            self._set_attributes(tags["origin"], attributes)
             return
-        after = _tag_end(self.data, tags.start)
-        self.edits.append((after, after, (element("origin", attributes)).encode()))
+        after = _tag_end(self.data, tags["joint"])
+        self.edits.append((after, after, element("origin", attributes).encode()))
 
     def set_child(self, joint: str, link: str) -> None:
         """Let a joint carry another link."""
-        tag = self.joints[joint].child
-        assert tag is not None, joint  # urdf_check has seen it
-        self._set_attributes(tag, {"link": link})
+        self._set_attributes(self.joints[joint]["child"], {"link": link})
 
     def append(self, text: str) -> None:
         """Add elements at the end of the robot."""
@@ -104,19 +97,16 @@ def read_urdf_text(path: Path) -> UrdfText:
     found = UrdfText(data, {}, len(data))
     parser = expat.ParserCreate()
     stack: list[str] = []
-    current: list[JointTags] = []
+    tags: dict[str, int] = {}
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal tags
         local, at = tag.rpartition(":")[2], parser.CurrentByteIndex
         stack.append(local)
         if len(stack) == 2 and local == "joint":
-            current[:] = [JointTags(at)]
-            found.joints[attributes["name"].strip()] = current[0]
+            tags = found.joints[attributes["name"].strip()] = {"joint": at}
         elif len(stack) == 3 and stack[1] == "joint":
-            if local == "origin" and current[0].origin is None:
-                current[0].origin = at
-            elif local == "child" and current[0].child is None:
-                current[0].child = at
+            tags.setdefault(local, at)
 
     def end(tag: str) -> None:
         stack.pop()
@@ -146,14 +136,9 @@ def _as_utf8(path: Path) -> bytes:
 
 def _tag_end(data: bytes, start: int) -> int:
     """Offset just after the `>` that closes the tag at `start`; one in quotes does not."""
-    quote = None
-    for k in range(start, len(data)):
-        c = data[k : k + 1]
-        if quote is None and c == b">":
-            return k + 1
-        if c in (b'"', b"'"):
-            quote = c if quote is None else None if c == quote else quote
-    raise AssertionError("a parsed tag ends")
+    tag = TAG.match(data, start)
+    assert tag, "a parsed tag ends"
+    return tag.end()
 
 
 # The calibrated arm as URDF: the user's own file with corrected joint origins.
@@ -229,14 +214,15 @@ def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
     return frames | {LOAD_POINT: load}
 
 
-def fixed_joint(name: str, parent: str, child: str, T: Array) -> str:
-    """A fixed joint as one line."""
+def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
+    """Lines of link `new` and the fixed joint parent → child, one of which is `new`."""
     inside = [
         element("parent", {"link": parent}),
         element("child", {"link": child}),
         element("origin", origin_attributes(T)),
     ]
-    return f'<joint name={quoteattr(name)} type="fixed">{"".join(inside)}</joint>'
+    head = f'<joint name={quoteattr(f"{new}_joint")} type="fixed">'
+    return [element("link", {"name": new}), f"{head}{''.join(inside)}</joint>"]
 
 
 def comment(text: str) -> str:
@@ -298,7 +284,7 @@ def _fixed(tree: Tree, text: UrdfText, new: str, parent: str, child: str, T: Arr
             f"{tree.path}: {what} stands where export would add its own; rename it, "
             f"or leave the frame out ({option('frames', False)}, or no {option('base_frame')})"
         )
-    return [element("link", {"name": new}), fixed_joint(name, parent, child, T)]
+    return fixed_link(new, parent, child, T)
 
 
 def _origin(joint: UrdfJoint) -> Array:
@@ -333,20 +319,17 @@ def new_urdf(pieces: ExportNumbers, frames: Frames, note: str) -> str:
     chain = pieces.calibrated_chain()
     lines = []
     if frames.base:
-        lines += [element("link", {"name": TRACKER})]
-        lines += [fixed_joint(f"{TRACKER}_joint", TRACKER, BASE, pieces.T_tracker_base)]
+        lines += fixed_link(TRACKER, TRACKER, BASE, pieces.T_tracker_base)
     lines += [element("link", {"name": BASE})]
     parent = BASE
     for i, joint in enumerate(chain.joints, start=1):
         lines += _link(f"link_{i}", chain.masses[i - 1] if chain.masses else None)
         lines += _joint(joint, parent, f"link_{i}")
         parent = f"link_{i}"
-    lines += [element("link", {"name": FLANGE})]
-    lines += [fixed_joint(f"{FLANGE}_joint", parent, FLANGE, chain.flange_placement)]
+    lines += fixed_link(FLANGE, parent, FLANGE, chain.flange_placement)
     if frames.tool:
         for name, T in tool_frames(pieces).items():
-            lines += [element("link", {"name": name})]
-            lines += [fixed_joint(f"{name}_joint", FLANGE, name, T)]
+            lines += fixed_link(name, FLANGE, name, T)
     head = ['<?xml version="1.0" encoding="UTF-8"?>', f"<!-- {comment(note)} -->"]
     body = [f"  {line}" for line in lines]
     return "\n".join([*head, f"<robot name={quoteattr(chain.name)}>", *body, "</robot>"]) + "\n"
@@ -378,12 +361,7 @@ def _joint(joint: Joint, parent: str, child: str) -> list[str]:
         f"  {element('axis', {'xyz': numbers(joint.axis)})}",
     ]
     if kind != "continuous":
-        lower, upper = max(joint.lower, -NO_LIMIT), min(joint.upper, NO_LIMIT)
-        limit = {
-            "lower": repr(float(lower)),
-            "upper": repr(float(upper)),
-            "effort": "0",
-            "velocity": "0",
-        }
-        lines += [f"  {element('limit', limit)}"]
+        ends = {"lower": max(joint.lower, -NO_LIMIT), "upper": min(joint.upper, NO_LIMIT)}
+        limit = {name: repr(float(end)) for name, end in ends.items()}
+        lines += [f"  {element('limit', limit | {'effort': '0', 'velocity': '0'})}"]
     return [*lines, "</joint>"]

@@ -37,10 +37,10 @@ from elastocal.identification.weighted_problem import (
     stated_covariance,
     whitener,
 )
+from elastocal.measurements import available_noise, polar_axes
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.text import did_you_mean
-from elastocal.tracker_noise import available_noise, polar_axes
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which noise model: what the readings allow is tried, and an information criterion decides.

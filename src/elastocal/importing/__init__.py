@@ -3,11 +3,10 @@
 from elastocal import loaded_on_demand
 
 ROOMS = {
-    "export_columns": "wanted",
     "foreign_text": "Clock Text krl_rows rapid_rows read_lines",
-    "import_files": "Imported",
-    "joining": "groups_alike standstills",
-    "mapping_file": "preset_text read_mapping",
+    "assemble": "Imported",
+    "joining": "dwells groups_alike",
+    "mapping_file": "preset_text read_mapping wanted",
     "records": "Records Understood with_positions",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]

@@ -1,10 +1,17 @@
-"""Points and their joint values → the rows of the measurement table, if they are plausible."""
+"""From exported files to a validated measurement table: the whole of `elastocal import`.
+
+Points and their joint values become rows, which are judged by their units and by the robot of the
+cell.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +20,32 @@ from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification.start import RegistrationProblem, register
-from elastocal.importing.joining import DEFAULT, Joined, PooledRecords, groups_alike
-from elastocal.importing.mapping_file import JoinTable, LoadStatesTable, MappingTable
+from elastocal.importing.joining import (
+    DEFAULT,
+    Joined,
+    PooledRecords,
+    groups_alike,
+    join,
+    joint_stems,
+    pooled,
+    with_joints,
+)
+from elastocal.importing.mapping_file import (
+    ImportMapping,
+    JoinTable,
+    LoadStatesTable,
+    MappingTable,
+    SourceTable,
+    UnitsTable,
+)
+from elastocal.importing.records import (
+    Records,
+    Understood,
+    is_spherical,
+    read_records,
+    with_labels,
+    with_positions,
+)
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.choice import load_chain
@@ -22,8 +53,6 @@ from elastocal.model.manipulator import Model
 from elastocal.tables import Family, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, convert, quantities
-
-# Points and their joint values → the checked measurement table.
 
 GRAVITY = 9.80665  # m/s², standard
 UNLOADED = ("none", "unloaded", "0")
@@ -54,10 +83,9 @@ def forces_of(
         )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in (loads or {}).items():
-        down = stated.mass_kg * GRAVITY if isinstance(stated, LoadStatesTable) else 0.0
-        known[name] = np.array(
-            [0.0, 0.0, -down] if isinstance(stated, LoadStatesTable) else list(stated), dtype=float
-        ) + 0.0  # no -0.0  # fmt: skip
+        if isinstance(stated, LoadStatesTable):
+            stated = np.array([0.0, 0.0, -stated.mass_kg * GRAVITY])
+        known[name] = stated + 0.0  # no -0.0
     for i, name in enumerate(named):
         if name not in known:
             raise InputError(
@@ -102,21 +130,20 @@ def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joine
     settings = mapping.join or JoinTable()
     rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
     numbers, units = _numbers(points, log, joined, rows)
-    n_joints = sum(1 for stem in numbers if stem[0] == "q" and stem[1:].isdigit())
-    if not n_joints:
+    stems = joint_stems(numbers)
+    if not stems:
         raise InputError(
             f"{where}: no joint values; map q1_deg … in [source.columns], or add a [[source]] with "
             'role = "joints"'
         )
     kinds = tuple(
-        "revolute" if "angle" in quantities(units[f"q{j + 1}"]) else "prismatic"
-        for j in range(n_joints)
+        "revolute" if "angle" in quantities(units[stem]) else "prismatic" for stem in stems
     )
     forces = forces_of(where, points, mapping.loads)
     if forces is not None:
         for k, axis in enumerate("xyz"):
             numbers[f"force_{axis}"], units[f"force_{axis}"] = forces[rows, k], "N"
-    q = np.column_stack([numbers[f"q{j + 1}"] for j in range(n_joints)])
+    q = np.column_stack([numbers[stem] for stem in stems])
     spread = (log or points).spread(
         settings.same_pose_deg or SAME_DEG, settings.same_pose_mm or SAME_MM
     )
@@ -134,7 +161,9 @@ def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joine
     for family in families(kinds).values():
         if family.name not in LABELS:
             columns |= _family(where, family, numbers, units)
-    time = points.time if points.time is not None else _of_log(log, joined)
+    time = points.time
+    if time is None and log is not None and joined is not None and log.time is not None:
+        time = log.time[joined.row]
     if time is not None:
         columns["time_s"] = np.round(time[rows] - time[rows].min(), 6)
     if any(points.names):
@@ -142,12 +171,6 @@ def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joine
     origin = [points.where(int(i)) for i in rows]
     columns["note_source"] = origin
     return Assembled(columns, kinds, origin, tuple(warnings))
-
-
-def _of_log(log: PooledRecords | None, joined: Joined | None) -> Array | None:
-    if log is None or joined is None or log.time is None:
-        return None
-    return log.time[joined.row]
 
 
 def _numbers(
@@ -201,7 +224,7 @@ def _repeats(
 ) -> NDArray[np.int64]:
     stated = points.labels.get("repeat")
     count: dict[tuple, int] = {}
-    observed: dict[tuple, int] = {}
+    known: dict[tuple, int] = {}
     repeats = np.zeros(len(rows), dtype=np.int64)
     for k, (i, key) in enumerate(zip(rows, keys, strict=True)):
         if stated is None:
@@ -213,7 +236,7 @@ def _repeats(
             raise InputError(f"{points.where(int(i))}: repeat {quoted(text)} is no whole number; "
                              "correct the pattern or the column")  # fmt: skip
         repeats[k] = int(text)
-        first = observed.setdefault((*key, int(text)), k)
+        first = known.setdefault((*key, int(text)), k)
         if first != k:
             raise InputError(
                 f"{points.where(int(i))}: repeat {text} of configuration {key[0]}"
@@ -269,8 +292,6 @@ def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measu
     markers: tuple[str, ...] = ()
     observe = "position" if any(c.startswith("x_") for c in made.columns) else "distance"
     if cell is not None:
-        from elastocal.model.choice import load_chain
-
         kinds = load_chain(cell).kinds
         markers = tuple(cell.tool.markers)
         observe = cell.model.observe
@@ -337,15 +358,9 @@ def _joints(made: Assembled, table: Measurements) -> list[str]:
             "read as radians? Map q#_deg"
         ]
     several = len(np.unique(table.q, axis=0)) >= 5
-    if (
-        several
-        and first.endswith("_deg")
-        and np.degrees(np.ptp(q, axis=0)).max() < (SMALLEST_SPREAD_DEG)
-    ):
-        return [
-            f"no joint moves by more than {np.degrees(np.ptp(q, axis=0)).max():.3g}°: radians read "
-            "as degrees? Map q#_rad"
-        ]
+    span = np.degrees(np.ptp(q, axis=0)).max()
+    if several and first.endswith("_deg") and span < SMALLEST_SPREAD_DEG:
+        return [f"no joint moves by more than {span:.3g}°: radians read as degrees? Map q#_rad"]
     still = [f"joint {j + 1}" for j in range(table.q.shape[1]) if np.ptp(table.q[:, j]) == 0]
     if several and still:
         return [f"{listed(still)} never moved; is it mapped to the right column?"]
@@ -436,7 +451,9 @@ def against_cell(
 
 
 def _fit(cell: Cell, table: Measurements, spherical: bool) -> NominalFit:
-    rigid = _rigid(cell, table.marker_names)
+    # The nominal arm without effects, its markers at the flange.
+    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
+    rigid = Model(replace(cell, tool=tool, model=ModelSpec()))
     light = np.flatnonzero(~np.any(table.force != 0, axis=1))
     rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
     if len(rows) > SAMPLE:
@@ -460,12 +477,6 @@ def _fit(cell: Cell, table: Measurements, spherical: bool) -> NominalFit:
         "mends that: check the robot of the cell, offsets of joints, and which joint values belong "
         "to which point",
     )
-
-
-def _rigid(cell: Cell, markers: tuple[str, ...]) -> Model:
-    """The nominal arm without effects, its markers at the flange."""
-    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in markers})
-    return Model(replace(cell, tool=tool, model=ModelSpec()))
 
 
 def _error(model: Model, table: Measurements) -> float:
@@ -502,57 +513,161 @@ def _linear_error(model: Model, table: Measurements) -> float:
 
 def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Measurements]]:
     """Mistakes that are often made, each undone."""
-
-    def other(q: Array) -> Measurements:
-        return replace(table, q=q)
-
-    def other_place(position: Array) -> Measurements:
-        return replace(table, position=position)
-
+    other = partial(replace, table)
     position = np.asarray(table.position)
-    for factor, words in ((1e-3, "mm read as m"), (1e3, "m read as mm"),
-                          (25.4, "inches read as mm"),
-                                                    (1 / 25.4, "mm read as inches")):  # fmt: skip
-        yield f"if positions were {words}", other_place(position * factor)
+    for factor, words in (
+        (1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
+        (1 / 25.4, "mm read as inches"),
+    ):  # fmt: skip
+        yield f"if positions were {words}", other(position=position * factor)
     # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
     mirrored = position[:, [1, 0, 2]]
     if spherical:
         yield (
             "with azimuths counted the other way (azimuth = … in [[source]])",
-            other_place(mirrored),
+            other(position=mirrored),
         )
         level = np.hypot(*position[:, :2].T)
         turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
         yield (
             "with zenith angles read as elevations or the other way round",
-            other_place(np.column_stack([position[:, :2] * turned[:, None], level])),
+            other(position=np.column_stack([position[:, :2] * turned[:, None], level])),
         )
     yield (
         "with two columns of the positions swapped, or the sign of one turned round (now they "
         "make a left-handed frame),",
-        other_place(mirrored),
+        other(position=mirrored),
     )
-    yield "if joints were degrees read as radians", other(np.radians(table.q))
-    yield "if joints were radians read as degrees", other(np.degrees(table.q))
+    yield "if joints were degrees read as radians", other(q=np.radians(table.q))
+    yield "if joints were radians read as degrees", other(q=np.degrees(table.q))
     n = table.q.shape[1]
     for j in range(n):
         q = table.q.copy()
         q[:, j] *= -1
-        yield f"with the sign of joint {j + 1} turned round", other(q)
+        yield f"with the sign of joint {j + 1} turned round", other(q=q)
     for factor in (1.0, -1.0):
         if n >= 3:
             q = table.q.copy()
             q[:, 2] += factor * q[:, 1]
-            yield f"with coupling {{ joint = 3, of = 2, factor = {factor:g} }}", other(q)
+            yield f"with coupling {{ joint = 3, of = 2, factor = {factor:g} }}", other(q=q)
     for j in range(n):
         for degrees in (90, -90, 180):
             q = table.q.copy()
             q[:, j] += np.radians(degrees)
-            yield f"with offset_deg {degrees} at joint {j + 1}", other(q)
+            yield f"with offset_deg {degrees} at joint {j + 1}", other(q=q)
     visit = np.cumsum(np.r_[0, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
     poses = np.array([table.q[visit == v][0] for v in range(visit.max() + 1)])
     for shift, words in ((1, "earlier"), (-1, "later")):
         yield (
             f"with the joint values of one pose {words}",
-            other(np.roll(poses, shift, axis=0)[visit]),
+            other(q=np.roll(poses, shift, axis=0)[visit]),
         )
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What was read and made of it.
+
+    `table` is the measurement table as `measurements.read_measurements` reads `text`;
+    `refused` says why the robot of the cell cannot have measured it, "" where it can.
+    """
+
+    understood: tuple[Understood, ...]
+    assembled: Assembled
+    joined: Joined | None
+    text: str
+    table: Measurements
+    warnings: tuple[str, ...]
+    fit: NominalFit | None
+    refused: str
+
+
+def import_files(
+    files: Sequence[Path], mapping: ImportMapping, cell: Cell | None = None, name: str = "data.csv"
+) -> Imported:
+    """Read `files` as `mapping` says, join, convert, and validate the measurement table.
+
+    `cell`: the robot that the table must fit: number and kind of joints, markers, limits;
+    `name`: what messages call the table.  Nothing is written.
+    Raises InputError that names file, line, column, what was found and what to do.
+    """
+    where, table = mapping.path, mapping.table
+    names: tuple[str, ...] = ()
+    if cell is not None:
+        names = tuple(joint.name for joint in load_chain(cell).joints)
+    units = table.units or UnitsTable()
+    records: dict[str, list[Records]] = {"points": [], "joints": []}
+    understood = []
+    spherical = False
+    for path, source in _assigned(where, files, mapping.sources):
+        found = with_labels(where, read_records(where, path, source, units), source.names)
+        spherical = spherical or is_spherical(found)
+        found = with_positions(found, clockwise=source.azimuth == "clockwise")
+        role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
+                               else "joints")  # fmt: skip
+        if role in ("joints", "both") and joint_stems(found.numbers):
+            found = with_joints(where, found, table.joints, names)
+        records["joints" if role == "joints" else "points"].append(found)
+        understood.append(found.understood)
+    if not records["points"]:
+        raise InputError(
+            f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "
+            'export, or set role = "points" in its [[source]]'
+        )
+    points = pooled(records["points"])
+    log = pooled(records["joints"]) if records["joints"] else None
+    if log is not None and not log.q.shape[1]:
+        raise InputError(
+            f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
+        )
+    joined = None if log is None else join(where, points, log, table.join)
+    made = assemble(where, points, log, joined, table)
+    text = table_text(made)
+    measured = validated(text, name, made, cell)
+    fit, refused = against_cell(cell, measured, made, spherical) if cell is not None else (None, "")
+    remarks = [] if joined is None else [r for r in joined.remarks if r.startswith("WARNING: ")]
+    warnings = [*(r.removeprefix("WARNING: ") for r in remarks), *made.warnings]
+    warnings += plausibility(made, measured, None if cell is None else cell.model.observe)
+    if fit is not None and fit.warning:
+        warnings.append(fit.warning)
+    return Imported(tuple(understood), made, joined, text, measured, tuple(warnings), fit, refused)
+
+
+def _assigned(
+    where: str, files: Sequence[Path], sources: Sequence[SourceTable]
+) -> list[tuple[Path, SourceTable]]:
+    """Each file with the source that reads it.
+
+    A file goes to the first source whose `files` pattern fits its name; sources without a pattern
+    share the rest: one takes them all, several take one file each, in order.
+    """
+    if not files:
+        raise InputError("no files to import; name the tracker's export and the joint log")
+    chosen: dict[int, SourceTable] = {}
+    for i, path in enumerate(files):
+        if path in files[:i]:
+            raise InputError(f"{path}: named twice; name each file once")
+        names = path.name, str(path)
+        for source in reversed(sources):
+            if any(fnmatchcase(name, p) for p in source.files or () for name in names):
+                chosen[i] = source
+    rest = [i for i in range(len(files)) if i not in chosen]
+    for source in sources:
+        if source.files and source not in chosen.values():
+            raise InputError(
+                f"{where}: no file fits files = {listed(map(quoted, source.files))}; the files are "
+                f"{listed((p.name for p in files), 8)}"
+            )
+    free = [source for source in sources if not source.files]
+    if len(free) == 1 and rest:
+        chosen |= dict.fromkeys(rest, free[0])
+    elif len(free) == len(rest):
+        chosen |= dict(zip(rest, free, strict=True))
+    else:
+        left = listed((str(files[i]) for i in rest), 8)
+        raise InputError(
+            f"{where}: {len(free)} sources without a files pattern for {len(rest)} files "
+            f'({left or "none left"}); give files = ["pattern"] in each [[source]], or one preset '
+            "per file"
+        )
+    return [(path, chosen[i]) for i, path in enumerate(files)]

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from elastocal.csv_lines import MAX_LINE, NUMBER, first_bad_cell
 from elastocal.errors import InputError
 from elastocal.files import decoded, open_input
 from elastocal.importing.mapping_file import TextSourceKeys
+from elastocal.tables import MAX_LINE, NUMBER, first_bad_cell
 from elastocal.text import quoted
 from elastocal.units import known_unit
 
@@ -32,10 +32,8 @@ DELIMITER_NAMES = {"tab": "\t", ";": ";", ",": ",", "space": " "}
 SAMPLE = 200  # lines that decide on the delimiter, and in which a header is looked for
 SHOWN = 120
 
-# Whether a list of cells is the header that a mapping asks for.
-IsHeader = Callable[[Sequence[str]], bool]
-# Whether cells hold numbers where a mapping expects them.
-IsData = Callable[[Sequence[str]], bool]
+# Whether the cells of a line are the header that a mapping asks for, or numbers where it has them.
+Judge = Callable[[Sequence[str]], bool]
 
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
 ISO = "ISO 8601"
@@ -92,14 +90,11 @@ def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
         wide = _wide(data)
         if wide:
             return decoded(source, data, SAVE_AS, wide, "UTF-16"), "UTF-16"
-        try:
-            return data.decode("utf-8"), "ASCII" if data.isascii() else "UTF-8"
-        except UnicodeDecodeError:
-            pass
-        try:
-            return data.decode("cp1252"), "Windows-1252"
-        except UnicodeDecodeError:
-            return data.decode("latin-1"), "Latin-1"
+        plain = "ASCII" if data.isascii() else "UTF-8"
+        for codec, name in (("utf-8", plain), ("cp1252", "Windows-1252")):
+            with suppress(UnicodeDecodeError):
+                return data.decode(codec), name
+        return data.decode("latin-1"), "Latin-1"
     codec = {"utf-8": "utf-8-sig"}.get(encoding, encoding)
     if encoding == "utf-16" and not data.startswith(codecs.BOM_UTF16):
         codec = _wide(data) or "utf-16-le"
@@ -110,10 +105,9 @@ def _wide(data: bytes) -> str | None:
     """UTF-16 without a byte order mark shows by zeros at every other place."""
     start = data[:4000]
     even, odd = start[0::2].count(0), start[1::2].count(0)
-    if odd > 0.4 * len(start) / 2 and even < odd / 4:
-        return "utf-16-le"
-    if even > 0.4 * len(start) / 2 and odd < even / 4:
-        return "utf-16-be"
+    for codec, many, few in (("utf-16-le", odd, even), ("utf-16-be", even, odd)):
+        if many > 0.4 * len(start) / 2 and few < many / 4:
+            return codec
     return None
 
 
@@ -163,7 +157,7 @@ class Rows:
 
 
 def table_rows(
-    text: Text, settings: TextSourceKeys, is_header: IsHeader | None, is_data: IsData
+    text: Text, settings: TextSourceKeys, is_header: Judge | None, is_data: Judge
 ) -> Rows:
     """The rows of a delimited table.
 
@@ -218,7 +212,7 @@ def _sniffed(
     content: list[tuple[int, str]],
     comments: list[tuple[int, str]],
     marks: tuple[str, ...],
-    is_header: IsHeader | None,
+    is_header: Judge | None,
 ) -> str:
     """The delimiter that leaves the most cells that are numbers; commas may be decimal marks.
 
@@ -249,16 +243,13 @@ class _Splitter:
         self.source, self.name = source, delimiter
         self.character = DELIMITER_NAMES[delimiter]
 
-    def _prepared(self, line: str) -> str:
-        return " ".join(line.split()) if self.name == "space" else line
-
     def one(self, number: int, line: str) -> list[str]:
         return next(cells for _, cells in self.all([(number, line)]))
 
     def all(self, lines: Sequence[tuple[int, str]]) -> Iterator[tuple[int, list[str]]]:
         """(line number, cells) of each line; a quotation mark that runs on is an error."""
         reader = csv.reader(
-            (self._prepared(line) for _, line in lines),
+            (" ".join(line.split()) if self.name == "space" else line for _, line in lines),
             delimiter=self.character, skipinitialspace=True,
         )  # fmt: skip
         before = 0
@@ -275,25 +266,21 @@ class _Splitter:
 
 def _named_header(
     split: _Splitter, content: list[tuple[int, str]], comments: list[tuple[int, str]],
-    marks: tuple[str, ...], is_header: IsHeader,
+    marks: tuple[str, ...], is_header: Judge,
 ) -> tuple[int, tuple[str, ...]]:  # fmt: skip
-    for number, line in content[:SAMPLE]:
-        cells = tuple(cell.strip() for cell in split.one(number, line))
-        if is_header(cells):
-            return number, cells
     # Some write the names of the columns as a comment.
-    for number, line in comments[:SAMPLE]:
-        bare = line
-        for mark in sorted(marks, key=len, reverse=True):
-            bare = bare.removeprefix(mark)
-        cells = tuple(cell.strip() for cell in split.one(number, bare))
-        if is_header(cells):
-            return number, cells
+    for some, off in ((content, ()), (comments, sorted(marks, key=len, reverse=True))):
+        for number, line in some[:SAMPLE]:
+            for mark in off:
+                line = line.removeprefix(mark)
+            cells = tuple(cell.strip() for cell in split.one(number, line))
+            if is_header(cells):
+                return number, cells
     return 0, ()
 
 
 def _unnamed_header(
-    text: Text, split: _Splitter, content: list[tuple[int, str]], is_data: IsData
+    text: Text, split: _Splitter, content: list[tuple[int, str]], is_data: Judge
 ) -> tuple[int, tuple[str, ...]]:
     before: tuple[int, list[str]] | None = None
     for number, line in content[:SAMPLE]:
@@ -390,16 +377,12 @@ class Clock:
 
     def seconds(self, text: str) -> float:
         """Seconds of one text.  Raises ValueError where no format fits."""
-        if self.chosen is None:
-            for candidate in (*self.formats, ISO):
-                try:
-                    value = _moment(text, candidate)
-                except ValueError:
-                    continue
+        for candidate in (self.chosen,) if self.chosen else (*self.formats, ISO):
+            with suppress(ValueError):
+                value = _moment(text, candidate)
                 self.chosen = candidate
                 return value
-            raise ValueError(text)
-        return _moment(text, self.chosen)
+        raise ValueError(text)
 
     def complaint(self, where: str, text: str) -> InputError:
         """What to say of a text that `seconds` did not take."""
@@ -490,7 +473,7 @@ def _rapid_statement(
         found.ignored.append((count(start + declared.start(2)), f"{name} is {kind}: {reason}"))
         return
     pairs = [
-        (match, [_parts_of(match[1]), _parts_of(match[2])])
+        (match, [[part.strip() for part in match[k].split(",")] for k in (1, 2)])
         for match in _RAPID_PAIR.finditer(statement)
     ]
     targets = [(m, parts) for m, parts in pairs if len(parts[0]) == 6 and len(parts[1]) == 6]
@@ -509,25 +492,19 @@ def _rapid_statement(
         found.rows.append((line, [label, *cells]))
 
 
-def _parts_of(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",")]
-
-
 def _complete(text: Text, found: Rows, what: str) -> Rows:
     if not found.rows:
+        n = len(found.ignored)
+        passed_over = f" ({n} Cartesian positions passed over)" if n else ""
         raise InputError(
-            f"{text.source}: {what} in {len(text.lines)} lines"
-            f"{_passed_over(found)}; check the file, or its format in [source.text]"
+            f"{text.source}: {what} in {len(text.lines)} lines{passed_over}; check the file, or "
+            "its format in [source.text]"
         )
     # Axes that no row has (E1 … of a robot without them) are no columns.
-    used = [i for i in range(len(found.header)) if any(cells[i] for _, cells in found.rows)]
-    used = sorted({0, *used})
+    names = range(len(found.header))
+    used = [i for i in names if i == 0 or any(cells[i] for _, cells in found.rows)]
     rows = [(line, [cells[i] for i in used]) for line, cells in found.rows]
     return replace(found, header=tuple(found.header[i] for i in used), rows=rows)
-
-
-def _passed_over(found: Rows) -> str:
-    return f" ({len(found.ignored)} Cartesian positions passed over)" if found.ignored else ""
 
 
 def _uncommented(line: str, mark: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,14 +74,14 @@ def with_joints(
     return replace(records, numbers=numbers, units=own)
 
 
-def joint_stems(numbers: Sequence[str]) -> list[str]:
+def joint_stems(numbers: Iterable[str]) -> list[str]:
     """q1, q2 … among the columns, in order."""
     found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
     return sorted(found, key=lambda stem: int(stem[1:]))
 
 
 def _stems(records: Records) -> list[str]:
-    stems = joint_stems(list(records.numbers))
+    stems = joint_stems(records.numbers)
     wrong = [stem for i, stem in enumerate(stems, 1) if stem != f"q{i}"]
     if wrong:
         raise InputError(
@@ -111,13 +111,13 @@ def _order(
                 'joint# = "name_#0" to [source.columns], or use order'
             )
         return None
-    observed = list(zip(*columns, strict=True))
-    wanted = joints.names or (model_names if set(model_names) <= set(observed[0]) else None)
+    found = list(zip(*columns, strict=True))
+    wanted = joints.names or (model_names if set(model_names) <= set(found[0]) else None)
     if not wanted:
         return None
     orders: dict[tuple[str, ...], list[int]] = {}
     rows = []
-    for i, names in enumerate(observed):
+    for i, names in enumerate(found):
         if names not in orders:
             absent = [name for name in wanted if name not in names]
             if absent:
@@ -181,14 +181,12 @@ class PooledRecords:
     @property
     def q(self) -> Array:
         """(n, joints) joint values in the units of their columns."""
-        stems = joint_stems(list(self.numbers))
-        return (
-            np.column_stack([self.numbers[s] for s in stems]) if stems else np.zeros((len(self), 0))
-        )
+        stems = joint_stems(self.numbers)
+        return np.column_stack([np.zeros((len(self), 0)), *(self.numbers[s] for s in stems)])
 
     @property
     def q_units(self) -> tuple[str, ...]:
-        return tuple(self.units[stem] for stem in joint_stems(list(self.numbers)))
+        return tuple(self.units[stem] for stem in joint_stems(self.numbers))
 
     def spread(self, deg: float, mm: float) -> Array:
         """(joints,) these tolerances in the unit of each joint."""
@@ -212,7 +210,11 @@ def pooled(records: Sequence[Records]) -> PooledRecords:
         _same("labels", first, other, set(first.labels) - loads, set(other.labels) - loads)
         _same("times", first, other, {"time"} if first.time is not None else set(),
               {"time"} if other.time is not None else set())  # fmt: skip
-    units = {stem: _common([r.units[stem] for r in records]) for stem in first.numbers}
+    units = {}
+    for stem in first.numbers:
+        unit = first.units[stem]
+        alike = all(r.units[stem] == unit for r in records)
+        units[stem] = unit if alike else DEFAULT[quantities(unit)[0]]
     numbers = {
         stem: np.concatenate([convert(r.numbers[stem], r.units[stem], unit) for r in records])
         for stem, unit in units.items()
@@ -248,10 +250,6 @@ def _loads(records: Records) -> list[str]:
     return named if named is not None else [str(records.load)] * len(records)
 
 
-def _common(units: list[str]) -> str:
-    return units[0] if len(set(units)) == 1 else DEFAULT[quantities(units[0])[0]]
-
-
 def _same(what: str, first: Records, other: Records, one: set[str], two: set[str]) -> None:
     if one == two:
         return
@@ -266,7 +264,7 @@ CHUNK = 1024
 
 
 @dataclass(frozen=True)
-class Standstill:
+class Dwell:
     """Rows `first` to `last` of the log, both included; the arm's `q` (n,) then (median)."""
 
     first: int
@@ -274,14 +272,14 @@ class Standstill:
     q: Array
 
 
-def standstills(time: Array, q: Array, still: Array, shortest: float) -> list[Standstill]:
+def dwells(time: Array, q: Array, still: Array, shortest: float) -> list[Dwell]:
     """The longest runs of rows in which no joint moves by more than `still`.
 
     `time` (m,) s, rising; `q` (m, n); `still` (n,): the largest max - min of each joint within a
-    standstill, in the unit of q; `shortest` s between its first and last row.  Runs are taken from
+    dwell, in the unit of q; `shortest` s between its first and last row.  Runs are taken from
     the start of the log on, each as long as it can be; shorter ones count as motion.
     """
-    found: list[Standstill] = []
+    found: list[Dwell] = []
     start, m = 0, len(time)
     while start + 1 < m:
         # The first row with which the run is long enough.
@@ -295,7 +293,7 @@ def standstills(time: Array, q: Array, still: Array, shortest: float) -> list[St
             start += int(moved[-1]) + 1
             continue
         end = _last(q, start, still)
-        found.append(Standstill(start, end, np.median(q[start : end + 1], axis=0)))
+        found.append(Dwell(start, end, np.median(q[start : end + 1], axis=0)))
         start = end + 1
     return found
 
@@ -446,11 +444,11 @@ def _visits(points: PooledRecords, chosen: IntArray, per_pose: int | None) -> In
     markers = [points.labels["marker"][i] for i in chosen] if "marker" in points.labels else []
     if len(set(markers)) < 2:
         return np.arange(n)
-    visit, observed, codes = 0, set[str](), []
+    visit, measured, codes = 0, set[str](), []
     for k, marker in enumerate(markers):
-        if marker in observed and marker != markers[k - 1]:
-            visit, observed = visit + 1, set()
-        observed.add(marker)
+        if marker in measured and marker != markers[k - 1]:
+            visit, measured = visit + 1, set()
+        measured.add(marker)
         codes.append(visit)
     return np.array(codes)
 
@@ -569,7 +567,7 @@ def _by_standstill(
     tolerance = TOLERANCE_S if settings.tolerance_s is None else settings.tolerance_s
     still = log.spread(settings.still_deg or STILL_DEG, settings.still_mm or STILL_MM)
     shortest = STILL_S if settings.still_s is None else settings.still_s
-    found = standstills(clock, log.q[order], still, shortest)
+    found = dwells(clock, log.q[order], still, shortest)
     if not found:
         raise InputError(
             f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
@@ -577,14 +575,9 @@ def _by_standstill(
         )
     first = np.array([clock[s.first] for s in found])
     last = np.array([clock[s.last] for s in found])
-    # 0 within a standstill, else the time to its nearer end: (points, standstills) at most a few
-    # thousand each.
-    best = np.zeros(len(at), dtype=np.int64)
-    apart = np.zeros(len(at))
-    for i, t in enumerate(at):
-        away = np.maximum(np.maximum(first - t, t - last), 0.0)
-        best[i] = int(np.argmin(away))
-        apart[i] = away[best[i]]
+    # 0 within a dwell, else the time to its nearer end.
+    best = np.array([np.argmin(np.maximum(np.maximum(first - t, t - last), 0.0)) for t in at])
+    apart = np.maximum(np.maximum(first[best] - at, at - last[best]), 0.0)
     good = apart <= tolerance
     q = np.array([s.q for s in found])[best]
     row = np.where(good, order[np.array([s.first for s in found])[best]], -1)

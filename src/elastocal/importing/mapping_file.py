@@ -1,10 +1,14 @@
-"""The mapping file: what the columns, names and units of somebody's export mean."""
+"""The mapping file: what the columns, names and units of somebody's export mean.
+
+A mapping and its presets are read and checked first; against a file they then say which of its
+columns fills which column of the measurement table, and in which unit.
+"""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -23,14 +27,18 @@ from elastocal.config import (
     place,
     read_toml,
 )
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
+from elastocal.measurements import families
+from elastocal.tables import column
 from elastocal.text import did_you_mean, listed, quoted
+from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
 # The keys of a mapping file: what the columns of somebody's export mean.
 
 Place = Annotated[int, Field(ge=1)] | Text
 Where = Place | Annotated[list[Place], Field(min_length=1)]
 Texts = Annotated[list[Text], Field(min_length=1)]
+PRESETS = ("spatialanalyzer", "polyworks", "leica", "faro", "spherical", "kuka", "abb", "ros")
 COLUMNS = (
     'places in the file by column of the measurement table, as in x_mm = "X [mm]", q1_deg = 5, '
     'q#_deg = "A#" or name = "Point"'
@@ -70,7 +78,7 @@ class NamesTable(Table):
 class SourceTable(Table):
     """One kind of file."""
 
-    preset: Text | None = key("the name of a preset (elastocal import --help lists them)")
+    preset: Text | None = key(f"the name of a preset: {', '.join(PRESETS)}")
     files: Texts | None = key('patterns of file names, as in ["loaded_*.txt"]')
     role: Literal["points", "joints", "both"] | None = key('"points", "joints" or "both"')
     load: Text | None = key("the name of a load of [loads], for all of these files")
@@ -148,13 +156,12 @@ class MappingTable(Table):
 # Reads a mapping file and the presets: TOML → checked tables, the user's keys on top.
 
 MAX_BYTES = 1_000_000
-PRESETS = ("spatialanalyzer", "polyworks", "leica", "faro", "spherical", "kuka", "abb", "ros")
 # A key of [source.columns] with its unit cut off: what two keys for the same column share.
 _UNIT = re.compile(r"_[A-Za-z]+$")
 
 
 @dataclass(frozen=True)
-class Mapping:
+class ImportMapping:
     """`path` says in messages where it was stated; `sources` have their presets merged in."""
 
     path: str
@@ -172,18 +179,19 @@ def preset_text(name: str) -> str:
     return (folder / f"{name}.toml").read_text(encoding="utf-8")
 
 
-def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> Mapping:
+def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> ImportMapping:
     """The mapping of a file, of presets (one source each), or of both.
 
     A mapping file without [[source]] tables says how to join and convert what `presets` read.
     Raises InputError that names file, key, what the key takes and what was found.
     """
-    where = "--preset" if path is None else str(path)
+    where = option("presets") if path is None else str(path)
     data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file", MAX_BYTES)
     if presets and data.get("source"):
         raise InputError(
-            f"{where}: has [[source]] tables, so --preset {presets[0]} has no place; write "
-            f'preset = "{presets[0]}" into the [[source]] it is for, or leave --preset out'
+            f"{where}: has [[source]] tables, so {option('presets', presets[0])} has no place; "
+            f'write preset = "{presets[0]}" into the [[source]] it is for, or leave '
+            f"{option('presets')} out"
         )
     if presets:
         data = {**data, "source": [{"preset": name} for name in presets]}
@@ -191,7 +199,7 @@ def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> Mappin
     if not data.get("source"):
         raise InputError(
             f'{where}: no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or '
-            "give --preset"
+            f"give {option('presets')}"
         )
     merged = {**data, "source": [_with_preset(where, s) for s in data["source"]]}
     table = checked(MappingTable, merged, where)
@@ -202,17 +210,22 @@ def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> Mappin
                 f"{where}: {place('source', k)} has neither preset nor columns; say where the "
                 'numbers stand, as in x_mm = "X"'
             )
-    return Mapping(where, table, tuple(sources))
+    return ImportMapping(where, table, tuple(sources))
 
 
-def with_units(mapping: Mapping, length: str | None, angle: str | None) -> Mapping:
-    """The mapping with the units of the command line, where given, instead of its own."""
-    given = {k: v for k, v in (("length", length), ("angle", angle)) if v is not None}
+def with_units(
+    mapping: ImportMapping, length_unit: str | None, angle_unit: str | None
+) -> ImportMapping:
+    """The mapping with these units, where given, instead of its own."""
+    given = {k: v for k, v in (("length", length_unit), ("angle", angle_unit)) if v is not None}
     if not given:
         return mapping
     data = mapping.table.model_dump(exclude_none=True)
     data["units"] = data.get("units", {}) | given
-    return replace(mapping, table=checked(MappingTable, data, "--length-unit, --angle-unit"))
+    return replace(
+        mapping,
+        table=checked(MappingTable, data, f"{option('length_unit')}, {option('angle_unit')}"),
+    )
 
 
 def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
@@ -237,3 +250,287 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
         }
         merged[part] = kept | source.get(part, {})
     return merged
+
+
+# Which column of an export fills which column of the measurement table, and in which unit.
+
+TEXTS = ("name", "configuration", "marker", "repeat", "load", "time_text", "joint#")
+AUTO = "auto"
+_NUMBERED = re.compile(r"(q|torque_|approach_|joint)([1-9]\d?|#)((?:_[A-Za-z]+)?)")
+
+
+def _quantities() -> dict[str, tuple[str, ...]]:
+    """What each column of the measurement table, and each that becomes some of them, measures."""
+    found: dict[str, tuple[str, ...]] = {"range": ("length",)}
+    found |= dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",))
+    for kind in ("revolute", "prismatic"):
+        for family in families((kind,)).values():
+            for stem, units in family.units.items():
+                name = re.sub(r"^(q|torque_|approach_)1$", r"\1#", stem)
+                if name not in TEXTS:
+                    known = found.get(name, ())
+                    found[name] = tuple(dict.fromkeys((*known, *quantities(units[0]))))
+    return found
+
+
+_QUANTITIES = _quantities()
+
+
+@dataclass(frozen=True)
+class ColumnKey:
+    """A column to fill: `stem` ("x", "q3", "q#"), `unit` ("" where there is none, or "auto").
+
+    `at`: where it stands in the file; `required`: it is of [source.columns], not [source.optional].
+    """
+
+    key: str
+    stem: str
+    unit: str
+    is_text: bool = False
+    at: Where = ""
+    required: bool = True
+
+    @property
+    def parts(self) -> list[str | int]:
+        """The places in the file; several only for texts."""
+        return list(self.at) if isinstance(self.at, list) else [self.at]
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What its numbers measure."""
+        return _QUANTITIES[re.sub(r"^(q|torque_|approach_)\d+$", r"\1#", self.stem)]
+
+    @property
+    def is_template(self) -> bool:
+        """q#: one column for each joint."""
+        return self.stem.endswith("#")
+
+    def numbered(self, i: int) -> ColumnKey:
+        """The column of joint i (from 1) of a template."""
+        key, stem = self.key.replace("#", str(i)), f"{self.stem[:-1]}{i}"
+        return replace(self, key=key, stem=stem, required=self.required and i == 1)
+
+
+def column_key(where: str, key: str) -> ColumnKey:
+    """What a key of [source.columns] means.
+
+    Raises InputError for an unknown column, a missing unit and a unit that it cannot have.
+    """
+    numbered = _NUMBERED.fullmatch(key)
+    if numbered:
+        family, number, tail = numbered.groups()
+        if family == "joint" and not tail:
+            return ColumnKey(key, key, "", is_text=True)
+        stem, unit, general = f"{family}{number}", tail[1:], f"{family}#"
+    else:
+        if key in TEXTS:
+            return ColumnKey(key, key, "", is_text=True)
+        stem, unit = key, ""
+        if key not in _QUANTITIES:
+            stem, _, unit = key.rpartition("_")
+        general = stem
+    if general not in _QUANTITIES:
+        ways = [column(stem, next(iter(FACTORS[q[0]]))) for stem, q in _QUANTITIES.items()]
+        valid = [*TEXTS, *ways]
+        raise InputError(
+            f"{where}: unknown column {quoted(key)}{did_you_mean(key, valid)}; columns are "
+            f"{listed(valid, 40)}"
+        )
+    units = [u for quantity in _QUANTITIES[general] for u in FACTORS[quantity]]
+    if unit == AUTO and units != [""]:
+        return ColumnKey(key, stem, AUTO)
+    if unit not in units:
+        ways = [column(stem, u) for u in units]
+        what = f"the unit {unit} is not one of its" if unit else "has no unit"
+        raise InputError(f"{where}: column {quoted(key)}: {what}; write {listed(ways)}")
+    return ColumnKey(key, stem, unit)
+
+
+MOST_JOINTS = 64
+
+
+@dataclass(frozen=True)
+class FileColumn:
+    """`index` into the cells of a row (several are joined, for texts), the file's own name."""
+
+    target: ColumnKey
+    index: tuple[int, ...]
+    header: str
+    unit: str
+
+
+def wanted(
+    where: str, required: Mapping[str, Where], optional: Mapping[str, Where]
+) -> tuple[ColumnKey, ...]:
+    """The keys of [source.columns] (required) and [source.optional], checked.
+
+    Raises InputError for unknown columns and columns given twice.
+    """
+    filled: dict[str, str] = {}
+    result: list[ColumnKey] = []
+    for part in (required, optional):
+        for target in [
+            replace(column_key(where, name), at=at, required=part is required)
+            for name, at in part.items()
+        ]:
+            # Seconds and nanoseconds of one clock stand in two columns, and are added.
+            name = target.key if target.stem == "time" else target.stem
+            if name in filled:
+                raise InputError(
+                    f"{where}: {filled[name]} and {target.key} fill the same column; keep one"
+                )
+            filled[name] = target.key
+            if target.is_template and any(isinstance(p, int) for p in target.parts):
+                raise InputError(
+                    f"{where}: {target.key} takes a name with # or #0 in it, as in "
+                    f'"position_#0"; write {target.numbered(1).key} = {target.at}, … for columns '
+                    "by number"
+                )
+            if isinstance(target.at, list) and not target.is_text:
+                raise InputError(
+                    f"{where}: {target.key} takes one column; only texts such as name are joined "
+                    "from several"
+                )
+            result.append(target)
+    return tuple(result)
+
+
+def by_name(asked: Sequence[ColumnKey]) -> bool:
+    """Whether any required column is looked for by its name in a header."""
+    return any(isinstance(part, str) for c in asked if c.required for part in c.parts)
+
+
+def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
+    """The required columns asked for by name that a line does not name, as the mapping has them."""
+    absent = []
+    for target in (c for c in asked if c.required):
+        first = target.numbered(1) if target.is_template else target
+        for part in target.parts:
+            if isinstance(part, str) and not _find(_named(part, first), cells):
+                absent.append(f"{target.key} = {quoted(part)}")
+    return absent
+
+
+def no_header(
+    source: str, asked: Sequence[ColumnKey], rows: Sequence[tuple[int, list[str]]]
+) -> InputError:
+    """What to say where no line is the header: which line comes nearest, and what it lacks."""
+    number, cells = min(rows, key=lambda row: len(lacking(asked, row[1])))
+    return InputError(
+        f"{source}: no line has all the columns that the mapping names; line {number} has "
+        f"{listed(map(quoted, cells), 12)}, but not {listed(lacking(asked, cells), 8)}: correct "
+        "the names, the delimiter or the comments in [source], or give columns by number"
+    )
+
+
+def resolve(
+    source: str, asked: Sequence[ColumnKey], header: Sequence[str], width: int,
+    units: UnitsTable, hint: str | None,
+) -> tuple[FileColumn, ...]:  # fmt: skip
+    """Where each column stands, and in which unit.
+
+    `header`: names of the columns, () without a header; `width`: cells of the first row;
+    `units`: for columns whose key ends in _auto where neither the header nor `hint`, the unit
+    that a comment of the file states, says one.
+    Raises InputError for names and numbers that the file does not have, names that stand for
+    several columns, and units that contradict the header.
+    """
+    columns = [c for target in asked for c in _columns(source, target, header, width)]
+    return tuple(_with_unit(source, column, units, hint) for column in columns)
+
+
+def _columns(
+    source: str, target: ColumnKey, header: Sequence[str], width: int
+) -> Iterator[FileColumn]:
+    """The column of a key where the file has it; of a template those of all joints."""
+    templates = (target.numbered(i) for i in range(1, MOST_JOINTS + 1))
+    for one in templates if target.is_template else (target,):
+        found = _column(source, one, header, width)
+        if found is None:
+            return
+        yield found
+
+
+def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -> FileColumn | None:
+    index, names = [], []
+    for part in target.parts:
+        if isinstance(part, int):
+            if part > width:
+                if not target.required:
+                    return None
+                raise InputError(
+                    f"{source}: {target.key} is column {part}, but the first reading has {width} "
+                    "columns; correct the number in [source.columns], or the delimiter"
+                )
+            index.append(part - 1)
+            names.append(header[part - 1] if part <= len(header) else f"column {part}")
+            continue
+        sought = _named(part, target)
+        hits = _find(sought, header)
+        if not hits:
+            if not target.required:
+                return None
+            raise InputError(
+                f"{source}: no column {' or '.join(map(quoted, sought))} for {target.key}"
+                f"{did_you_mean(sought[0], header)}; the file has {listed(map(quoted, header))}"
+            )
+        if len(hits) > 1:
+            raise InputError(
+                f"{source}: {target.key} = {quoted(part)} could be column "
+                f"{' or '.join(f'{i + 1} ({header[i]})' for i in hits)}; give its number"
+            )
+        index.append(hits[0])
+        names.append(header[hits[0]])
+    return FileColumn(target, tuple(index), " + ".join(names), target.unit)
+
+
+def _named(part: str, target: ColumnKey) -> list[str]:
+    """The names "A|B#" stands for, with the joint's number from 1 (#) or 0 (#0)."""
+    number = re.search(r"\d+", target.stem) if "#" in part else None
+    if number:
+        part = part.replace("#0", str(int(number[0]) - 1)).replace("#", number[0])
+    return [name.strip() for name in part.split("|")]
+
+
+def _plain(name: str) -> str:
+    return " ".join(name.split()).casefold()
+
+
+def _find(names: Sequence[str], header: Sequence[str]) -> list[int]:
+    """Columns with the first of the names that any has; by the whole header, else less its unit."""
+    for name in names:
+        for view in (_plain, lambda cell: _plain(split_unit(cell)[0])):
+            hits = [i for i, cell in enumerate(header) if view(cell) == _plain(name)]
+            if hits:
+                return hits
+    return []
+
+
+def _with_unit(source: str, column: FileColumn, units: UnitsTable, hint: str | None) -> FileColumn:
+    """The column with its unit found out, or compared with what the file says."""
+    target = column.target
+    if target.is_text or target.unit == "":
+        return column
+    stated = split_unit(column.header)[1]
+    if stated is not None and not set(quantities(stated)) & set(target.quantities):
+        stated = None  # "Roll m" of a header is no unit of an angle
+    if target.unit != AUTO:
+        if stated is not None and stated != target.unit:
+            raise InputError(
+                f"{source}: column {quoted(column.header)} says {stated}, but the mapping has "
+                f"{target.key}; write {target.stem}_{stated}, or correct the header"
+            )
+        return column
+    told = known_unit(hint) if hint else None
+    default = {"length": units.length, "angle": units.angle}
+    general = [default[q] for q in target.quantities if default.get(q)]
+    fitting = told if told and set(quantities(told)) & set(target.quantities) else None
+    unit = stated or fitting or (general[0] if general else None)
+    if unit is None:
+        quantity, usual = ("length", "mm") if "length" in target.quantities else ("angle", "deg")
+        raise InputError(
+            f"{source}: column {quoted(column.header)} states no unit; give "
+            f"{option(f'{quantity}_unit', usual)}, [units] in the mapping file, or "
+            f"{target.stem}_{usual} in [source.columns]"
+        )
+    return replace(column, unit=unit)

@@ -9,14 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from elastocal.errors import InputError
-from elastocal.importing.export_columns import (
-    FileColumn,
-    Wanted,
-    lacking,
-    no_header,
-    resolve,
-    wanted,
-)
 from elastocal.importing.foreign_text import (
     SAMPLE,
     Clock,
@@ -30,7 +22,20 @@ from elastocal.importing.foreign_text import (
     table_rows,
     unit_in_comments,
 )
-from elastocal.importing.mapping_file import NamesTable, SourceTable, TextSourceKeys, UnitsTable
+from elastocal.importing.mapping_file import (
+    ColumnKey,
+    FileColumn,
+    NamesTable,
+    SourceTable,
+    TextSourceKeys,
+    UnitsTable,
+    by_name,
+    lacking,
+    no_header,
+    resolve,
+    wanted,
+)
+from elastocal.tables import column
 from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, IntArray, convert
 
@@ -104,7 +109,9 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
          for c in numeric if c.index[0] < len(row)),
     )  # fmt: skip
-    reader = _Reader(text.source, columns, cells, _formats(source))
+    given = source.time_format or ()
+    formats = (given,) if isinstance(given, str) else given
+    reader = _Reader(text.source, columns, cells, formats)
     for number, row in table.rows:
         reader.add(number, row)
     if not reader.line:
@@ -121,7 +128,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         encoding=text.encoding,
         layout=_layout(table),
         decimal=cells.decimal,
-        columns=tuple((c.header, _filled(c), c.unit) for c in columns),
+        columns=tuple((c.header, column(c.target.stem, c.unit), c.unit) for c in columns),
         unused=tuple(
             name or f"column {i + 1}" for i, name in enumerate(table.header) if i not in used
         ),
@@ -131,12 +138,13 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     return reader.records(understood, source)
 
 
-def _table(text: Text, settings: TextSourceKeys, asked: Wanted) -> Rows:
+def _table(text: Text, settings: TextSourceKeys, asked: Sequence[ColumnKey]) -> Rows:
     kind = settings.format or "table"
     if kind != "table":
         return (krl_rows if kind == "krl" else rapid_rows)(text)
     guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
-    places = [at for t, at in asked.required if not t.is_text and isinstance(at, int)]
+    named = by_name(asked)
+    places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
 
     def is_header(cells: Sequence[str]) -> bool:
         return not lacking(asked, cells)
@@ -144,8 +152,8 @@ def _table(text: Text, settings: TextSourceKeys, asked: Wanted) -> Rows:
     def is_data(cells: Sequence[str]) -> bool:
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
 
-    table = table_rows(text, settings, is_header if asked.by_name else None, is_data)
-    if asked.by_name and not table.header_line:
+    table = table_rows(text, settings, is_header if named else None, is_data)
+    if named and not table.header_line:
         raise no_header(text.source, asked, table.rows[:SAMPLE])
     return table
 
@@ -156,16 +164,6 @@ def _layout(table: Rows) -> str:
     head = f"header in line {table.header_line}" if table.header_line else "no header"
     mark = {"tab": "tabs", "space": "blanks"}.get(table.split_at, f"{table.split_at!r}")
     return f"columns split at {mark}, {head}"
-
-
-def _filled(column: FileColumn) -> str:
-    stem, unit = column.target.stem, column.unit
-    return f"{stem}_{unit}" if unit else stem
-
-
-def _formats(source: SourceTable) -> tuple[str, ...]:
-    given = source.time_format
-    return () if given is None else (given,) if isinstance(given, str) else tuple(given)
 
 
 class _Reader:
@@ -192,51 +190,48 @@ class _Reader:
                 "or pass over such lines with ignore in [source.text]"
             )
         found = []
-        for column in self.numeric:
-            cell = row[column.index[0]]
+        for place in self.numeric:
+            cell = row[place.index[0]]
             try:
                 value = self.cells.value(cell)
             except ValueError:
-                raise self.cells.complaint(self.source, number, cell, column.header) from None
+                raise self.cells.complaint(self.source, number, cell, place.header) from None
             if value is None:
-                self.ignored.append((number, f"no value in column {column.header}"))
+                self.ignored.append((number, f"no value in column {place.header}"))
                 return
             found.append(value)
         for values, value in zip(self.values, found, strict=True):
             values.append(value)
-        for texts, column in zip(self.texts, self.textual, strict=True):
-            glue = " " if column.target.stem == "time_text" else "::"
-            texts.append(glue.join(row[i].strip() for i in column.index))
+        for texts, place in zip(self.texts, self.textual, strict=True):
+            glue = " " if place.target.stem == "time_text" else "::"
+            texts.append(glue.join(row[i].strip() for i in place.index))
         self.line.append(number)
 
     def records(self, understood: Understood, source: SourceTable) -> Records:
         numbers: dict[str, Array] = {}
         units: dict[str, str] = {}
         time: Array | None = None
-        for column, values in zip(self.numeric, self.values, strict=True):
-            stem, array = column.target.stem, np.array(values, dtype=np.float64)
+        for place, values in zip(self.numeric, self.values, strict=True):
+            stem, array = place.target.stem, np.array(values, dtype=np.float64)
             if stem == "time":
-                seconds = convert(array, column.unit, "s")
+                seconds = convert(array, place.unit, "s")
                 time = seconds if time is None else time + seconds
                 continue
             if stem.startswith("sigma_") and source.coverage_factor is not None:
                 array = array / source.coverage_factor
-            numbers[stem], units[stem] = array, column.unit
+            numbers[stem], units[stem] = array, place.unit
         texts = {c.target.stem: t for c, t in zip(self.textual, self.texts, strict=True)}
         written = texts.pop("time_text", None)
         if written is not None and time is None:
-            time = self._times(written)
+            time = np.array([self._time(*at) for at in zip(self.line, written, strict=True)])
         line = np.array(self.line, dtype=np.int64)
         return Records(self.source, line, numbers, units, texts, time, understood, source.load)
 
-    def _times(self, written: list[str]) -> Array:
-        seconds = np.empty(len(written))
-        for i, text in enumerate(written):
-            try:
-                seconds[i] = self.clock.seconds(text)
-            except ValueError:
-                raise self.clock.complaint(f"{self.source}, line {self.line[i]}", text) from None
-        return seconds
+    def _time(self, number: int, text: str) -> float:
+        try:
+            return self.clock.seconds(text)
+        except ValueError:
+            raise self.clock.complaint(f"{self.source}, line {number}", text) from None
 
 
 HEIGHT = ("zenith", "elevation")
@@ -409,13 +404,13 @@ def _labels_of_names(
 
 def _taken(records: Records, keep: np.ndarray, reasons: tuple[tuple[int, str], ...]) -> Records:
     """The rows `keep`; the others are listed as passed over."""
-    observed = records.understood
-    ignored = tuple(sorted([*observed.ignored, *reasons]))
+    before = records.understood
+    ignored = tuple(sorted([*before.ignored, *reasons]))
     return replace(
         records,
         line=records.line[keep],
         numbers={stem: values[keep] for stem, values in records.numbers.items()},
         texts={stem: [texts[i] for i in keep] for stem, texts in records.texts.items()},
         time=None if records.time is None else records.time[keep],
-        understood=replace(observed, rows=len(keep), ignored=ignored),
+        understood=replace(before, rows=len(keep), ignored=ignored),
     )

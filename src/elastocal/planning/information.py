@@ -20,14 +20,13 @@ from elastocal.identification.weighted_problem import (
     weights_for,
     whitener,
 )
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, available_noise
 from elastocal.model.chain import joint_index
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
 from elastocal.simulation.simulate import simulate
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.tracker_noise import available_noise
 from elastocal.units import Array, IntArray
 
 # What a pose will be read as: its table rows, load states, and the covariance of its readings.

@@ -9,18 +9,12 @@ out one task, `study_run` hands the tasks to workers, `study_results` is the dat
     frame = read_results("look")
 """
 
-from elastocal.studies.study_folder import Study, read_study
-from elastocal.studies.study_results import read_results
-from elastocal.studies.study_run import (
-    ClusterLostError,
-    StudyStop,
-    run_cluster,
-    run_local,
-    run_study,
-    summarise,
-)
+from elastocal import loaded_on_demand
 
-__all__ = [
-    "ClusterLostError", "Study", "StudyStop", "read_results", "read_study", "run_cluster",
-    "run_local", "run_study", "summarise",
-]  # fmt: skip
+ROOMS = {
+    "study_folder": "Study read_study",
+    "study_results": "read_results",
+    "study_run": "ClusterLostError StudyStop run_cluster run_local run_study summarise",
+}
+__all__ = [name for names in ROOMS.values() for name in names.split()]
+__getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

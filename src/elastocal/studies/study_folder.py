@@ -29,11 +29,11 @@ from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from elastocal import __version__
-from elastocal.errors import InputError, require
-from elastocal.files import read_text
+from elastocal.config import Table, checked, read_toml
+from elastocal.errors import InputError, option, require
 from elastocal.text import did_you_mean, listed, quoted
 
 RESERVED = ("task", "task_hash", "task_row", "task_seconds", "elastocal", "task_error")
@@ -126,10 +126,9 @@ class Outcome:
     trace: str = ""
 
 
-class StudyFile(BaseModel):
+class StudyFile(Table):
     """The keys of study.toml."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
     title: str = Field("", description="text")
     seed: int = Field(ge=0, description="a whole number from 0")
     files: list[str] = Field([], description='a list of names, as in files = ["cell.toml"]')
@@ -154,7 +153,7 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
             f"{folder}: holds no {name}; a study has one, with its {what}",
         )
     path = folder / "study.toml"
-    stated = _read_toml(path)
+    stated = checked(StudyFile, read_toml(path, "study file", 1_000_000), path)
     for name in stated.columns:
         require(name not in RESERVED, f"{path}: columns.{name} cannot be a column; {TAKEN}")
     for name in stated.files:
@@ -176,34 +175,17 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
     return Study(folder, title, seed, chosen, sources, module, tasks)
 
 
-def _read_toml(path: Path) -> StudyFile:
-    try:
-        return StudyFile.model_validate(tomllib.loads(read_text(path, "study file", 1_000_000)))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML ({error}); correct it there") from None
-    except ValidationError as error:
-        known, found = StudyFile.model_fields, error.errors()
-        # A misspelt key is the cause, the key then missing only its consequence.
-        first = min(found, key=lambda problem: problem["type"] != "extra_forbidden")
-        key = ".".join(map(str, first["loc"]))
-        if first["type"] == "extra_forbidden":
-            hint = f"{did_you_mean(key, known)}; known are {listed(known)}"
-            raise InputError(f"{path}: unknown key {quoted(key)}{hint}") from None
-        shown = quoted(None if first["type"] == "missing" else first["input"])
-        takes = known[str(first["loc"][0])].description
-        raise InputError(f"{path}: key {key} takes {takes}; found {shown}") from None
-
-
 def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str]) -> dict[str, Any]:
     """The defaults, with KEY=VALUE in their place; a value is of its default's type."""
     options = dict(defaults)
     kinds = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
     for text in given:
         key, equals, written = (part.strip() for part in text.partition("="))
-        require(bool(equals), f"options: takes KEY=VALUE; found {quoted(text)}")
+        here = option("options", text)
+        require(bool(equals), f"{option('options')} takes KEY=VALUE; found {quoted(text)}")
         require(
             key in options,
-            f"options: {text}: {path} has no option {quoted(key)}{did_you_mean(key, options)}; "
+            f"{here}: {path} has no option {quoted(key)}{did_you_mean(key, options)}; "
             f"it has {listed(options) or 'none'}",
         )
         default, value = defaults[key], None
@@ -214,7 +196,7 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
         if type(default) is float and type(value) is int:
             value = float(value)
         kind = kinds.get(type(default), f"a TOML value like {quoted(default)}")
-        require(type(value) is type(default), f"options: {text}: takes {kind}, as in study.toml")
+        require(type(value) is type(default), f"{here}: takes {kind}, as in study.toml")
         options[key] = value
     return options
 

@@ -7,17 +7,16 @@ is checked, so that no task counts twice.
 from __future__ import annotations
 
 import json
-import os
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
-from elastocal.errors import InputError, require
-from elastocal.files import atomic_write_text
+from elastocal.errors import InputError, option, require
+from elastocal.files import UNFINISHED, atomic_binary_writer, atomic_write_text
 from elastocal.studies.study_folder import Outcome, Study
 
 if TYPE_CHECKING:
@@ -102,17 +101,8 @@ class StudyResults:
 
     def write(self, path: Path, lines: pyarrow.Table) -> None:
         """Write the part `path` (again), whole or not at all."""
-        temporary = self.folder / f".{path.name}.tmp"
-        try:
-            with open(temporary, "wb") as handle:
-                arrow().parquet.write_table(lines, handle, compression="zstd")
-                handle.flush()
-                os.fsync(handle.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            with suppress(OSError):
-                temporary.unlink()
-            raise
+        with atomic_binary_writer(path) as handle:
+            arrow().parquet.write_table(lines, handle, compression="zstd")
 
     def read(self, study: Study | None = None) -> pyarrow.Table | None:
         """Returns all lines, or None where there is no part yet.
@@ -133,13 +123,13 @@ class StudyResults:
             require(
                 table.schema.equals(schema, check_metadata=True),
                 f"{path}: has other columns, types or units than the study now; "
-                "run with restart=True, or with output=NEW",
+                f"run with {option('restart', True)}, or with {option('output', 'NEW')}",
             )
             tables.append(table)
         if not tables:
             return None
-        whole = pa.concat_tables(tables)
-        frame = whole.select(["task", "task_hash", "task_row"]).to_pandas()
+        lines = pa.concat_tables(tables)
+        frame = lines.select(["task", "task_hash", "task_row"]).to_pandas()
         twice = frame.duplicated(["task", "task_row"])
         hashes = frame.groupby("task")["task_hash"].nunique()
         alone = frame["task_row"].isna() & frame["task"].duplicated(keep=False)
@@ -147,9 +137,9 @@ class StudyResults:
         require(
             not wrong,
             f"{self.folder}: task {min(wrong, default=0)} has more than one result; parts of two "
-            "runs were put together: remove those of one, or run with restart=True",
+            f"runs were put together: remove those of one, or run with {option('restart', True)}",
         )
-        return whole
+        return lines
 
     def drop_failed(self) -> None:
         """Remove the lines of failed tasks, part by part."""
@@ -292,9 +282,9 @@ def opened(folder: Path) -> Iterator[StudyResults]:
         except OSError:
             raise InputError(
                 f"{folder}: another run of the study is writing there; wait for it, or name "
-                "another folder with output=NEW"
+                f"another folder with {option('output', 'NEW')}"
             ) from None
-        for left in folder.glob(".part-*.tmp"):
+        for left in folder.glob(f".part-*{UNFINISHED}"):
             left.unlink(missing_ok=True)
         yield StudyResults(folder)
 
@@ -306,11 +296,11 @@ def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     elastocal (version), task_error.
     Raises InputError where there are none, or a result is there twice.
     """
-    whole = StudyResults(Path(folder)).read()
-    if whole is None:
+    lines = StudyResults(Path(folder)).read()
+    if lines is None:
         raise InputError(f"{folder}: holds no results; run elastocal study first")
-    frame = whole.to_pandas()
-    for field in filter(_is_json, whole.schema):
+    frame = lines.to_pandas()
+    for field in filter(_is_json, lines.schema):
         frame[field.name] = frame[field.name].map(json.loads)
     wanted = frame["task_error"].notna() if failed else frame["task_row"].notna()
     frame = frame[wanted].sort_values(["task", "task_row"], ignore_index=True)

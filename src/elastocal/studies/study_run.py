@@ -25,7 +25,7 @@ from types import FrameType, ModuleType
 from typing import Any, Self
 
 from elastocal import __version__
-from elastocal.errors import ElastocalError, InputError, require
+from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.files import atomic_write_text
 from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
 from elastocal.studies.study_results import SOONEST, Recorder, StudyResults, opened, read_results
@@ -286,8 +286,9 @@ def connect(address: str) -> Any:
     where = dask.config.get("scheduler-address", None) if address == "config" else address
     require(
         where is not None,
-        "cluster=config: Dask's configuration names no scheduler; set DASK_SCHEDULER_ADDRESS or "
-        "scheduler-address, or give cluster=tcp://HOST:8786",
+        f"{option('cluster', 'config')}: Dask's configuration names no scheduler; set "
+        "DASK_SCHEDULER_ADDRESS or scheduler-address, or give "
+        f"{option('cluster', 'tcp://HOST:8786')}",
     )
     # Its log lines tell of dead workers with tracebacks; what matters is told by the study.
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
@@ -296,8 +297,8 @@ def connect(address: str) -> Any:
         client = distributed.Client(where, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"cluster={where}: no scheduler answers ({error}); check the address, or start one "
-            "with: dask scheduler"
+            f"{option('cluster', where)}: no scheduler answers ({error}); check the address, or "
+            "start one with: dask scheduler"
         ) from None
     try:
         found = client.run(_version)
@@ -307,7 +308,8 @@ def connect(address: str) -> Any:
         told = f"a worker cannot import elastocal ({error})"
     if told:
         client.close()
-        raise InputError(f"cluster={where}: {told}; install elastocal {__version__} there, as here")
+        here = option("cluster", where)
+        raise InputError(f"{here}: {told}; install elastocal {__version__} there, as here")
     return client
 
 
@@ -321,7 +323,8 @@ def dask_distributed() -> ModuleType:
         import distributed
     except ImportError:
         raise InputError(
-            "cluster=ADDRESS needs dask.distributed; run: pip install 'elastocal[cluster]'"
+            f"{option('cluster', 'ADDRESS')} needs dask.distributed; run: pip install "
+            "'elastocal[cluster]'"
         ) from None
     module: ModuleType = distributed
     return module
@@ -409,18 +412,19 @@ def _known(study: Study, results: StudyResults) -> dict[int, bool]:
 
     Raises InputError where a task there is not the study's task of that index now.
     """
-    whole = results.read(study)
-    if whole is None:
+    found = results.read(study)
+    if found is None:
         return {}
     names = ("task", "task_hash", "task_error")
-    lines = sorted(zip(*(whole[name].to_pylist() for name in names), strict=True))
+    lines = sorted(zip(*(found[name].to_pylist() for name in names), strict=True))
     lines = [line for line in lines if line[0] < len(study.tasks)]
     for index, hashed, _ in lines:
         if study.tasks[index].hash != hashed:
             told = "; ".join(_changes(study, results.stated())) or f"task {index} was another one"
             raise InputError(
                 f"{results.folder}: holds results of another study: {told}. "
-                "Run with restart=True to discard them, or with output=NEW to keep them"
+                f"Run with {option('restart', True)} to discard them, or with "
+                f"{option('output', 'NEW')} to keep them"
             )
     return {index: error is not None for index, _, error in lines}
 
