@@ -52,23 +52,23 @@ def loaded_on_demand(
         setattr(sys.modules[package], name, value)
         return value
 
-    return load, lambda: sorted({*vars(sys.modules[package]), *home_of})
+    return load, lambda: sorted({*home_of, "__doc__", "__name__"})
 
 
 # Where each name lives; a test holds this against the imports above.
 ROOMS = {
     "cell": "Cell Robot Tool Tracker Workspace read_cell",
     "compensation.compensate": "Compensation",
-    "planning.plan": "Plan",
     "diagnosis.diagnosis": "Diagnosis",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
+    "measurements": "Measurements",
+    "model.arm": "Parameter",
     "model.calibrated": "CalibratedArm read_calibrated",
     "model.effects.base": "Effect",
     "model.manipulator": "Model",
-    "model.arm": "Parameter",
-    "measurements": "Measurements",
+    "planning.plan": "Plan",
     "plugins": "register_criterion register_effect register_noise_model",
     "verbs": "compensate design diagnose identify simulate",
 }

@@ -21,7 +21,7 @@ from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.file_keys import table_of
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.diagnosis import write_extended_cell
-from elastocal.diagnosis.extended_cell import PATHS
+from elastocal.diagnosis.diagnose import PATHS
 from elastocal.errors import InputError
 from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE

@@ -23,8 +23,8 @@ from support.cells import choices, kr270_chain, random_poses
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.identification import reduce
-from elastocal.identification.identifiability import STRUCTURAL
 from elastocal.identification.identify import identify
+from elastocal.identification.solve import STRUCTURAL
 from elastocal.model import Chain, Joint, Model, Parameter
 
 DOWN = ((0.0, 0.0, -300.0),)

@@ -30,7 +30,8 @@ from support.robots import KR270
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.errors import ElastocalError
-from elastocal.model import Chain, Joint, LinkMass, Model, equilibrium
+from elastocal.model import Chain, Joint, LinkMass, Model
+from elastocal.model import symbolic as equilibrium
 from elastocal.model.effects.compliances import transverse_axes
 from elastocal.simulation import MujocoArm
 from elastocal.units import Array

@@ -8,13 +8,13 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "arm_description": (
-        "CartesianNoise CompensatorTable EffectChoice ModelSpec Nominal Observe PolarNoise Robot "
-        "Tool Tracker"
+        "CartesianNoise CompensatorTable EffectChoice ModelSpec Nominal Observe PolarNoise "
+        "Robot Tool Tracker"
     ),
     "file_keys": "rotation_from_rpy table_of",
     "plan_wishes": "DesignSpec Motion TargetBox TargetPath TargetPose",
     "work_cell": "Cell read_cell",
-    "workspace_rules": ("CarriedBody HalfSpace HangingLoad Shape Solid Visibility Workspace"),
+    "workspace_rules": "CarriedBody HalfSpace HangingLoad Shape Solid Visibility Workspace",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]
 __getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

@@ -67,8 +67,8 @@ def diagnose(
     Example: elastocal diagnose cell.toml data.csv -o diagnosis.json --report diagnosis.html
     """
     from elastocal import verbs
+    from elastocal.diagnosis.diagnose import write_extended_cell
     from elastocal.diagnosis.diagnosis import publish
-    from elastocal.diagnosis.extended_cell import write_extended_cell
     from elastocal.model.choice import cell_of
     from elastocal.saving import save_diagnosis
 

@@ -5,7 +5,7 @@ from elastocal import loaded_on_demand
 ROOMS = {
     "backlash_model": "doubt under_other_backlash_model with_likelier_backlash_model",
     "baseline": "Baseline Blocks VisitPlaces fit_baseline made_once thinned",
-    "diagnose": "DiagnosisOptions",
+    "diagnose": "DiagnosisOptions write_extended_cell",
     "diagnosis": (
         "Candidate Curve Diagnosis EffectAt ExtraPlan FaultyReading FittedParameter "
         "FoundEffect Gap Location NoiseFloor RivalPair StructureTest Untested publish"
@@ -19,7 +19,6 @@ ROOMS = {
     ),
     "effect_search": "ForwardSelection SelectedEffects Slot base_score is_far relinearised",
     "evidence": "EntrySums Grams Prior Scan direct evidence_of scan",
-    "extended_cell": "write_extended_cell",
     "extra_poses": "expected expected_of_random fewest measuring_order plan_extra",
     "hypotheses": (
         "Hypothesis SettingsGrid change_times compute_columns grid_of model_keys possible "

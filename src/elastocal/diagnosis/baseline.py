@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError
-from elastocal.identification.identifiability import Problem
-from elastocal.identification.solve import PLACING, is_placed, sizes_and_check, tied_fit
+from elastocal.identification.solve import PLACING, Problem, is_placed, sizes_and_check, tied_fit
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import (
     Weights,

@@ -36,7 +36,7 @@ from elastocal.diagnosis.noise_floor import (
     noise_draws,
     project,
 )
-from elastocal.identification.error_budget import BudgetStep, resampled_rms, stage_of
+from elastocal.identification.findings import BudgetStep, resampled_rms, stage_of
 from elastocal.measurements import Measurements
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model, Regression

@@ -7,14 +7,13 @@ ROOMS = {
     "constrained": "ActiveConstraint constrained_fit minimise objective_of",
     "constrained_solver": "ConstrainedObjective ResidualLoss",
     "covariance": "Covariance cluster_robust hc t_quantile",
-    "error_budget": "BudgetStep gap_budget",
     "faulty_readings": "FaultyGroup OutlierReport outlier_report",
-    "findings": "judged next_steps standings warning_sentences",
-    "identifiability": "Problem Reduction reduce residual_sigma",
+    "findings": "BudgetStep gap_budget judged next_steps standings warning_sentences",
     "intervals": "cluster_by_parts profile_interval profile_of worth_clustering",
     "knowledge": (
         "Bounds Constraints GaussianPrior Knowledge KnowledgeTable LinearEquality "
-        "SemidefiniteMatrix equal non_negative physical_constraints read_knowledge share_of_prior"
+        "SemidefiniteMatrix equal non_negative physical_constraints read_knowledge "
+        "share_of_prior"
     ),
     "knowledge_fit": (
         "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_linear_interval"
@@ -41,7 +40,7 @@ ROOMS = {
         "m_scale normal_mean normal_moments"
     ),
     "robust_fits": "log_likelihood m_estimate mm_estimate student_t",
-    "solve": "Solution sizes_and_check",
+    "solve": "Problem Reduction Solution reduce residual_sigma sizes_and_check",
     "start": "RegistrationProblem check_limits check_table fixed_and_free register start_values",
     "weighted_problem": (
         "Evaluation Partition RFactor Weights merge part_of scaled_by_component weights_for"

@@ -31,7 +31,6 @@ from elastocal.identification.constrained_solver import (
     solve_conic,
     tangent_rows,
 )
-from elastocal.identification.identifiability import WORTH_A_COLUMN
 from elastocal.identification.knowledge import (
     ROUND_OFF,
     Bounds,
@@ -42,7 +41,7 @@ from elastocal.identification.knowledge import (
     share_of_prior,
 )
 from elastocal.identification.least_squares import FitProblem
-from elastocal.identification.solve import Solution
+from elastocal.identification.solve import WORTH_A_COLUMN, Solution
 from elastocal.model.manipulator import Regression
 from elastocal.text import listed, quoted
 from elastocal.units import Array, IntArray

@@ -10,14 +10,13 @@ from scipy import linalg
 
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution, warning_sentences
-from elastocal.identification.identifiability import residual_sigma
 from elastocal.identification.intervals import Intervals
 from elastocal.identification.methods import MethodResult, is_exact
 from elastocal.identification.noise_summary import noise_of
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.residuals import ResidualSummary, rms_3d, summarise_residuals
 from elastocal.identification.result import Calibration, Combination, Estimate
-from elastocal.identification.solve import Solution
+from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
 

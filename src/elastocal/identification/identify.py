@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from elastocal.identification.estimates import summarise
 from elastocal.identification.findings import judged
-from elastocal.identification.identifiability import Problem
 from elastocal.identification.methods import is_exact, run_method
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.result import Calibration, TestErrors
-from elastocal.identification.solve import Solution, solve
+from elastocal.identification.solve import Problem, Solution, solve
 from elastocal.identification.start import check_rows, check_table, fixed_and_free, start_values
 from elastocal.identification.weighted_problem import (
     Weights,

@@ -13,10 +13,9 @@ from scipy import linalg, optimize, sparse
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.identification.bootstrap import parametric_bootstrap, wild_cluster_bootstrap
 from elastocal.identification.covariance import Covariance, cluster_robust, hc, t_quantile
-from elastocal.identification.identifiability import residual_sigma
 from elastocal.identification.least_squares import Fit, FitProblem, fit
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, linearised
-from elastocal.identification.solve import Solution
+from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import Partition, Span, in_order, regressor
 from elastocal.units import Array
 

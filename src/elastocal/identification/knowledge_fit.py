@@ -32,7 +32,6 @@ from elastocal.identification.constrained_solver import (
     tangent_rows,
 )
 from elastocal.identification.covariance import Covariance, t_quantile
-from elastocal.identification.identifiability import Reduction, residual_sigma
 from elastocal.identification.intervals import (
     DRAWS,
     LEVEL,
@@ -51,7 +50,7 @@ from elastocal.identification.least_squares import Fit, FitProblem
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.robust_core import median_scale
-from elastocal.identification.solve import Solution
+from elastocal.identification.solve import Reduction, Solution, residual_sigma
 from elastocal.identification.weighted_problem import RFactor
 from elastocal.text import listed
 from elastocal.units import Array, Progress

@@ -12,7 +12,6 @@ from elastocal.errors import InputError
 from elastocal.identification import published
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance
-from elastocal.identification.identifiability import Problem, fit_kept, held_at_bounds, heldout_of
 from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
 from elastocal.identification.knowledge_fit import fit_with_knowledge
 from elastocal.identification.noise_choice import (
@@ -26,7 +25,7 @@ from elastocal.identification.noise_choice import (
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_fit
-from elastocal.identification.solve import Solution
+from elastocal.identification.solve import Problem, Solution, fit_kept, held_at_bounds, heldout_of
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray, Progress

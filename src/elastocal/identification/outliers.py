@@ -10,8 +10,14 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.identifiability import WORTH_A_COLUMN, choose
-from elastocal.identification.solve import SAMPLE, Solution, is_placed, settle
+from elastocal.identification.solve import (
+    SAMPLE,
+    WORTH_A_COLUMN,
+    Solution,
+    choose,
+    is_placed,
+    settle,
+)
 from elastocal.identification.weighted_problem import (
     Part,
     RFactor,

@@ -1,40 +1,304 @@
-"""The course of a fit: place, tie weakly, choose the parameters, fit, compare, hold at bounds."""
+"""The course of a fit: place, choose a minimal complete set of parameters, fit, compare."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
-from elastocal.errors import ElastocalError
-from elastocal.identification.identifiability import (
-    WORTH_A_COLUMN,
-    Problem,
-    Reduction,
-    choose,
-    fit_kept,
-    free_r_factor,
-    held_at_bounds,
-    heldout_of,
-    prefer_wider,
-    residual_sigma,
-)
-from elastocal.identification.least_squares import Fit, fit
-from elastocal.identification.residuals import rms_3d
+from elastocal.errors import ElastocalError, InsufficientDataError
+from elastocal.identification.least_squares import Fit, FitProblem, fit
+from elastocal.identification.linear_solver import solve_weighted
+from elastocal.identification.residuals import held_out_by_parts, held_out_residual, rms_3d
 from elastocal.identification.start import check_enough
 from elastocal.identification.weighted_problem import (
     Part,
+    Partition,
     RFactor,
+    Weights,
     each,
+    evaluate,
+    is_large,
     merge,
+    partition,
     regressor,
     residual_at,
     sample,
 )
+from elastocal.model.arm import Parameter
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
 from elastocal.units import Array, Progress
+
+# Which parameters the data determine: a minimal complete set, a wider one, and what combines.
+
+# Which parameters the data determine: a minimal complete set, and what the rest combine with.
+
+# Below this share of its own length a column lies in the span of the kept ones: B is exact
+# to 1e-15, so this is a structural dependence and not rounding.
+STRUCTURAL = 1e-7
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """`kept` and `dropped` parameter indices; `mixing` (kept, dropped) with B_D ≈ B_K · mixing.
+
+    The data determine β_k = X_k + Σ_d mixing[k, d] X_d, the kept parameter with what it stands
+    for.  `invisible` are dropped parameters that move no reading at all,
+    `at_bound` those that a bounded fit holds at their bound.
+    """
+
+    kept: NDArray[np.int64]
+    dropped: NDArray[np.int64]
+    mixing: Array
+    invisible: NDArray[np.int64]
+    at_bound: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def terms(self, k: int, sizes: Array, std: float) -> dict[int, float]:
+        """Parameters combined with kept parameter number k, and their factors.
+
+        A dropped parameter counts where its typical deviation would shift the estimate by more
+        than a tenth of its standard deviation `std`: less would not show in the interval.
+        """
+        row = self.mixing[k]
+        return {
+            int(d): float(row[j])
+            for j, d in enumerate(self.dropped)
+            if abs(row[j]) * sizes[d] > 0.1 * std
+        }
+
+
+def reduce(
+    B: Array, sizes: Array, parameters: tuple[Parameter, ...], sigma: float, threshold: float
+) -> Reduction:
+    """Choose a minimal complete set of columns of the whitened B (rows, parameters), or of its R.
+
+    Columns are scaled by typical size and by the noise `sigma` of a whitened row, so that the
+    length of a column off the span of the kept ones counts how many standard deviations a
+    typical deviation moves the data: a parameter below `threshold` is not worth a column (at 1
+    the variance it would add equals the squared bias it would remove).  Pivoted QR in the order
+    of the effects' ranks; `threshold` 0 keeps everything that is structurally independent.
+    """
+    # The triangular factor has the same geometry as B at any number of rows.
+    R = linalg.qr(B * sizes, mode="r")[0][: B.shape[1]] / sigma
+    length = np.linalg.norm(R, axis=0)
+    visible = length > max(threshold, STRUCTURAL * length.max(initial=0.0), 1e-300)
+    basis = np.zeros((len(R), 0))
+    kept: list[int] = []
+    for group in _groups(parameters):
+        candidates = [c for c in group if visible[c]]
+        if not candidates:
+            continue
+        off = R[:, candidates] - basis @ (basis.T @ R[:, candidates])
+        off -= basis @ (basis.T @ off)  # twice is enough (Parlett)
+        _, T, order = linalg.qr(off, mode="economic", pivoting=True)
+        diagonal = np.abs(np.diag(T))
+        for k, d in enumerate(diagonal):
+            c = candidates[order[k]]
+            if d > max(threshold, STRUCTURAL * length[c]):
+                kept.append(c)
+        chosen = R[:, kept]
+        basis = linalg.qr(chosen, mode="economic")[0] if kept else basis
+    kept.sort()
+    dropped = [c for c in range(R.shape[1]) if c not in set(kept)]
+    scaled = linalg.lstsq(R[:, kept], R[:, dropped])[0] if kept and dropped else None
+    mixing = np.zeros((len(kept), len(dropped)))
+    if scaled is not None:
+        mixing = scaled * sizes[kept][:, None] / sizes[dropped][None, :]
+    unseen = np.array([d for d in dropped if not visible[d]], dtype=np.int64)
+    return Reduction(np.array(kept, dtype=np.int64), np.array(dropped, dtype=np.int64),
+                     mixing, unseen)  # fmt: skip
+
+
+def _groups(parameters: tuple[Parameter, ...]) -> list[list[int]]:
+    """Indices of the parameters by rank: first what a user asks for by name; link geometry takes
+    the rest."""
+    ranks = [effect_of(p.effect).rank for p in parameters]
+    return [[i for i, own in enumerate(ranks) if own == rank] for rank in sorted(set(ranks))]
+
+
+# Which parameters are fitted: a minimal complete set, a wider one, what ends at a bound.
+
+# A typical deviation must move the data by this many standard deviations to earn a column:
+# at 1, the variance it adds equals the squared bias it removes.
+WORTH_A_COLUMN = 1.0
+WIDER = (0.1, 0.01, 0.0)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Fit the parameters `free` of the model to the observations, from x0 (parameters,)."""
+
+    model: Model
+    observations: Observations
+    weights: Weights
+    x0: Array
+    free: NDArray[np.int64]
+    bounded: bool = False
+
+    @cached_property
+    def parts(self) -> Partition:
+        """The table cut into parts that can be worked on alone: one, unless it is large."""
+        return partition(self.observations, self.weights, len(self.model.parameters))
+
+    @property
+    def large(self) -> bool:
+        return is_large(self.observations, len(self.model.parameters))
+
+    def fit_of(self, columns: NDArray[np.int64], x: Array, sizes: Array) -> FitProblem:
+        """The fit of `columns` from x, the other parameters held."""
+        return FitProblem(
+            self.model, self.observations, self.weights, x, columns, sizes,
+            bounded=self.bounded, cut=self.parts,
+        )  # fmt: skip
+
+
+def residual_sigma(found: Fit, n_parameters: int) -> float:
+    """Standard deviation of a whitened row: √(rss / (rows − parameters))."""
+    dof = max(len(found.whitened) - n_parameters, 1)
+    return max(float(np.sqrt(found.whitened @ found.whitened / dof)), 1e-12)
+
+
+def free_r_factor(problem: Problem, found: Fit) -> RFactor:
+    """The R factor of the free columns at the fitted values."""
+    if np.array_equal(found.columns, problem.free):
+        return found.r_factor
+    if found.wide is not None:
+        return found.wide
+    return evaluate(problem.model, problem.parts, found.x, problem.free).r_factor
+
+
+def choose(
+    problem: Problem, sizes: Array, r_factor: RFactor, sigma: float, threshold: float
+) -> Reduction:
+    """A minimal complete set of the free columns, as indices into all parameters.
+
+    Raises InsufficientDataError where no column is worth keeping.
+    """
+    observed, free = problem.observations, problem.free
+    parameters = tuple(problem.model.parameters[c] for c in free)
+    local = reduce(r_factor.R, sizes[free], parameters, sigma, threshold)
+    if not len(local.kept):
+        raise InsufficientDataError(
+            f"{observed.table.source}: the readings do not depend on any parameter of the model; "
+            "measure other poses or loads, or choose other effects"
+        )
+    return Reduction(free[local.kept], free[local.dropped], local.mixing, free[local.invisible])
+
+
+def fit_kept(
+    problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_steps: int = 60,
+    *, again: bool = False,
+) -> Fit:  # fmt: skip
+    """Fit of the kept parameters, the others held at the start; their share moves over first.
+
+    `again` says that there will be another choice at its end, by `free_r_factor`.
+    """
+    kept, dropped = chosen.kept, chosen.dropped
+    among = problem.free if again else None
+    start = x.copy()
+    start[dropped] = problem.x0[dropped]
+    shifted = start.copy()
+    shifted[kept] += chosen.mixing @ (x[dropped] - problem.x0[dropped])
+    # The share is a linear estimate: a soft arm may have no equilibrium so far out.
+    for trial in (shifted, start):
+        try:
+            return fit(replace(problem.fit_of(kept, trial, sizes), among=among), max_steps)
+        except ElastocalError:
+            continue
+    return fit(replace(problem.fit_of(kept, problem.x0, sizes), among=among), max_steps)
+
+
+def heldout_of(problem: Problem, found: Fit) -> Array:
+    """Residual (rows,) of each configuration under a fit to the others."""
+    if not problem.large:
+        observed = problem.observations
+        return held_out_residual(
+            found.B, found.residual, problem.weights, observed.configuration, observed.size
+        )
+    return held_out_by_parts(
+        problem.model, problem.parts, found.x, found.columns, found.r_factor,
+        np.zeros(len(found.columns)),
+    )  # fmt: skip
+
+
+def prefer_wider(
+    problem: Problem, sizes: Array, found: Fit, reduction: Reduction, heldout: Array,
+    r_factor: RFactor,
+) -> tuple[Fit, Reduction, Array]:  # fmt: skip
+    """A wider set, up to full rank, where it predicts held-out configurations better.
+
+    Typical sizes are prior knowledge and may be wrong for this arm; held-out data decide, first
+    on the linearised model, then on the refitted one.  `r_factor` is that of the free columns.
+    """
+    size = problem.observations.size
+    for threshold in WIDER:
+        sigma = residual_sigma(found, len(reduction.kept))
+        wider = choose(problem, sizes, r_factor, sigma, threshold)
+        if len(wider.kept) <= len(reduction.kept):
+            continue
+        x, linear_heldout = _linear_step(problem, sizes, found.x, wider, r_factor)
+        if rms_3d(linear_heldout, size) >= rms_3d(heldout, size):
+            continue
+        try:
+            wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
+        except (ElastocalError, np.linalg.LinAlgError, ValueError):
+            continue  # along an undetermined direction the wide set may leave every valid arm
+        wide_heldout = heldout_of(problem, wide)
+        if wide.converged and rms_3d(wide_heldout, size) < rms_3d(heldout, size):
+            found, reduction, heldout = wide, wider, wide_heldout
+            r_factor = free_r_factor(problem, found)
+    return found, reduction, heldout
+
+
+def _linear_step(
+    problem: Problem, sizes: Array, x: Array, chosen: Reduction, r_factor: RFactor
+) -> tuple[Array, Array]:
+    """x after one Gauss–Newton step of the chosen set, and the linear model's held-out residual."""
+    kept, observed = chosen.kept, problem.observations
+    moved = x.copy()
+    if not problem.large:
+        at = problem.model.regressor(observed.table, x, kept, observed)
+        B, e = problem.weights.apply(at.B), problem.weights.apply(at.residual)
+        step = solve_weighted(B, e).x
+        moved[kept] += step
+        residual = at.residual - at.B @ step
+        held = held_out_residual(
+            at.B, residual, problem.weights, observed.configuration, observed.size
+        )
+        return moved, held
+    own = r_factor.of_columns(np.searchsorted(problem.free, kept))
+    step = own.step(sizes[kept])
+    moved[kept] += step
+    return moved, held_out_by_parts(problem.model, problem.parts, x, kept, own, step)
+
+
+def held_at_bounds(
+    problem: Problem, sizes: Array, found: Fit, chosen: Reduction
+) -> tuple[Fit, Reduction]:
+    """Refit with the parameters that ended at a bound held there: they have no interval."""
+    lower, upper = (
+        np.array([getattr(problem.model.parameters[c], side) for c in chosen.kept])
+        for side in ("lower", "upper")
+    )
+    x, slack = found.x[chosen.kept], 1e-6 * sizes[chosen.kept]
+    at = (x <= lower + slack) | (x >= upper - slack)
+    if not at.any():
+        return found, chosen
+    start = found.x.copy()
+    start[chosen.kept[at]] = np.where(x <= lower + slack, lower, upper)[at]
+    kept = chosen.kept[~at]
+    if not len(kept):
+        return found, chosen
+    inner = replace(chosen, kept=kept, mixing=chosen.mixing[~at], at_bound=chosen.kept[at])
+    return fit(problem.fit_of(kept, start, sizes)), inner
+
+
+# The course of a fit: place, tie weakly, choose the parameters, fit, compare, hold at bounds.
 
 # Width of the weak tie that keeps undetermined directions still before they are recognised:
 # in typical sizes for deviations from nominal, in m and rad for what registration placed.

@@ -3,8 +3,8 @@
 from elastocal import loaded_on_demand
 
 ROOMS = {
-    "foreign_text": "Clock Text krl_rows rapid_rows read_lines",
     "assemble": "Imported",
+    "foreign_text": "Clock Text krl_rows rapid_rows read_lines",
     "joining": "dwells groups_alike",
     "mapping_file": "preset_text read_mapping wanted",
     "records": "Records Understood with_positions",

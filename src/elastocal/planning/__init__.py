@@ -9,7 +9,6 @@ ROOMS = {
     ),
     "candidates": "Candidates JointSpace draw feasible joint_space sobol",
     "collision": "Collisions Kinematics MotionBound StaticTorque arm_configuration arm_model",
-    "continuum": "estimate",
     "criteria": (
         "DeterminantCriterion GCriterion SpectralCriterion TraceCriterion criterion_named "
         "make_criterion register"
@@ -19,16 +18,14 @@ ROOMS = {
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",
     "feasibility": "Feasibility PoseFeasibility",
-    "information": (
-        "Estimable LoadStates PoseInformation load_states measured next_number rows_of"
-    ),
+    "information": "Estimable LoadStates PoseInformation load_states measured next_number rows_of",
     "moves": "Blockers Unreachable",
     "plan": (
         "Certificate Chance Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
         "write_plan_json"
     ),
     "polish": (
-        "Goal LocalSearch PlanValue Searches Sensitivity excess margins search_all "
+        "Goal LocalSearch PlanValue Searches Sensitivity estimate excess margins search_all "
         "signed_distance smooth_min sphere_cover symbolic_blocks"
     ),
     "programs": "krl_program load_name number plain urscript_program",

@@ -25,7 +25,6 @@ from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
-from elastocal.planning.continuum import Continuum, estimate
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.exact_plan import exact_plan, random_plans, size_curve
 from elastocal.planning.execution import Execution, schedule
@@ -41,7 +40,7 @@ from elastocal.planning.plan import (
     predicted,
     reasons,
 )
-from elastocal.planning.polish import Searches, polish
+from elastocal.planning.polish import Continuum, Searches, estimate, polish
 from elastocal.planning.relaxation import Relaxed, relax
 from elastocal.planning.selection import efficiency, values_without
 from elastocal.planning.setup import (

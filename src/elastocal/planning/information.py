@@ -11,9 +11,9 @@ from scipy import linalg, sparse
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.identification.identifiability import WORTH_A_COLUMN, Reduction, reduce
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
+from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
 from elastocal.identification.weighted_problem import (
     Weights,
     stated_covariance,

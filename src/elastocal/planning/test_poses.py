@@ -16,7 +16,7 @@ from elastocal.cell.plan_wishes import TargetBox, TargetPath
 from elastocal.cell.work_cell import Cell
 from elastocal.config import place
 from elastocal.errors import InputError, InsufficientDataError, require
-from elastocal.identification.identifiability import Reduction
+from elastocal.identification.solve import Reduction
 from elastocal.measurements import NUMBERED, Measurements, families, layout_of, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits

@@ -18,7 +18,7 @@ from elastocal.diagnosis.diagnosis import (
     Location,
     NoiseFloor,
 )
-from elastocal.identification.error_budget import BudgetStep
+from elastocal.identification.findings import BudgetStep
 from elastocal.report.formatting import (
     ShownTable,
     capital,

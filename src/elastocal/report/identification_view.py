@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import option
-from elastocal.identification.error_budget import ErrorBudget, stage_of
 from elastocal.identification.findings import (
     ABSORBED,
     ALONE,
     COMBINED,
     FIXED,
     INVISIBLE,
+    ErrorBudget,
     next_steps,
+    stage_of,
     standings,
 )
 from elastocal.identification.residuals import ResidualSummary

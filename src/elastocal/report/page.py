@@ -21,7 +21,7 @@ from elastocal import __version__
 from elastocal.compensation.compensate import Compensation
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.files import atomic_write_text, open_input
-from elastocal.identification.error_budget import gap_budget
+from elastocal.identification.findings import gap_budget
 from elastocal.identification.result import Calibration
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations

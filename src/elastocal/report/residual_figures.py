@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
-from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.estimates import CORRELATED
+from elastocal.identification.findings import ErrorBudget
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.model.manipulator import Model

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from planning.design.feasibility.small_cells import CHECK, DOWN, NOTHING, study_module
+from planning.feasibility.small_cells import CHECK, DOWN, NOTHING, study_module
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.model import joint_limits, load_chain

@@ -4,7 +4,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
-from planning.design.feasibility.small_cells import (
+from planning.feasibility.small_cells import (
     DOWN,
     KR270_CHAIN,
     NOTHING,
@@ -13,8 +13,8 @@ from planning.design.feasibility.small_cells import (
     freed_by,
     sphere,
 )
-from planning.design.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
-from planning.design.feasibility.test_single_rules import full_cell
+from planning.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
+from planning.feasibility.test_single_rules import full_cell
 
 from elastocal.cell.arm_description import Tool, Tracker
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, Visibility, Workspace

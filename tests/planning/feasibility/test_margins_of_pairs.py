@@ -6,7 +6,7 @@ from itertools import combinations, pairwise
 import coal
 import numpy as np
 import pytest
-from planning.design.feasibility.small_cells import (
+from planning.feasibility.small_cells import (
     DOWN,
     KR270_CHAIN,
     NOTHING,

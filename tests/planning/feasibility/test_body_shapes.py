@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planning.design.feasibility.small_cells import at
+from planning.feasibility.small_cells import at
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.workspace_rules import Solid

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from planning.design.feasibility.small_cells import (
+from planning.feasibility.small_cells import (
     DOWN,
     KR270_CHAIN,
     NOTHING,
@@ -19,8 +19,8 @@ from planning.design.feasibility.small_cells import (
     gantry_rules,
     sphere,
 )
-from planning.design.feasibility.test_frames_of_poses import random_chain
-from planning.design.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
+from planning.feasibility.test_frames_of_poses import random_chain
+from planning.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
 
 from elastocal.cell.arm_description import EffectChoice, Tool, Tracker
 from elastocal.cell.workspace_rules import (

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planning.design.feasibility.small_cells import DOWN, KR270_CHAIN, cell, gantry
+from planning.feasibility.small_cells import DOWN, KR270_CHAIN, cell, gantry
 from scipy.spatial.transform import Rotation
 from support.robots import random_chain_urdf
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planning.design.feasibility.small_cells import KR270_CHAIN, at, box, cell, gantry, sphere
+from planning.feasibility.small_cells import KR270_CHAIN, at, box, cell, gantry, sphere
 from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import Nominal, Robot

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planning.design.feasibility.small_cells import breaking
+from planning.feasibility.small_cells import breaking
 from support.cells import kr270_cell, kr270_chain, random_poses
 
 from elastocal.cell.plan_wishes import Motion
