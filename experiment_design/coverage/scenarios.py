@@ -16,8 +16,9 @@ from campaign import DEMO, campaign
 from elastocal.cell.work_cell import read_cell
 from elastocal.demo import LOAD_N, published_compliances
 from elastocal.identification import Readings
-from elastocal.measurements import polar_axes, read_plan
+from elastocal.measurements import read_plan
 from elastocal.model import Model
+from elastocal.model.observations import polar_axes
 from elastocal.simulation import expand_plan, values_from
 
 EFFECT = 80e-6  # m, configuration effect in each direction

@@ -23,7 +23,7 @@ from elastocal.identification import (
     eq14,
     mm_estimate,
     ols,
-    screen,
+    outlier_screening,
 )
 from elastocal.identification.noise_choice import settle
 
@@ -68,7 +68,7 @@ def estimates(s: Setting, replicate: int) -> np.ndarray:
     own = asymptotic_covariance(robust)
     put("Tukey MM", robust.x, own.std, own.dof)
     readings = s.readings(e)
-    noise = settle(readings, good=screen(readings, robust.residual.reshape(-1, 3))).noise
+    noise = settle(readings, good=outlier_screening(readings, robust.residual.reshape(-1, 3))).noise
     put("default", noise.x, noise.covariance.std, noise.covariance.dof)
     x, std = s.oracle(e, clean)
     put("oracle", x, std, np.inf)

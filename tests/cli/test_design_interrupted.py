@@ -17,7 +17,7 @@ from support.design_commands import (
 )
 
 from elastocal.planning import Stage
-from elastocal.planning import search as select
+from elastocal.planning import design as select
 
 GOING_ON = "going on with the design that was interrupted"
 # A child may inherit that SIGINT is ignored; here it must not.

@@ -27,7 +27,8 @@ def test_every_package_has_a_room_and_a_line_of_text(house):
 
 def test_every_arrow_leads_downwards(house):
     uses = house.uses()
-    assert uses["model"] == {"cell", "measurements"} and "model" in uses["identification"]
+    assert uses["model"] == {"cell", "measurements"}
+    assert "model" in uses["identification"]
     for room, direct in uses.items():
         assert all(house.ROOMS[target][1] < house.ROOMS[room][1] for target in direct), room
 

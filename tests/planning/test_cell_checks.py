@@ -110,7 +110,7 @@ def test_degrees_do_not_fit_a_prismatic_joint(bad: Cell, told: str) -> None:
 
 
 def test_the_cell_shown_in_the_documentation_fits_its_robot(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "file-formats.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "file-formats.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```toml(?: workspace| design)?\n(.*?)```", page, re.S)
     assert len(blocks) == 3
     (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())

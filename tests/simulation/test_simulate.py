@@ -11,8 +11,8 @@ from support.cells import COMPLIANCE, kr270_chain, random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, PolarNoise, Tracker
 from elastocal.errors import InputError
-from elastocal.measurements import position_covariance
 from elastocal.model import Model, observe
+from elastocal.model.observations import position_covariance
 from elastocal.simulation import draw_errors, expand_plan, values_from
 from elastocal.simulation.simulate import simulate
 

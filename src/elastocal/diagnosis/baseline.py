@@ -19,9 +19,9 @@ from elastocal.identification.weighted_problem import (
     stated_covariance,
     weights_for,
 )
-from elastocal.measurements import Measurements, available_noise
+from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations, observe
+from elastocal.model.observations import Observations, available_noise, observe
 from elastocal.units import Array, IntArray
 
 

@@ -37,9 +37,8 @@ from elastocal.identification.weighted_problem import (
     stated_covariance,
     whitener,
 )
-from elastocal.measurements import available_noise, polar_axes
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations
+from elastocal.model.observations import Observations, available_noise, polar_axes
 from elastocal.text import did_you_mean
 from elastocal.units import Array, BoolArray, IntArray
 

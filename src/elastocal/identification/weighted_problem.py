@@ -14,9 +14,15 @@ from scipy import linalg, sparse
 
 from elastocal.cell.arm_description import Tracker
 from elastocal.errors import InputError, option
-from elastocal.measurements import available_noise, need, position_covariance
 from elastocal.model.manipulator import Model, Regression
-from elastocal.model.observations import Observations, alone, subset
+from elastocal.model.observations import (
+    Observations,
+    alone,
+    available_noise,
+    need,
+    position_covariance,
+    subset,
+)
 from elastocal.units import Array, IntArray
 
 # Measurement noise: covariance of the observations and the weights W with W Σ = I.

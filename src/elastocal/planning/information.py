@@ -20,11 +20,11 @@ from elastocal.identification.weighted_problem import (
     weights_for,
     whitener,
 )
-from elastocal.measurements import Measurements, available_noise
+from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_index
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations, observe
+from elastocal.model.observations import Observations, available_noise, observe
 from elastocal.simulation.simulate import simulate
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray

@@ -14,7 +14,7 @@ from elastocal.identification.noise_structure import REGISTERED, SHARED
 from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
-from elastocal.measurements import available_noise
+from elastocal.model.observations import available_noise
 from elastocal.report.formatting import display, length, plain, printable, significant
 
 MOST_NAMED = 6

@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option
-from elastocal.measurements import Measurements, available_noise, position_covariance
+from elastocal.measurements import Measurements
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.manipulator import Model
+from elastocal.model.observations import available_noise, position_covariance
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 

@@ -16,7 +16,7 @@ from elastocal.cell.workspace_rules import Solid, Workspace
 from elastocal.model import Chain, Joint, read_urdf
 from elastocal.planning import Feasibility, PoseFeasibility
 
-CHECK = Path(__file__).resolve().parents[4] / "experiment_design" / "feasibility_check"
+CHECK = Path(__file__).resolve().parents[3] / "experiment_design" / "feasibility_check"
 DOWN = np.array([0.0, 0.0, -2600.0])
 NOTHING = np.zeros(3)
 KR270_CHAIN = read_urdf(KR270)

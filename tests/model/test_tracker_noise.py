@@ -8,7 +8,7 @@ from support.calibration import table_at
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError
-from elastocal.measurements import available_noise, polar_axes, position_covariance
+from elastocal.model.observations import available_noise, polar_axes, position_covariance
 
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 3e-5])))
 NOISE = PolarNoise(range=1e-4, range_per_m=5e-5, transverse=3e-4, transverse_per_m=1e-4)
