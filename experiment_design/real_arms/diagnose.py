@@ -107,7 +107,7 @@ def finding_lines(found: dict[str, Any]) -> list[str]:
         lines.append(
             f"- **{effect['effect']} at {effect['where']}**, probability "
             f"{chance(effect['probability'])}: takes away {100 * effect['gap_reduction']:.0f} % "
-            f"({100 * low:.0f} to {100 * high:.0f} %) of the noise-free error of fresh poses; "
+            f"({100 * low:.0f} to {100 * high:.0f} %) of the noise-free error of new poses; "
             f"{', '.join(values)}"
         )
     for rivals in found["indistinguishable"]:

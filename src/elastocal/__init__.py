@@ -18,7 +18,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from elastocal.cell import Cell, Robot, Tool, Tracker, Workspace, read_cell
+    from elastocal.cell.arm_description import Robot, Tool, Tracker
+    from elastocal.cell.work_cell import Cell, read_cell
+    from elastocal.cell.workspace_rules import Workspace
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
@@ -57,7 +59,9 @@ def loaded_on_demand(
 
 # Where each name lives; a test holds this against the imports above.
 ROOMS = {
-    "cell": "Cell Robot Tool Tracker Workspace read_cell",
+    "cell.arm_description": "Robot Tool Tracker",
+    "cell.work_cell": "Cell read_cell",
+    "cell.workspace_rules": "Workspace",
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",

@@ -62,7 +62,7 @@ def diagnose(
     """Why does the real arm still differ from the model?
 
     Says where the gap lies, which effect of the catalogue causes it, or that none does, and how
-    far the error of fresh poses falls once it is added.
+    far the error of new poses falls once it is added.
 
     Example: elastocal diagnose cell.toml data.csv -o diagnosis.json --report diagnosis.html
     """

@@ -286,6 +286,6 @@ def _undecided_backlash(found: SelectedEffects) -> str:
     places = " and ".join(named)
     return (
         f"hardly a reading tells whether the play of {places} follows the load alone or also the "
-        "last motion, so the error left at fresh poses is uncertain: measure poses in which the "
+        "last motion, so the error left at new poses is uncertain: measure poses in which the "
         f"load hardly turns {places}, approached from both sides"
     )

@@ -248,9 +248,9 @@ def _error_lines(d: Diagnosis) -> list[str]:
         f"(noise alone: {floor})."
     )
     if len(d.effects) == 1:
-        return [f"{text} The noise-free error of fresh poses shrinks by {reduction(d.effects[0])}."]
+        return [f"{text} The noise-free error of new poses shrinks by {reduction(d.effects[0])}."]
     each = [f"{effect_at(f)} takes away {reduction(f)}" for f in d.effects]
-    return [f"{text} Of the noise-free error of fresh poses {together(each)}."]
+    return [f"{text} Of the noise-free error of new poses {together(each)}."]
 
 
 def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:
