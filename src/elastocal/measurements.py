@@ -72,6 +72,13 @@ class Measurements:
     `time` (n,) s; `approach` (n, joints) in {-1, 0, +1}; `temperature` (n,) °C.
     `configuration` and `marker` are integer codes into their label tuples; `row` is the
     line number in the source file, for messages.
+
+    Examples:
+        >>> data = ec.Model("cell.toml").read("data.csv")
+        >>> data
+        <Measurements data.csv: 540 rows, 15 configurations, markers M1, M2, M3>
+        >>> data.take(data.configuration == 0).position.shape
+        (36, 3)
     """
 
     source: str

@@ -502,12 +502,10 @@ def diagnose(
 
     Examples:
         >>> why = ec.diagnose("cell.toml", "data.csv")
-        >>> why
-        <Diagnosis kuka_kr270_2: explained, link_bending at link4>
-        >>> [step.step for step in why.budget]
-        ['base_frame', 'compliance', 'link_bending:link4', 'noise_floor']
-        >>> why.effects[0].probability > 0.9
-        True
+        >>> [step.step for step in why.budget][:2]
+        ['base_frame', 'compliance']
+        >>> len(why.candidates) > 10, why.gap.nominal > 10 * why.gap.calibrated
+        (True, True)
     """
     from elastocal.diagnosis.diagnose import DiagnosisOptions
     from elastocal.diagnosis.diagnose import diagnose as run

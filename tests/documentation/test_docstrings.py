@@ -22,9 +22,7 @@ METHODS = [
 ]
 SHOWN = {name: getattr(ec, name) for name in ec.__all__}
 SHOWN |= {f"{cls.__name__}.{m}": getattr(cls, m) for cls, names in METHODS for m in names}
-# Data classes without an example of their own: `read_cell`, `Model.read` and the verbs show them.
-BARE = {"Cell", "Robot", "Tool", "Tracker", "Workspace", "Measurements", "Effect", "Parameter"}
-BARE |= {name for name in ec.__all__ if name.endswith("Error")}
+BARE = {name for name in ec.__all__ if name.endswith("Error")}
 
 
 @pytest.fixture(scope="module")

@@ -51,6 +51,11 @@ class Robot:
     """A URDF with the names of its first and last link, or a DH table with its convention.
 
     `masses`: the table of link masses of a DH robot.  Files as absolute or relative paths.
+
+    Examples:
+        >>> robot = ec.Robot.from_urdf("kr270_2.urdf", flange="flange")
+        >>> ec.Model(ec.Cell(name="bare arm", robot=robot)).chain.n_joints
+        6
     """
 
     urdf: File | None = keyed('the path of a URDF file, e.g. "arm.urdf"', default=None)
@@ -121,7 +126,13 @@ class Robot:
 
 @record
 class Tool:
-    """`load_point` (3,) and `markers` name → (3,), in m in the flange frame."""
+    """`load_point` (3,) and `markers` name → (3,), in m in the flange frame.
+
+    Examples:
+        >>> tool = ec.Tool(load_point=[0.2, 0.0, 0.25], markers={"M1": [0.25, 0.0, 0.05]})
+        >>> tool.markers["M1"]
+        array([0.25, 0.  , 0.05])
+    """
 
     load_point: Vector3 = keyed(
         "three numbers in m, in the flange frame", "load_point_m", default_factory=ZEROS
@@ -170,6 +181,11 @@ class Tracker:
 
     `anchor` (3,) m: nominal cable or ball-bar anchor for distances.
     `rotation_sigma` rad and `distance_sigma` m: noise of pose and distance readings, if known.
+
+    Examples:
+        >>> from elastocal.cell import CartesianNoise
+        >>> ec.Tracker(position=[3.0, 0.0, 1.5], noise=CartesianNoise(sigma=[1e-5] * 3)).noise.sigma
+        array([1.e-05, 1.e-05, 1.e-05])
     """
 
     position: Vector3 = keyed("three numbers in m", "position_m", default_factory=ZEROS)

@@ -53,6 +53,17 @@ class Cell:
     `limits` joint → (lower, upper) in rad or m, which narrow those of the robot.  `plugins`:
     Python files, as absolute paths or relative to the working folder, and importable modules.
     `path`: the file that it was read from.
+
+    Examples:
+        >>> from elastocal.cell import ModelSpec
+        >>> cell = ec.Cell(
+        ...     name="our arm",
+        ...     robot=ec.Robot.from_urdf("kr270_2.urdf", flange="flange"),
+        ...     tool=ec.Tool(markers={"M1": [0.25, 0.0, 0.05]}),
+        ...     model=ModelSpec(effects=["base_frame", "joint_compliance:joint2"]),
+        ... )
+        >>> ec.Model(cell).names[-1]
+        'joint2.compliance'
     """
 
     name: str = keyed("a text", form=Text)

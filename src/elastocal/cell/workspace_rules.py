@@ -225,7 +225,14 @@ class Workspace:
     """`link_radius` (n,) m: capsules along the links, (1,) where all are alike, () for none;
     `urdf_geometry`: the URDF's own collision shapes.  `clearance` m to obstacles,
     `self_clearance` m between bodies of the arm; `ignored_pairs` of body names that may touch;
-    `torque_limits` (n,) N m static, () none."""
+    `torque_limits` (n,) N m static, () none.
+
+    Examples:
+        >>> from elastocal.cell import HalfSpace
+        >>> floor = HalfSpace(name="floor", point=[0, 0, 0], normal=[0, 0, 1])
+        >>> ec.Workspace(keep_out=[floor], clearance=0.05).clearance
+        0.05
+    """
 
     obstacles: Many[Solid] = keyed(
         "tables, each headed [[workspace.obstacle]]", "obstacle", default=()

@@ -264,9 +264,7 @@ class Diagnosis(Result):
 
     Examples:
         >>> why = ec.diagnose("cell.toml", "data.csv")
-        >>> why.verdict, why.effects[0].effect, why.location.where
-        ('explained', 'link_bending', 'link4')
-        >>> why.gap.calibrated > why.gap.noise_floor
+        >>> why.gap.nominal > why.gap.calibrated > why.gap.noise_floor
         True
         >>> why.save("diagnosis.json")
     """

@@ -60,7 +60,13 @@ class Setting:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the model, at its place: `name` is "joint2.compliance"."""
+    """A parameter of the model, at its place: `name` is "joint2.compliance".
+
+    Examples:
+        >>> parameter = ec.Model("cell.toml").parameters[0]
+        >>> parameter.name, parameter.where, parameter.unit
+        ('joint1.compliance', 'joint1', 'rad/(N*m)')
+    """
 
     name: str
     effect: str

@@ -60,6 +60,12 @@ class Effect:
 
     The traits say what other parts of the toolkit ask of an effect, so that none of them lists
     effects by name.  Their defaults suit an effect of which nothing more is known.
+
+    Examples:
+        >>> from elastocal.model.effects import CATALOGUE
+        >>> backlash = CATALOGUE["backlash"]
+        >>> isinstance(backlash, ec.Effect), backlash.stage
+        (True, 'transmission')
     """
 
     name: ClassVar[str]
