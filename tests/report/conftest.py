@@ -18,7 +18,7 @@ from elastocal.simulation.simulate import simulate
 
 EFFECTS = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
 SCRIPT = "<script>alert(1)</script>"
-MARKUP = "[red]$x^2$ & [31m"  # a cell refuses names with control characters
+MARKUP = "[red]$x^2$ & \x1b[31m"
 SIGMA = 3e-5
 
 

@@ -134,13 +134,12 @@ class Cell:
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
             "for capsules along the links instead",
         )
-        known = known_effects
+        known = None if known_effects is None else tuple(known_effects)
         for i, choice in enumerate(self.model.effects):
             require(
                 known is None or choice.name in known,
                 f"{where}: key model.effects[{i}] names the unknown effect {quoted(choice.name)}"
-                f"{did_you_mean(choice.name, tuple(known or ()))}; known effects: "
-                f"{listed(tuple(known or ()))}",
+                f"{did_you_mean(choice.name, known or ())}; known effects: {listed(known or ())}",
             )
 
     def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:
