@@ -27,6 +27,9 @@ class ParameterSpec:
     are scaled by it before any rank is judged, so that metres and rad/(N m) compare.
     None means that no size is known beforehand (a compliance without a nominal value):
     `Model.sizes` then finds one from what moves the readings.
+
+    A `shrunk` parameter is one of many that a smooth function or a family of lines consists of:
+    it has the prior N(nominal, typical²), which every fit counts.
     """
 
     key: str
@@ -35,6 +38,7 @@ class ParameterSpec:
     typical: float | None
     lower: float = -np.inf
     upper: float = np.inf
+    shrunk: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,7 @@ class Parameter:
     typical: float | None
     lower: float = -np.inf
     upper: float = np.inf
+    shrunk: bool = False
 
 
 # The chain under construction: what effects change, and how it is put together.

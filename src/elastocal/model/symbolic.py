@@ -175,7 +175,7 @@ class SymbolicArm:
                 symbols.append(own[spec.key])
                 parameters.append(
                     Parameter(f"{place}.{spec.key}", effect.name, place, spec.unit,
-                              spec.nominal, spec.typical, spec.lower, spec.upper)
+                              spec.nominal, spec.typical, spec.lower, spec.upper, spec.shrunk)
                 )  # fmt: skip
             bound.append((effect, place, own))
         _check_names(parameters, cell)

@@ -47,6 +47,7 @@ from elastocal.model.effects.placements import (
     MarkerPosition,
 )
 from elastocal.model.effects.play import Backlash, Hysteresis
+from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.model.effects.tracker_distortion import TrackerDistortion
 from elastocal.plugin_loader import same_class
 
@@ -60,11 +61,13 @@ CATALOGUE: dict[str, Effect] = {
         GearEccentricity(),
         GearSecondHarmonic(),
         GearRipple(),
+        JointCurve(),
         WristCoupling(),
         JointDrift(),
         EncoderJump(),
         LinkGeometry(),
         ThermalExpansion(),
+        ResidualField(),
         JointCompliance(),
         JointHardening(),
         Backlash(),

@@ -1,0 +1,235 @@
+"""Smooth functions without a formula: the error curve of a joint, and the residual field.
+
+A function f of one quantity x (a joint's angle, the time) over [low, high] is a sum of waves,
+
+    f(x) = Σ_k [a_k cos ω_k(x − low) + b_k sin ω_k(x − low)],   ω_k = 2πk/P,   k = 1 … K,
+
+whose coefficients have the prior a_k, b_k ~ N(0, s² S_k) with the spectrum of a Matérn process of
+smoothness 5/2, S_k ∝ (5/ℓ² + ω_k²)⁻³ and Σ S_k = 1: a Gaussian process of standard deviation s
+and correlation length ℓ in a basis of fixed size (Solin and Särkkä 2020, Stat. Comput. 30, 419).
+A joint that turns all the way is periodic, P = 2π; else P is longer than the range by so much that
+its ends do not know of each other.  Such parameters are `shrunk`: what the readings do not show
+stays at zero, so that the function takes as many parameters as the data pay for.
+
+A smooth function corrects the arm and explains nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from elastocal.cell.work_cell import Cell
+from elastocal.model.arm import Arm, ParameterSpec, Setting
+from elastocal.model.chain import Chain
+from elastocal.model.effects.base import Symbols, index, joints, links, turning_joints
+from elastocal.model.effects.driven import (
+    BaseMotion,
+    DrivenEffect,
+    Entry,
+    JointMotion,
+    LinkFrame,
+    MarkerMotion,
+)
+from elastocal.units import Array
+
+FULL_TURN = 0.98  # of 2π: a range from which on a joint's curve is periodic
+# Waves up to this many times 1/ℓ: what is beyond has 0.2 % of the variance.
+HIGHEST = 6.0
+MOST_WAVES = 160
+MARGIN, LENGTHS = 0.25, 3.0  # of the range, or in lengths, that the ends are apart
+
+
+@dataclass(frozen=True)
+class Waves:
+    """The waves of a smooth function: `frequency` ω (K,) in 1/x, of x − `low`."""
+
+    low: float
+    frequency: Array
+
+    @classmethod
+    def over(cls, low: float, high: float, length: float, turns: bool) -> Waves:
+        """Those of functions over [low, high] that vary over `length`; `turns` says whether x is
+        an angle, and the function periodic where it goes all the way round."""
+        span = max(high - low, 1e-9)
+        period = span + max(MARGIN * span, LENGTHS * length)
+        if turns and span >= FULL_TURN * 2 * math.pi:
+            period = 2 * math.pi
+        count = math.ceil(HIGHEST / length * period / (2 * math.pi))
+        order = np.arange(1, min(max(count, 1), MOST_WAVES) + 1)
+        return cls(low, 2 * np.pi * order / period)
+
+    def variances(self, size: float, length: float) -> Array:
+        """Prior variances (2K,) of the coefficients, cosines first."""
+        spectrum = (5 / length**2 + self.frequency**2) ** -3.0
+        return np.asarray(np.tile(size**2 * spectrum / spectrum.sum(), 2))
+
+    def values(self, x: ca.SX) -> list[ca.SX]:
+        """cos ω_k(x − low), then sin ω_k(x − low): 2K expressions."""
+        phases = [float(w) * (x - self.low) for w in self.frequency]
+        return [*(ca.cos(phase) for phase in phases), *(ca.sin(phase) for phase in phases)]
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a smooth function at a place follows, by the settings that say so: prior `size` in rad
+    or m, `length` ℓ and range in the unit of what it follows."""
+
+    name: str
+    size: float
+    length: float
+    low: float
+    high: float
+
+    @property
+    def turns(self) -> bool:
+        return self.name != "time"
+
+    @property
+    def waves(self) -> Waves:
+        return Waves.over(self.low, self.high, self.length, self.turns)
+
+    def of(self, arm: Arm) -> ca.SX:
+        """The quantity of the row."""
+        return arm.input("time", 1) if not self.turns else arm.q_commanded[index(self.name)]
+
+
+def _given(cell: Cell, place: str, settings: tuple[Setting, ...]) -> dict[str, float]:
+    """The values of settings that decide how many parameters there are."""
+    stated = cell.model.nominal.settings.get(place, {})
+    return {s.key: float(stated.get(s.key, s.default or 0.0)) for s in settings}
+
+
+class JointCurve(DrivenEffect):
+    """δq = f(q), f a smooth function of the commanded joint angle q (see the module).
+
+    The transmission error of a real gear: eccentricities, tooth errors and encoder errors of all
+    orders at once.  Settings: the standard deviation `curve_size_rad` and the length
+    `curve_length_rad` of the process, and the range from `curve_low_rad` to `curve_high_rad`; a
+    diagnosis estimates them.
+    """
+
+    name = "joint_curve"
+    stage = "transmission"
+    formats = ()
+    entry = JointMotion()
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        return False  # judged with all other components of the gap, not by itself
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return turning_joints(chain)
+
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        return (
+            Setting("curve_size_rad", "range", 2e-4, 0.0, 1.0),
+            Setting("curve_length_rad", "range", 0.3, 1e-3, 100.0),
+            Setting("curve_low_rad", "range", -math.pi, -100.0, 100.0),
+            Setting("curve_high_rad", "range", math.pi, -100.0, 100.0),
+        )
+
+    def course(self, place: str, chain: Chain, cell: Cell) -> Course:
+        given = _given(cell, place, self.settings(place, chain, cell))
+        keys = ("size", "length", "low", "high")
+        return Course(place, *(given[f"curve_{key}_rad"] for key in keys))
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        course = self.course(place, chain, cell)
+        sd = np.sqrt(course.waves.variances(course.size, course.length))
+        return tuple(
+            ParameterSpec(f"curve_{k + 1}", "rad", 0.0, float(s), shrunk=True)
+            for k, s in enumerate(sd)
+        )
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        course = self.course(place, arm.chain, arm.cell)
+        waves = course.waves.values(course.of(arm))
+        return sum((p[f"curve_{k + 1}"] * wave for k, wave in enumerate(waves)), ca.SX(0))
+
+
+class ResidualField(DrivenEffect):
+    """A place moves smoothly with joint angles or time, and nobody knows why.
+
+    u = Σ_c f_c(x_c) in every component of the motion at the place: of "jointN" its angle, of
+    "linkN" its end frame along and about its axes, of "base" the base, of "marker:NAME" the marker;
+    x_c are the joints' angles and the time.  Settings for each c, "joint2" or "time":
+    `field_c_size` (rad and m; 0, the default, where the field does not follow it), and
+    `field_c_length`, `field_c_low`, `field_c_high` in rad or s.  What a diagnosis finds and cannot
+    name: it corrects the arm where it was measured, and is no explanation.
+    """
+
+    name = "residual_field"
+    stage = "geometry"
+    formats = ()
+    entry = JointMotion()  # at a joint; see `entry_at`
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        return False
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        markers = tuple(f"marker:{name}" for name in cell.tool.markers)
+        return (*joints(chain), *links(chain), "base", *markers)
+
+    def entry_at(self, place: str) -> Entry:
+        """The motion that is meant by a place."""
+        if place.startswith("joint"):
+            return JointMotion()
+        if place.startswith("link"):
+            return LinkFrame()
+        return BaseMotion() if place == "base" else MarkerMotion()
+
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        return tuple(self._settings(chain))
+
+    def _settings(self, chain: Chain) -> Iterator[Setting]:
+        for name in (*turning_joints(chain), "time"):
+            wide = 1e9 if name == "time" else 100.0
+            half = 3600.0 if name == "time" else math.pi
+            yield Setting(f"field_{name}_size", "range", 0.0, 0.0, 1.0)
+            yield Setting(f"field_{name}_length", "range", half / 3, 1e-3, wide)
+            yield Setting(f"field_{name}_low", "range", -half, -wide, wide)
+            yield Setting(f"field_{name}_high", "range", half, -wide, wide)
+
+    def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
+        """What the field follows at this place."""
+        given = _given(cell, place, self.settings(place, chain, cell))
+        keys = ("size", "length", "low", "high")
+        found = (
+            Course(name, *(given[f"field_{name}_{key}"] for key in keys))
+            for name in (*turning_joints(chain), "time")
+        )
+        return tuple(course for course in found if course.size > 0)
+
+    def needed(self, cell: Cell) -> tuple[str, ...]:
+        timed = any(s.get("field_time_size") for s in cell.model.nominal.settings.values())
+        return ("time",) if timed else ()
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        specs = []
+        for course in self.courses(place, chain, cell):
+            sd = np.sqrt(course.waves.variances(course.size, course.length))
+            specs += [
+                ParameterSpec(
+                    f"field_{course.name}_{c + 1}_{k + 1}", unit, 0.0, float(s), shrunk=True
+                )
+                for c, unit in enumerate(self.entry_at(place).units)
+                for k, s in enumerate(sd)
+            ]
+        return tuple(specs)
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        size = self.entry_at(place).size
+        u = ca.SX.zeros(size)
+        for course in self.courses(place, arm.chain, arm.cell):
+            waves = course.waves.values(course.of(arm))
+            for c in range(size):
+                for k, wave in enumerate(waves):
+                    u[c] += p[f"field_{course.name}_{c + 1}_{k + 1}"] * wave
+        return u
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        self.entry_at(place).enter(arm, place, self.drive(arm, place, p))
