@@ -16,6 +16,7 @@ from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Untested
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
 from elastocal.model.chain import Chain
+from elastocal.model.choice import set_constants
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Stage, index
 from elastocal.model.effects.changes_in_time import ThermalExpansion
@@ -504,7 +505,9 @@ class RegressorDirection:
         self._arm = Arm(model.chain, model.cell)
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
-        u = effect.drive(self._arm, hypothesis.where, {**fitted, **searched})
+        # Settings that are not searched are as the model has them.
+        held = {} if searched else set_constants(effect, hypothesis.where, model.chain, model.cell)
+        u = effect.drive(self._arm, hypothesis.where, {**held, **fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
         # Most directions ask for one or two numbers of a row: evaluated at thousands of settings,

@@ -85,6 +85,8 @@ class Effect:
     rank: ClassVar[int] = ORDINARY
     # The kinds of file that can hold it; what none can hold is exported as an error with its cost.
     formats: ClassVar[tuple[Format, ...]] = ()
+    # One of many causes at once: a diagnosis judges it only in the sum of all components.
+    together: ClassVar[bool] = False
     # What to measure besides more poses where those do not tell it from other effects.
     remedy: ClassVar[str] = ""
 
@@ -119,8 +121,8 @@ class Effect:
         return False
 
     def may_be_missing(self, cell: Cell) -> bool:
-        """Whether a diagnosis of this cell's data may suspect it."""
-        return True
+        """Whether a diagnosis of this cell's data may suspect it by itself."""
+        return not self.together
 
     def unphysical(self, values: Mapping[str, float], chain: Chain, cell: Cell) -> str:
         """Why no spring or body has these `values` (by parameter name); "" where one may."""

@@ -115,11 +115,8 @@ class JointCurve(DrivenEffect):
 
     name = "joint_curve"
     stage = "transmission"
-    formats = ()
+    together = True
     entry = JointMotion()
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return False  # judged with all other components of the gap, not by itself
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return turning_joints(chain)
@@ -164,11 +161,8 @@ class ResidualField(DrivenEffect):
 
     name = "residual_field"
     stage = "geometry"
-    formats = ()
+    together = True
     entry = JointMotion()  # at a joint; see `entry_at`
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return False
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         markers = tuple(f"marker:{name}" for name in cell.tool.markers)

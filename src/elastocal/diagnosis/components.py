@@ -1,0 +1,356 @@
+"""The gap as a sum of components, the sizes of all of them judged together.
+
+On a real arm something acts at every joint at once, each too small to stand alone.  So the
+residual is taken for a sum
+
+    r = X β + Σ_k C_k w_k + noise,   w_k ~ N(0, s_k² D_k(ℓ_k)),
+
+of components k: errors of each joint against its own angle (smooth curves whose length ℓ_k is
+estimated, and lines), every effect of the catalogue that is linear in its parameters, and smooth
+dependences without a name.  Sizes s_k, lengths ℓ_k and the noise maximise the restricted
+likelihood (Patterson and Thompson 1971) times a prior that lets most components be absent: each
+one present costs what one more hypothesis costs, and goes where it does not earn it.  At the
+maximum most sizes are zero of themselves (automatic relevance determination, MacKay 1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from scipy import linalg, optimize
+
+from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.noise_floor import (
+    NoiseValues,
+    NoisyData,
+    Weighted,
+    fit_noise,
+    log_prior,
+)
+from elastocal.model.effects.base import Effect
+from elastocal.model.effects.smooth import ResidualField, Waves
+from elastocal.units import Array
+
+Family = Literal[
+    "angle", "gravity", "torque", "load", "move", "time", "temperature", "pose", "tool"
+]  # fmt: skip
+
+# Prior probability that a component is there, and what the search for its size costs beside: a
+# size is known beforehand to a factor of e^SPREAD, and afterwards to about a third of itself.
+PRESENT, SPREAD, AFTERWARDS = 0.2, 1.5, 0.3
+COST = float(np.log(1 / PRESENT - 1) + np.log(SPREAD / AFTERWARDS))
+# Below GONE, the log of a size in typical sizes, a component is as good as absent.
+GONE, LARGEST = -5.0, 7.0
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """One cause that may be at work: `columns` (C, m, k) per typical size.
+
+    `waves` are those of a smooth function, whose spectrum its length decides, between the
+    logarithms `lengths`; they stand in the columns `repeat` times, once for each component of the
+    motion.  `settings` are constants of the effect by key; `follows` is what a field depends on.
+    """
+
+    family: Family
+    effect: Effect
+    where: str
+    columns: Array
+    unit: float = 1.0
+    follows: str = ""
+    waves: Waves | None = None
+    lengths: tuple[float, float] = (0.0, 0.0)
+    repeat: int = 1
+    settings: tuple[tuple[str, float], ...] = ()
+    hypothesis: Hypothesis | None = None
+
+    @property
+    def label(self) -> str:
+        follows = f" following {self.follows}" if self.follows else ""
+        return f"{self.effect.name} at {self.where}{follows}"
+
+    @property
+    def named(self) -> bool:
+        return not isinstance(self.effect, ResidualField)
+
+    @property
+    def width(self) -> int:
+        return self.columns.shape[2]
+
+    @property
+    def cost(self) -> float:
+        """Nats that it has to earn: its prior odds, and the search for its size and length."""
+        low, high = self.lengths
+        return COST + (float(np.log((high - low) / AFTERWARDS)) if high > low else 0.0)
+
+    def shares(self, log_length: float) -> tuple[Array, Array]:
+        """Prior variances (k,) at size 1, and the slope of their logarithms in log ℓ."""
+        if self.waves is None:
+            return np.ones(self.width), np.zeros(self.width)
+        length = float(np.exp(log_length))
+        spectrum = self.waves.variances(1.0, length)
+        slope = 30 / length**2 / (5 / length**2 + np.tile(self.waves.frequency, 2) ** 2)
+        slope = slope - (spectrum @ slope) / spectrum.sum()
+        return np.tile(spectrum, self.repeat), np.tile(slope, self.repeat)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Logarithms: of a common `factor` on the noise, of each component's size and length."""
+
+    factor: float
+    size: Array
+    length: Array
+
+    @classmethod
+    def start(cls, components: Sequence[Component]) -> Sizes:
+        length = np.array([(2 * c.lengths[0] + c.lengths[1]) / 3 for c in components])
+        return cls(0.0, np.zeros(len(components)), length)
+
+    def chosen(self, index: Sequence[int]) -> Sizes:
+        at = np.asarray(index, dtype=np.int64)
+        return Sizes(self.factor, self.size[at], self.length[at])
+
+    def and_one(self, component: Component) -> Sizes:
+        new = Sizes.start([component])
+        return Sizes(
+            self.factor, np.append(self.size, new.size), np.append(self.length, new.length)
+        )
+
+
+@dataclass(frozen=True)
+class SumOfComponents:
+    """Components beside fitted columns, under a noise whose factor is free: −2ℓ and its slope.
+
+    `weighted` is the data whitened by that noise, with the components' columns last.
+    """
+
+    weighted: Weighted
+    own: Array  # prior precision (p,) of the fitted columns
+    components: tuple[Component, ...]
+    stated: bool
+    rows: int
+
+    @cached_property
+    def squares(self) -> float:
+        return float(np.vdot(self.weighted.r, self.weighted.r))
+
+    @cached_property
+    def spans(self) -> tuple[slice, ...]:
+        ends = len(self.own) + np.cumsum([c.width for c in self.components], dtype=np.int64)
+        return tuple(
+            slice(int(e) - c.width, int(e)) for e, c in zip(ends, self.components, strict=True)
+        )
+
+    def variances(self, at: Sizes) -> Array:
+        """Prior variances of all coefficients (p + Σ k,)."""
+        shares = [c.shares(length)[0] for c, length in zip(self.components, at.length, strict=True)]
+        sized = [np.exp(2 * s) * share for s, share in zip(at.size, shares, strict=True)]
+        return np.concatenate([1 / self.own, *sized])
+
+    def factored(self, at: Sizes) -> tuple[Array, Array, Array, float]:
+        """√v, L of LLᵀ = I + √v M √v/a², b = (LLᵀ)⁻¹ √v z/a², and −2ℓ."""
+        a2 = np.exp(2 * at.factor)
+        root = np.sqrt(self.variances(at))
+        A = root[:, None] * (self.weighted.M / a2) * root[None, :]
+        A[np.diag_indices_from(A)] += 1
+        L = linalg.cholesky(A, lower=True, overwrite_a=True, check_finite=False)
+        z = root * self.weighted.z / a2
+        b = linalg.cho_solve((L, True), z, check_finite=False)
+        value = (
+            self.weighted.alone - self.squares + self.squares / a2 + 2 * self.rows * at.factor
+            + 2 * float(np.log(np.diag(L)).sum()) - float(z @ b)
+        )  # fmt: skip
+        return root, L, b, value
+
+    def objective(self, theta: Array) -> tuple[float, Array]:
+        """−2 log posterior of the logarithms and its slope."""
+        K = len(self.components)
+        at = Sizes(float(theta[0]), theta[1 : K + 1], theta[K + 1 :])
+        root, L, b, value = self.factored(at)
+        inverse = linalg.lapack.dpotri(L, lower=1, overwrite_c=1)[0]
+        left = np.diag(inverse)  # a coefficient's posterior over its prior variance
+        each = (1 - left) - b**2  # ∂(−2ℓ)/∂ log v
+        slope = np.zeros_like(theta)
+        for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
+            slope[1 + k] = 2 * each[span].sum() + 2 * at.size[k] / SPREAD**2
+            if c.waves is not None:
+                slope[1 + K + k] = each[span] @ c.shares(at.length[k])[1]
+        value += float((at.size**2).sum()) / SPREAD**2
+        beta = root * b
+        a2 = np.exp(2 * at.factor)
+        M = self.weighted.M
+        rss = self.squares - 2 * float(beta @ self.weighted.z) + float(beta @ (M @ beta))
+        slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss / a2)
+        if self.stated:
+            value += (at.factor / 0.5) ** 2
+            slope[0] += 2 * at.factor / 0.25
+        return value, slope
+
+    def climbed(self, at: Sizes, steps: int) -> Sizes:
+        """The sizes after so many steps of a quasi-Newton search."""
+        K = len(self.components)
+        bounds = [(at.factor - 4, at.factor + 4), *[(GONE - 1, LARGEST)] * K]
+        bounds += [c.lengths for c in self.components]
+        theta = np.concatenate([[at.factor], at.size, at.length])
+        found = optimize.minimize(
+            self.objective, theta, jac=True, method="L-BFGS-B", bounds=bounds,
+            options={"maxiter": steps, "ftol": 1e-9, "gtol": 1e-2},
+        )  # fmt: skip
+        x = found.x
+        return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
+
+    def earned(self, at: Sizes) -> Array:
+        """By how much ℓ falls (K,) where a component is left out, all else as it is.
+
+        Of the posterior: with S its covariance block of a component's standardised coefficients
+        and b their mean, leaving it out changes −2ℓ by log|S| + bᵀS⁻¹b.
+        """
+        _, L, b, _ = self.factored(at)
+        inverse = linalg.lapack.dpotri(L, lower=1)[0]
+        out = np.zeros(len(self.components))
+        for k, span in enumerate(self.spans):
+            S = inverse[span, span]
+            S = np.tril(S) + np.tril(S, -1).T
+            C = linalg.cholesky(S, lower=True)
+            y = linalg.solve_triangular(C, b[span], lower=True)
+            out[k] = 0.5 * float(y @ y + 2 * np.log(np.diag(C)).sum())
+        return out
+
+
+def posed(
+    data: NoisyData, components: Sequence[Component], noise: NoiseValues
+) -> SumOfComponents:
+    """The sum of these components beside the data's own columns, under one noise."""
+    columns = [data.masked(c.columns) for c in components]
+    wide = replace(
+        data,
+        X=np.concatenate([data.X, *columns], axis=2),
+        precision=np.concatenate([data.precision, np.ones(sum(c.width for c in components))]),
+    )
+    weighted = Weighted.of(wide, noise)
+    return SumOfComponents(weighted, data.precision, tuple(components), data.stated, data.n_rows)
+
+
+@dataclass(frozen=True)
+class FittedSum:
+    """The components that are left, their sizes, the noise beside them and the log posterior.
+
+    `earned` (K,) nats of each; `data` holds their columns with their prior precisions.
+    """
+
+    components: tuple[Component, ...]
+    sizes: Sizes
+    noise: NoiseValues
+    earned: Array
+    score: float
+    data: NoisyData
+
+    @property
+    def spans(self) -> tuple[slice, ...]:
+        """Where each component's coefficients stand among those of the data, last of all."""
+        widths = [c.width for c in self.components]
+        ends = self.data.X.shape[2] - sum(widths) + np.cumsum(widths, dtype=np.int64)
+        return tuple(slice(int(e) - w, int(e)) for e, w in zip(ends, widths, strict=True))
+
+
+STEPS, ROUNDS = 30, 12
+MOST_AT_ONCE = 0.5  # nats: components that earn less go together
+SOME = 1000  # configurations from which the noise is estimated
+
+
+def fit_sum(
+    data: NoisyData, components: Sequence[Component], noise: NoiseValues,
+    start: Sizes | None = None, refit_noise: bool = True,
+) -> FittedSum:  # fmt: skip
+    """Maximise over all sizes; leave out, one after the other, what does not earn its cost."""
+    components, at = list(components), start or Sizes.start(components)
+    rounds = 2 if refit_noise else 1
+    for last in range(rounds):
+        problem = posed(data, components, noise)
+        for _ in range(ROUNDS * 4):
+            at = problem.climbed(at, STEPS)
+            kept = _kept(problem, at)
+            if len(kept) == len(components):
+                break
+            components, at = [components[k] for k in kept], at.chosen(kept)
+            problem = replace(problem, **_narrowed(problem, kept))
+        noise = _scaled(noise, at.factor)
+        at = replace(at, factor=0.0)
+        if refit_noise:
+            noise = _noise_beside(data, components, at, noise)
+            if last == rounds - 1 or not components:
+                break
+    problem = posed(data, components, noise)
+    variances = problem.variances(at)
+    value = problem.factored(at)[3]
+    prior = -float((at.size**2).sum()) / 2 / SPREAD**2
+    score = -value / 2 + prior - sum(c.cost for c in components)
+    score -= 0.5 * log_prior(data.stated, noise)[0]
+    with_all = replace(
+        data, X=np.concatenate([data.X, *(data.masked(c.columns) for c in components)], axis=2),
+        precision=1 / variances,
+    )  # fmt: skip
+    return FittedSum(tuple(components), at, noise, problem.earned(at), score, with_all)
+
+
+def _kept(problem: SumOfComponents, at: Sizes) -> list[int]:
+    """Components that stay: not the worst of those that do not earn their cost, nor those that are
+    next to nothing."""
+    costs = np.array([c.cost for c in problem.components])
+    earned = problem.earned(at) - (at.size**2) / 2 / SPREAD**2
+    poor = np.flatnonzero(earned < costs)
+    if not len(poor):
+        return list(range(len(costs)))
+    worst = poor[np.argmin(earned[poor] - costs[poor])]
+    gone = (at.size < GONE) | ((earned < MOST_AT_ONCE) & (earned < costs))
+    gone[worst] = True
+    return [k for k in range(len(costs)) if not gone[k]]
+
+
+def _narrowed(problem: SumOfComponents, kept: list[int]) -> dict:
+    """The problem with fewer components, without whitening anything anew."""
+    p = len(problem.own)
+    index = np.concatenate([np.arange(p), *(np.r_[problem.spans[k]] for k in kept)]).astype(int)
+    w = problem.weighted
+    narrow = replace(w, X=w.X[:, :, index], M=w.M[np.ix_(index, index)], z=w.z[index])
+    return {"weighted": narrow, "components": tuple(problem.components[k] for k in kept)}
+
+
+def _scaled(noise: NoiseValues, factor: float) -> NoiseValues:
+    return NoiseValues(noise.factor * float(np.exp(factor)), noise.joint * np.exp(factor), noise.shared)
+
+
+def _noise_beside(
+    data: NoisyData, components: Sequence[Component], at: Sizes, noise: NoiseValues
+) -> NoiseValues:
+    """The most probable noise beside the components at their sizes, from SOME configurations."""
+    some = data.every(step) if (step := max(1, len(data.r) // SOME)) > 1 else data
+    columns = [
+        _compressed(some.masked(c.columns[::step]), np.exp(2 * s) * c.shares(length)[0], some, noise)
+        for c, s, length in zip(components, at.size, at.length, strict=True)
+    ]
+    wide = some.with_columns(
+        np.concatenate([np.zeros((*some.r.shape, 0)), *columns], axis=2),
+        np.ones(sum(c.shape[2] for c in columns)),
+    )
+    # From next to nothing the likelihood is flat in a joint's logarithm, and no climb leaves.
+    usual = NoiseValues.usual(len(noise.joint)).joint
+    return fit_noise(wide, replace(noise, joint=np.maximum(noise.joint, usual)))
+
+
+FAINT = 1e-2  # of the noise's variance: what a direction of a component may add and be left out
+
+
+def _compressed(columns: Array, variances: Array, data: NoisyData, noise: NoiseValues) -> Array:
+    """The few directions (C, m, k) of a component that show beside the noise, of unit variance."""
+    scaled = columns * np.sqrt(variances)
+    flat = scaled.reshape(-1, scaled.shape[2])
+    noisy = noise.factor**2 * np.diagonal(data.covariance, axis1=1, axis2=2)
+    white = flat / np.sqrt(np.maximum(noisy.ravel(), 1e-300))[:, None]
+    values, vectors = np.linalg.eigh(white.T @ white)
+    return np.asarray(scaled @ vectors[:, values > FAINT])
