@@ -27,9 +27,11 @@ COLUMNS = {
     "approach": "`approach_1 …`",
     "temperature": "`temperature_C`",
     "load": "`force_x_N …`",
+    "torque": "`torque_1_Nm …`",
 }
 OBSERVED = ("position", "deflection", "pose", "distance")
 # Order of size where the parameters' own size is known only from the cell.
+SHOWN = {"order_1": 36.5, "order_2": 101.0, "order_sd_2": 0.05, "field_joint2_size": 2e-4}
 COMPLIANCE = (2e-6, 3e-7, 4e-7, 3e-6, 3.5e-6, 2e-6)  # rad/(N m)
 HEAD = """# Effects
 
@@ -43,7 +45,9 @@ This page is made from the code when the site is built: the texts are the effect
 nominal values and sizes are those of the KR 270 of the demo, with joint compliances of 0.3 to
 3.5 µrad/(N·m). The *typical size* is the deviation from nominal that one expects: it scales
 columns of B before any rank is judged, it is the prior of a diagnosis, and `simulate --draw 1`
-draws from it.
+draws from it. Parameters that are *shrunk* are many, and each has the prior N(nominal, typical²) in
+every fit: what the readings do not show stays at nominal. Effects that consist of such parameters
+correct the arm; they are shown here with two lines, or a field over one joint's angle.
 """
 
 
@@ -88,12 +92,16 @@ def _section(effect: Effect, chain: Chain, base: Cell) -> str:
 
 def _observing(observe: str, base: Cell) -> Cell:
     """The demo's cell with another observation, and with all that gives effects their sizes."""
+    chain = load_chain(base)
+    places = {place for e in CATALOGUE.values() for place in e.places(chain, base)}
     model = replace(
         base.model,
         observe=observe,  # type: ignore[arg-type]
         compliance_levels={},
         gear_ripple_orders=(121.0,),
-        nominal=replace(base.model.nominal, joint_compliance=COMPLIANCE),
+        nominal=replace(
+            base.model.nominal, joint_compliance=COMPLIANCE, settings=dict.fromkeys(places, SHOWN)
+        ),
     )
     return replace(base, model=model)
 
@@ -138,15 +146,37 @@ def _parameters(place: str, parameters: tuple[ParameterSpec, ...]) -> str:
         "| parameter | unit | nominal | typical size | bounds |",
         "|---|---|---|---|---|",
     ]
-    for p in parameters:
-        typical = "from the readings"
-        if p.typical is not None:
-            value, shown = display(p.typical, p.unit)
-            rounded = float(f"{value:.2g}")
-            typical = f"{rounded:g} {shown}"
+    for family in _families(parameters):
+        p = family[0]
+        sizes = list(dict.fromkeys(_size(p) for p in family))
+        ends = [min(family, key=_typical), max(family, key=_typical)]
+        typical = " to ".join(_size(p) for p in ends) if len(sizes) > 1 else sizes[0]
+        typical += ", shrunk" if p.shrunk else ""
+        name = f"`{place}.{p.key}`"
+        name += f" … `{place}.{family[-1].key}`" if len(family) > 1 else ""
         lower = "" if p.lower == float("-inf") else f"≥ {p.lower:g}"
         upper = "" if p.upper == float("inf") else f"≤ {p.upper:g}"
         bounds = " ".join(filter(None, (lower, upper))) or "–"
         unit = p.unit.replace("*", "·").replace("^3", "³")
-        lines.append(f"| `{place}.{p.key}` | {unit} | {p.nominal:g} | {typical} | {bounds} |")
+        lines.append(f"| {name} | {unit} | {p.nominal:g} | {typical} | {bounds} |")
     return "\n".join(lines)
+
+
+def _families(parameters: tuple[ParameterSpec, ...]) -> list[list[ParameterSpec]]:
+    """Parameters that differ in their number only, many and shrunk, together; others alone."""
+    families: dict[tuple[str, str], list[ParameterSpec]] = {}
+    for p in parameters:
+        kind = re.sub(r"\d+$", "", p.key) if p.shrunk else p.key
+        families.setdefault((kind, p.unit), []).append(p)
+    return list(families.values())
+
+
+def _typical(p: ParameterSpec) -> float:
+    return p.typical or 0.0
+
+
+def _size(p: ParameterSpec) -> str:
+    if p.typical is None:
+        return "from the readings"
+    value, shown = display(p.typical, p.unit)
+    return f"{float(f'{value:.2g}'):g} {shown}"

@@ -71,7 +71,9 @@ class Measurements:
     x, y, z ("cartesian") or range, azimuth, elevation ("polar", transverse lengths);
     `time` (n,) s; `approach` (n, joints) in {-1, 0, +1}; `temperature` (n,) °C.
     `configuration` and `marker` are integer codes into their label tuples; `row` is the
-    line number in the source file, for messages.
+    line number in the source file, for messages.  `move` and `direction` (n, joints) are no
+    columns: they follow from the order of the visits (`with_moves`), are found when a table is
+    read, and stay with the rows that are taken from it.
 
     Examples:
         >>> data = ec.Model("cell.toml").read("data.csv")
@@ -99,6 +101,8 @@ class Measurements:
     time: Array | None = None
     approach: Array | None = None
     temperature: Array | None = None
+    move: Array | None = None
+    direction: Array | None = None
 
     def __len__(self) -> int:
         return len(self.row)
@@ -148,6 +152,49 @@ class Measurements:
             if isinstance(getattr(self, f.name), np.ndarray)
         }
         return replace(self, **changes)
+
+
+# Visits, and the moves between them
+
+STILL = 1e-4  # rad or m; a joint that moved by less has stayed where it was
+
+
+def visits(table: Measurements) -> IntArray:
+    """Number (n,) of each row's visit: its configuration, repeat and force."""
+    number = np.zeros(len(table), dtype=np.int64)
+    for values in (table.configuration, table.repeat, *np.round(table.force, 6).T):
+        codes = np.unique(values, return_inverse=True)[1].ravel()
+        number = number * (int(codes.max(initial=0)) + 1) + codes
+        number = np.unique(number, return_inverse=True)[1].ravel()
+    return number
+
+
+def with_moves(table: Measurements) -> Measurements:
+    """The table with the way the arm came to each visit, by the order of its visits.
+
+    `move` (n, joints) is the commanded q of the visit minus that of the visit before, in rad or m:
+    the visits in order of time where it is recorded, else of the rows, which is an assumption.  A
+    visit that moved no joint keeps the move before it, and the first has none.  `direction`
+    (n, joints) is the sign of each joint's own last motion, 0 where it has not moved yet.  All
+    rows of a visit have those of its first row.
+    """
+    n = len(table)
+    if n == 0 or table.q.shape[1] == 0:
+        return replace(table, move=None, direction=None)
+    order = np.arange(n) if table.time is None else np.argsort(table.time, kind="stable")
+    number = visits(table)
+    known, begun = np.unique(number[order], return_index=True)
+    sequence = np.argsort(begun)
+    q = table.q[order[begun[sequence]]]
+    step = np.diff(q, axis=0, prepend=q[:1])
+    step[np.abs(step) <= STILL] = 0.0
+    visit = np.arange(len(step))
+    last = np.maximum.accumulate(np.where(step.any(axis=1), visit, 0))
+    own = np.maximum.accumulate(np.where(step != 0, visit[:, None], 0), axis=0)
+    place = np.empty(len(known), dtype=np.int64)
+    place[sequence] = visit
+    direction = np.sign(np.take_along_axis(step, own, axis=0))
+    return replace(table, move=step[last][place[number]], direction=direction[place[number]])
 
 
 # Its columns
@@ -308,7 +355,7 @@ def read_measurements(
     )
     if observe != "targets":  # a path may pass a place twice
         _check_duplicates(raw, table)
-    return table
+    return with_moves(table)
 
 
 def read_plan(path: str | Path, *, joint_kinds: tuple[str, ...]) -> Measurements:

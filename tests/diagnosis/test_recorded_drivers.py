@@ -9,8 +9,10 @@ import numpy as np
 from support.cells import kr270_cell, kr270_chain, random_table
 from support.diagnoses import ECCENTRICITY
 
-from elastocal.diagnosis import model_keys, with_recorded_drivers
+from elastocal.diagnosis import Hypothesis, model_keys, with_recorded_drivers
+from elastocal.diagnosis.hypotheses import RegressorDirection
 from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
 
 
 def bare(**model) -> Model:
@@ -46,6 +48,25 @@ def test_keys_are_those_of_the_effects_found() -> None:
     play = replace(ECCENTRICITY, effect="backlash")
     assert model_keys(model, (play,)) == {"play_side": "load_and_approach"}
     assert model_keys(model, (ECCENTRICITY,)) == {}
+
+
+def test_the_order_of_visits_is_a_key_of_what_rests_on_it() -> None:
+    model = bare(approach="order")
+    for effect in ("hysteresis", "backlash"):
+        assert model_keys(model, (replace(ECCENTRICITY, effect=effect),)) == {"approach": "order"}
+    assert model_keys(model, (ECCENTRICITY,)) == {}
+    assert with_recorded_drivers(bare(), table()).cell.model.approach == "column"
+
+
+def test_the_vertical_of_a_driven_effect_is_that_of_the_fitted_base() -> None:
+    model, effect = bare(), CATALOGUE["gravity_sag"]
+    spec = effect.parameters("joint1", model.chain, model.cell)
+    h = Hypothesis(effect, "joint1", spec, ())
+    x = model.nominal
+    upright = RegressorDirection(h, model, x)(table(), np.zeros((1, 0)))
+    x[3:6] = [0.2, 0.0, 0.0]
+    tilted = RegressorDirection(h, model, x)(table(), np.zeros((1, 0)))
+    assert np.abs(upright).max() < 1e-12 < 0.1 < np.abs(tilted).max()
 
 
 def test_without_load_the_joint_lags_behind_its_last_motion() -> None:

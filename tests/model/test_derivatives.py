@@ -27,12 +27,20 @@ from elastocal.model.observations import COMPONENTS
 
 TOLERANCE = 1e-7  # relative to the largest entry of the column
 EPS = float(np.finfo(float).eps)
-# What changes once does so in the middle of `random_table`'s two hours.
+# What changes once does so in the middle of `random_table`'s two hours; lines and smooth functions
+# have no parameters where no setting asks for any.
+SMOOTH = {"field_joint3_size": 1e-4, "field_time_size": 1e-4, "field_time_length": 2000.0}
 CHANGES = {
-    **{f"joint{i}": {"jump_time_s": 3000.0} for i in range(1, 7)},
+    **{
+        f"joint{i}": {"jump_time_s": 3000.0, "order_1": 7.3, "order_3": 90.5, "order_sd_3": 0.1}
+        for i in range(1, 7)
+    },
+    "base": SMOOTH,
+    "link2": SMOOTH,
     "tracker": {"jump_time_s": 4000.0},
     **{f"marker:{name}": {"slip_time_s": 3500.0} for name in MARKERS},
 }
+CHANGES["joint2"] |= SMOOTH
 SPRING = Nominal(COMPLIANCE, gravity_compensator=COMPENSATOR, settings=CHANGES)
 OBSERVED = tuple(COMPONENTS)
 

@@ -323,6 +323,7 @@ class ModelSpec:
     gear_ripple_orders: Many[Positive] = keyed("a list of positive numbers", default=())
     thermal_driver: Literal["time", "temperature"] = keyed(default="time")
     play_side: Literal["load", "load_and_approach"] = keyed(default="load")
+    approach: Literal["column", "order"] = keyed(default="column")
     nominal: Nominal = keyed("a table", default_factory=Nominal)
 
     def __post_init__(self) -> None:

@@ -19,7 +19,7 @@ from elastocal.identification.weighted_problem import (
     stated_covariance,
     weights_for,
 )
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, visits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, available_noise, observe
 from elastocal.units import Array, IntArray
@@ -172,13 +172,6 @@ class Baseline:
         """Readings by configuration; a visit is a configuration, repeat and load state."""
         table, lead = self.observed.table, self.observed.lead
         return Blocks.of(table.configuration[lead], visits(table)[lead], self.observed.size)
-
-
-def visits(table: Measurements) -> IntArray:
-    """Number (n,) of each row's visit: its configuration, repeat and force."""
-    force = np.round(table.force, 6)
-    key = np.column_stack([table.configuration, table.repeat, force])
-    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
 
 
 def fit_baseline(

@@ -120,8 +120,9 @@ class DiagnosisData:
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
-        model = self.base.model
-        return {h.key: RegressorDirection(h, model) for h in self.hypotheses if h.driven}
+        base = self.base
+        driven = (h for h in self.hypotheses if h.driven)
+        return {h.key: RegressorDirection(h, base.model, base.x) for h in driven}
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:

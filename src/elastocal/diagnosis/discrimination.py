@@ -12,7 +12,7 @@ from scipy import linalg
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import norm
 
-from elastocal.diagnosis.baseline import Baseline, visits
+from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import evidence_of
@@ -28,7 +28,7 @@ from elastocal.diagnosis.rivals import (
     noise_found,
 )
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, visits, with_moves
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.candidates import draw
@@ -121,6 +121,8 @@ def visit_pool_of(
     )
     if table.temperature is not None:
         rows = replace(rows, temperature=np.full(len(rows), np.median(table.temperature)))
+    if table.move is not None:
+        rows = with_moves(rows)  # from one candidate to the next, as good as any order
     return VisitPool(q, approach, time, forces, simulate(model, rows, x, 0, noise=False))
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
@@ -30,7 +31,8 @@ from elastocal.model.effects.driven import (
     LinkLength,
     MarkerMotion,
 )
-from elastocal.model.effects.play import Backlash
+from elastocal.model.effects.placements import BaseFrame
+from elastocal.model.effects.play import BY_ORDER, Backlash, Hysteresis
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -49,6 +51,7 @@ RECORD = {
         "measure some poses with and without a load, or give the links' masses and set "
         "[model] link_gravity = true",
     ),
+    "torque": ("the table has no torque columns", "record torque_1_Nm … of every joint"),
 }
 
 
@@ -107,7 +110,8 @@ class Hypothesis:
     def entry_key(self, model: Model) -> EntryKey:
         """The entry of the chain that a driven hypothesis acts on."""
         assert isinstance(self.effect, DrivenEffect)
-        return self.effect.entry.name, self.effect.entered_at(self.where, model.chain)
+        entry = self.effect.entry_at(self.where)
+        return entry.name, self.effect.entered_at(self.where, model.chain)
 
 
 def possible(
@@ -209,7 +213,9 @@ def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
     """Keys of [model] that the effects found rest on."""
     names, spec = {f.effect for f in found}, model.cell.model
     used = [(key, value) for key, value, _, effect in CHOICES if effect in names]
-    return {key: value for key, value in used if getattr(spec, key) == value}
+    keys = {key: value for key, value in used if getattr(spec, key) == value}
+    ordered = spec.approach == BY_ORDER and names & {Backlash.name, Hysteresis.name}
+    return keys | {"approach": BY_ORDER} if ordered else keys
 
 
 # Where an effect's constants are searched: change times, time constants, orders, ranges.
@@ -495,14 +501,29 @@ def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:
     return np.array([s if p.typical is None else p.typical for s, p in sized])
 
 
-class RegressorDirection:
-    """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression."""
+def _as_placed(model: Model, x: Array) -> Cell:
+    """The model's cell with the base turned as it is at x (parameters,)."""
+    vector = [v for p, v in zip(model.parameters, x, strict=True)
+              if p.effect == BaseFrame.name and p.unit == "rad"]  # fmt: skip
+    if len(vector) != 3:
+        return model.cell
+    nominal = replace(
+        model.cell.model.nominal, base_rotation=Rotation.from_rotvec(vector).as_matrix()
+    )
+    return replace(model.cell, model=replace(model.cell.model, nominal=nominal))
 
-    def __init__(self, hypothesis: Hypothesis, model: Model) -> None:
+
+class RegressorDirection:
+    """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.
+
+    With `x` (parameters,) of the model the base stands as fitted, else as the cell says.
+    """
+
+    def __init__(self, hypothesis: Hypothesis, model: Model, x: Array | None = None) -> None:
         effect = hypothesis.effect
         assert isinstance(effect, DrivenEffect)
         self.hypothesis = hypothesis
-        self._arm = Arm(model.chain, model.cell)
+        self._arm = Arm(model.chain, model.cell if x is None else _as_placed(model, x))
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
         # Settings that are not searched are as the model has them.

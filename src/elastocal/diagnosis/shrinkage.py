@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.diagnosis.backlash_model import EFFECT, under_other_backlash_model
-from elastocal.diagnosis.baseline import Baseline, Blocks, visits
+from elastocal.diagnosis.baseline import Baseline, Blocks
 from elastocal.diagnosis.diagnosis import FittedParameter, Gap
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, from_centre, prior_deviations
 from elastocal.diagnosis.effect_search import SelectedEffects
@@ -37,7 +37,7 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.identification.findings import BudgetStep, resampled_rms, stage_of
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, visits
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations, observe
@@ -320,6 +320,10 @@ def _box(at: Array, configuration: IntArray) -> tuple[Array, Array]:
     return 2 * low[0] - low[min(1, len(low) - 1)], 2 * high[-1] - high[max(-2, -len(high))]
 
 
+# What a table says of each joint by itself.
+OF_JOINTS = ("q", "approach", "torque", "move", "direction")
+
+
 def _recombined(
     table: Measurements, n: int, rng: np.random.Generator
 ) -> tuple[Measurements, IntArray]:
@@ -332,7 +336,7 @@ def _recombined(
     labels = tuple(str(c + 1) for c in range(n))
     new = replace(table.take(rows), configuration=configuration, configuration_labels=labels)
     place = np.concatenate([np.arange(len(r)) for r in chosen])
-    own = {name: getattr(new, name) for name in ("q", "approach", "torque")}
+    own = {name: getattr(new, name) for name in OF_JOINTS}
     donors = rng.integers(len(codes), size=(n, table.q.shape[1]))
     for j, of_joint in enumerate(donors.T):
         of = [rows_of[k] for k in of_joint]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, with_moves
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
 
@@ -222,6 +222,8 @@ COLUMNS = {
     "time": "time_s or time_min",
     "approach": "approach_1 …",
     "temperature": "temperature_C",
+    "move": "q1_deg …",
+    "direction": "q1_deg …",
 }
 # A row belongs to a level of a split joint when it is this close to it (rad or m).
 LEVEL_TOLERANCE = 0.01
@@ -241,6 +243,8 @@ def _one(arm: Arm, table: Measurements, name: str, marker: NDArray) -> NDArray:
         return _one_hot(marker, len(arm.markers))
     if name.startswith("level:"):
         return _levels(arm, table, name.removeprefix("level:"))
+    if name in ("move", "direction") and getattr(table, name) is None:
+        table = with_moves(table)
     value = getattr(table, name)
     if value is None:
         raise InputError(

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, with_moves
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import available_noise, position_covariance
@@ -74,15 +74,15 @@ def expand_plan(
         for m in range(len(marker_names))
     ]
     index, repeat, state, marker = (np.array(v) for v in zip(*parts, strict=True))
-    rows = plan.take(index)
-    return replace(
-        rows,
+    rows = replace(
+        plan.take(index),
         row=np.arange(len(index)) + 2,
         repeat=plan.repeat[index] * repeats + repeat,
         marker=marker,
         marker_names=marker_names,
         force=np.stack(forces)[state, index],
     )
+    return with_moves(rows)
 
 
 def simulate(

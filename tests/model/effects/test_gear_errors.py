@@ -109,3 +109,38 @@ def test_gears_are_at_turning_joints_only(tmp_path) -> None:
     assert 0 < len(turning) < 5
     for name in ("gear_eccentricity", "gear_ripple", "backlash", "hysteresis", "joint_hardening"):
         assert CATALOGUE[name].places(chain, kr270_cell()) == turning
+
+
+LINES = {"order_1": 12.5, "order_3": 80.25, "order_sd_3": 0.2, "spectrum_centre_rad": 0.4}
+
+
+def test_a_spectrum_has_the_lines_that_the_cell_names() -> None:
+    m = model(stick("z"), "gear_spectrum", settings={"joint1": LINES})
+    keys = ["line_1_sin", "line_1_cos", "line_3_sin", "line_3_cos", "line_3_sin_shift",
+            "line_3_cos_shift"]  # fmt: skip
+    assert [name.partition(".")[2] for name in m.names] == keys
+    assert [p.typical for p in m.parameters] == [5e-5] * 4 + [5e-5 * 0.2] * 2
+    assert all(p.shrunk for p in m.parameters)
+    x, y, _ = positions(m, rows(Q), line_1_sin=2e-4, line_3_cos=-3e-4).T
+    found = np.arctan2(np.sin(np.arctan2(y, x) - Q), np.cos(np.arctan2(y, x) - Q))
+    np.testing.assert_allclose(
+        found, 2e-4 * np.sin(12.5 * Q) - 3e-4 * np.cos(80.25 * Q), atol=1e-15
+    )
+
+
+def test_beside_a_line_stands_its_derivative_by_the_order() -> None:
+    """A line of an order a little off, turned about the middle of the angles, is their sum."""
+    m = model(stick("z"), "gear_spectrum", settings={"joint1": LINES})
+    off, a, b = 1e-4, 2e-4, 3e-4
+    phase = 80.25 * Q + off * (Q - 0.4)
+    expected = a * np.sin(phase) + b * np.cos(phase)
+    shifts = {"line_3_sin_shift": a * off, "line_3_cos_shift": b * off}
+    x, y, _ = positions(m, rows(Q), line_3_sin=a, line_3_cos=b, **shifts).T
+    found = np.arctan2(np.sin(np.arctan2(y, x) - Q), np.cos(np.arctan2(y, x) - Q))
+    np.testing.assert_allclose(found, expected, atol=1e-3 * a * off + 1e-11)
+
+
+def test_a_spectrum_of_no_lines_has_no_parameters() -> None:
+    assert not model(stick("z"), "gear_spectrum").parameters
+    with pytest.raises(InputError, match="unknown setting of joint1 'order_41'"):
+        model(stick("z"), "gear_spectrum", settings={"joint1": {"order_41": 3.0}})

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 
 from elastocal.cell.arm_description import Nominal
+from elastocal.errors import InputError
 from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.compliances import rated_torque, torque_scale, weight_torque
@@ -157,3 +158,30 @@ def test_what_the_table_must_say(effect: str, computed, weighed, measured) -> No
     assert needed(kr270_cell()) == computed
     assert needed(kr270_cell(link_gravity=True)) == weighed
     assert needed(kr270_cell(torque="measured")) == measured
+
+
+def test_a_joint_follows_the_recorded_torques_of_the_others() -> None:
+    m = model(stick("zz", (1.0, 1.0)), "torque_coupling:joint1")
+    table = rows(np.zeros((3, 2)), torque=[[50.0, 0.0], [0.0, 10.0], [0.0, -20.0]])
+    y = positions(m, table, coupling_joint2=1e-5)[:, 1]
+    np.testing.assert_allclose(y, 2.0 * np.array([0.0, 1e-4, -2e-4]), atol=1e-8)
+
+
+def test_a_link_tilts_across_the_joints_at_its_ends_by_their_torques() -> None:
+    """Joints about z: the link behind joint 1 tilts about x and y, which lifts the tip 1 m on."""
+    m = model(stick("zz", (1.0, 1.0)), "torque_tilt:link1")
+    assert [n.partition(".")[2] for n in m.names] == [
+        "tilt_own_x", "tilt_own_y", "tilt_next_x", "tilt_next_y",
+    ]  # fmt: skip
+    table = rows(np.zeros((2, 2)), torque=[[100.0, 0.0], [0.0, 50.0]])
+    own = positions(m, table, tilt_own_y=1e-6)[:, 2]
+    other = positions(m, table, tilt_next_y=1e-6)[:, 2]
+    np.testing.assert_allclose(np.abs(own), [1e-4, 0.0], atol=1e-9)
+    np.testing.assert_allclose(np.abs(other), [0.0, 5e-5], atol=1e-9)
+
+
+def test_torques_that_are_not_recorded_are_asked_for() -> None:
+    for effect in ("torque_coupling", "torque_tilt"):
+        m = model(stick("zz", (1.0, 1.0)), effect)
+        with pytest.raises(InputError, match="needs the column torque_1_Nm"):
+            m.predict(rows(np.zeros((2, 2))))

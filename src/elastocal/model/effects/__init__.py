@@ -29,9 +29,11 @@ from elastocal.model.effects.gears import (
     GearEccentricity,
     GearRipple,
     GearSecondHarmonic,
+    GearSpectrum,
     JointOffset,
     WristCoupling,
 )
+from elastocal.model.effects.gravity_sag import GravitySag
 from elastocal.model.effects.loads import (
     GravityCompensator,
     LinkGravity,
@@ -46,8 +48,9 @@ from elastocal.model.effects.placements import (
     MarkerOrientation,
     MarkerPosition,
 )
-from elastocal.model.effects.play import Backlash, Hysteresis
+from elastocal.model.effects.play import Backlash, Hysteresis, MoveLag
 from elastocal.model.effects.smooth import JointCurve, ResidualField
+from elastocal.model.effects.torque_couplings import TorqueCoupling, TorqueTilt
 from elastocal.model.effects.tracker_distortion import TrackerDistortion
 from elastocal.plugin_loader import same_class
 
@@ -61,11 +64,16 @@ CATALOGUE: dict[str, Effect] = {
         GearEccentricity(),
         GearSecondHarmonic(),
         GearRipple(),
+        GearSpectrum(),
         JointCurve(),
         WristCoupling(),
         JointDrift(),
         EncoderJump(),
+        MoveLag(),
+        GravitySag(),
+        TorqueCoupling(),
         LinkGeometry(),
+        TorqueTilt(),
         ThermalExpansion(),
         ResidualField(),
         JointCompliance(),

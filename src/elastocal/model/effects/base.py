@@ -21,7 +21,7 @@ Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "track
 # Kinds of file that can hold an effect: of a rigid arm (URDF, DH table), or with springs (MJCF).
 Format = Literal["rigid", "elastic"]
 Symbols = Mapping[str, ca.SX]
-NEEDS = ("time", "approach", "temperature", "load")
+NEEDS = ("time", "approach", "temperature", "load", "torque")
 REVOLUTE = "revolute"
 
 # Ranks of parameters: where a choice is free, a minimal complete set takes low ones first.
@@ -70,7 +70,7 @@ class Effect:
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
-    # What the table must say for the effect to show, of "time", "approach", "temperature", "load".
+    # What the table must say for the effect to show, of NEEDS.
     needs: ClassVar[tuple[str, ...]] = ()
 
     # Traits.

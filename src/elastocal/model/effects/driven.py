@@ -144,8 +144,12 @@ class DrivenEffect(Effect):
         """The places of the entry that u acts on, in the order in which u stacks them."""
         return (place,)
 
+    def entry_at(self, place: str) -> Entry:
+        """The entry that u acts on, which is another one at some places of few effects."""
+        return self.entry
+
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        places = self.entered_at(place, arm.chain)
-        motions = ca.vertsplit(self.drive(arm, place, p), self.entry.size)
+        places, entry = self.entered_at(place, arm.chain), self.entry_at(place)
+        motions = ca.vertsplit(self.drive(arm, place, p), entry.size)
         for where, u in zip(places, motions, strict=True):
-            self.entry.enter(arm, where, u)
+            entry.enter(arm, where, u)

@@ -144,6 +144,76 @@ class GearRipple(GearHarmonic):
         return p["ripple_order"]
 
 
+MOST_LINES = 40
+
+
+class GearSpectrum(DrivenEffect):
+    """δq = Σ_k a_k sin N_k q + b_k cos N_k q, lines of real orders N_k; a_k and b_k in rad.
+
+    A gear with several stages has lines at each wheel's turns, at its teeth and at their
+    multiples, at once.  Settings: `order_1` … `order_40` in periods per turn (0, the default: no
+    line; as many as the cell names), the prior size `spectrum_size_rad` of each a_k and b_k.
+
+    An order that was estimated with the standard deviation `order_sd_k` brings the derivative by
+    N_k beside its line, (q − q₀)(c_k cos N_k q − d_k sin N_k q) with c_k = a_k δN_k and
+    d_k = b_k δN_k of the prior size `spectrum_size_rad` · `order_sd_k`; q₀ =
+    `spectrum_centre_rad` is the middle of the angles that the order was estimated from.
+    """
+
+    name = "gear_spectrum"
+    stage = "transmission"
+    entry = JointMotion()
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        return False  # judged with all other components of the gap, not by itself
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return turning_joints(chain)
+
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        stated = cell.model.nominal.settings.get(place, {})
+        known = range(1, MOST_LINES + 1)
+        lines = max((k for k in known if f"order_{k}" in stated), default=1)
+        orders = (Setting(f"order_{k}", "order", 0.0, 0.0, 1000.0) for k in known[:lines])
+        spreads = (Setting(f"order_sd_{k}", "range", 0.0, 0.0, 10.0) for k in known[:lines])
+        return (
+            Setting("spectrum_size_rad", "range", 5e-5, 1e-12, 1.0),
+            Setting("spectrum_centre_rad", "range", 0.0, -100.0, 100.0),
+            *orders,
+            *spreads,
+        )
+
+    def lines(self, place: str, chain: Chain, cell: Cell) -> dict[int, float]:
+        """Numbers of the lines that there are, and how uncertain their orders are."""
+        settings = self.settings(place, chain, cell)
+        stated = cell.model.nominal.settings.get(place, {})
+        given = {s.key: float(stated.get(s.key, s.default or 0.0)) for s in settings}
+        known = range(1, MOST_LINES + 1)
+        return {k: given[f"order_sd_{k}"] for k in known if given.get(f"order_{k}", 0.0) > 0}
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        stated = cell.model.nominal.settings.get(place, {})
+        size = float(stated.get("spectrum_size_rad", 5e-5))
+        specs = []
+        for k, sd in self.lines(place, chain, cell).items():
+            parts = [("sin", size), ("cos", size)]
+            parts += [("sin_shift", size * sd), ("cos_shift", size * sd)] if sd > 0 else []
+            specs += [
+                ParameterSpec(f"line_{k}_{part}", "rad", 0.0, s, shrunk=True) for part, s in parts
+            ]
+        return tuple(specs)
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        q, u = arm.q_commanded[index(place)], ca.SX(0)
+        for k, sd in self.lines(place, arm.chain, arm.cell).items():
+            sine, cosine = ca.sin(p[f"order_{k}"] * q), ca.cos(p[f"order_{k}"] * q)
+            u += p[f"line_{k}_sin"] * sine + p[f"line_{k}_cos"] * cosine
+            if sd > 0:
+                turned = p[f"line_{k}_sin_shift"] * cosine - p[f"line_{k}_cos_shift"] * sine
+                u += (q - p["spectrum_centre_rad"]) * turned
+        return u
+
+
 class WristCoupling(DrivenEffect):
     """δq₅ = a q₄, δq₆ = b q₄ + c q₅ of six joints; of n, the last three.
 

@@ -1,4 +1,9 @@
-"""Joints that come to rest elsewhere: play, and friction behind the encoder."""
+"""Joints that come to rest elsewhere: play, friction behind the encoder, and what lags behind.
+
+From which side a joint came says the table's `approach_i`; with `[model] approach = "order"` the
+order of the visits does, by times where they are recorded, else by rows (`with_moves`).  That the
+arm was measured in that order and went straight from pose to pose is an assumption.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +19,16 @@ from elastocal.model.effects.compliances import (
     rated_torque,
     torque_scale,
 )
+from elastocal.model.effects.driven import DrivenEffect, JointMotion
 
 FRICTION = 3.0  # times τ_s: the load's torque that friction holds up
+BY_ORDER = "order"
+
+
+def came_from(arm: Arm) -> ca.SX:
+    """±1 (n,): the direction of each joint's last motion, by column or by order of visits."""
+    ordered = arm.cell.model.approach == BY_ORDER
+    return arm.input("direction" if ordered else "approach", arm.chain.n_joints)
 
 
 class Backlash(TorqueEffect):
@@ -33,7 +46,7 @@ class Backlash(TorqueEffect):
     stage = "transmission"
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
-        sided = cell.model.play_side == "load_and_approach"
+        sided = cell.model.play_side == "load_and_approach" and cell.model.approach != BY_ORDER
         return (*super().needed(cell), "approach") if sided else super().needed(cell)
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
@@ -48,7 +61,7 @@ class Backlash(TorqueEffect):
         play = p["backlash"]
         held: ca.SX | float = 0.0
         if arm.cell.model.play_side == "load_and_approach":
-            held = FRICTION * scale * arm.input("approach", arm.chain.n_joints)[i]
+            held = FRICTION * scale * came_from(arm)[i]
 
         def law(tau: ca.SX) -> ca.SX:
             return play / 2 * ca.tanh((tau - held) / scale)
@@ -68,6 +81,9 @@ class Hysteresis(Effect):
     stage = "transmission"
     needs = ("approach",)
 
+    def needed(self, cell: Cell) -> tuple[str, ...]:
+        return () if cell.model.approach == BY_ORDER else self.needs
+
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return turning_joints(chain)
 
@@ -83,10 +99,47 @@ class Hysteresis(Effect):
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         i = index(place)
         scale = torque_scale(arm.chain, arm.cell, i)
-        direction = arm.input("approach", arm.chain.n_joints)[i]
+        direction = came_from(arm)[i]
 
         def law(tau: ca.SX) -> ca.SX:
             magnitude = ca.sqrt(tau**2 + scale**2) - scale
             return direction * (p["hysteresis"] + p["hysteresis_per_torque"] * magnitude)
 
         add_deflection(arm, i, f"{place}.hysteresis", law)
+
+
+NEVER = 1e-12  # rad; far below any move, so that no move at all makes no quotient of zeros
+
+
+class MoveLag(DrivenEffect):
+    """δq_j = a Δq_j / max_k |Δq_k| + b sgn Δq_j, Δq the arm's last move; a and b in rad.
+
+    A controller moves all joints for as long as the slowest one takes, so that joint j arrives
+    with a speed in proportion to Δq_j / max |Δq|: a servo that stops short, oil and rubber that
+    settle only after the reading leave an error in proportion to that speed (a), friction one of
+    a fixed size (b).  Δq is the visit's q minus that of the visit before it, in the order of the
+    times, or of the rows where there are none: an assumption that can be tested, for the same
+    visits in another order must fit worse.  The first visit has no move.
+    """
+
+    name = "move_lag"
+    stage = "transmission"
+    entry = JointMotion()
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        return False  # rests on an assumption: judged with all other components of the gap
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return turning_joints(chain)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        return (
+            ParameterSpec("move_lag", "rad", 0.0, 1e-4),
+            ParameterSpec("move_lag_sign", "rad", 0.0, 5e-5),
+        )
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        move = arm.input("move", arm.chain.n_joints)
+        own = move[index(place)]
+        longest = ca.mmax(ca.fabs(move)) + NEVER
+        return p["move_lag"] * own / longest + p["move_lag_sign"] * ca.sign(own)

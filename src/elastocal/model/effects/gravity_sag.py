@@ -1,0 +1,122 @@
+"""Joints that yield under the links' own weights, where nobody knows the weights.
+
+Joint j's torque from weights is linear in the bodies' masses m_k and first moments s_k,
+
+    τ_j = −g Σ_{k ≥ j} [m_k ∂(u·o_k)/∂q_j + Σ_c s_kc ∂(u·R_k e_c)/∂q_j],
+
+with o_k and R_k the origin and axes of link k's frame and u the vertical, and with a compliance it
+is a deflection of the same form in the unknown products of compliance, mass and g.  Most of these
+functions depend on each other: what two joints about parallel axes carry, masses on an axis.  A
+largest independent set of them is chosen once for a chain (QR with column pivoting; Golub and Van
+Loan, Matrix Computations, section 5.4), numerically, as base inertial parameters are (Gautier
+1991, J. Robotic Systems 8, 485).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import qr
+
+from elastocal.cell.work_cell import Cell
+from elastocal.model import rigid
+from elastocal.model.arm import Arm, ParameterSpec, Setting
+from elastocal.model.chain import Chain, Joint, finite_ranges
+from elastocal.model.effects.base import Symbols, index, turning_joints
+from elastocal.model.effects.driven import DrivenEffect, JointMotion
+from elastocal.units import Array
+
+POSES = 400  # random ones, in which the functions are compared
+DEPENDENT = 1e-8  # of the largest; what is left of a function that others make up
+
+
+def weight_torques(chain: Chain, q: ca.SX, up: ca.SX, j: int) -> ca.SX:
+    """−∂(height)/∂q_j of joint j (0-based) for each function that its links' weights bring.
+
+    For each link k ≥ j four: the height of its frame's origin in m, and those of the ends of its
+    three unit axes.  `q` (joints,) are symbols, `up` (3,) is the vertical in the base frame.
+    """
+    T, heights = ca.SX.eye(4), []
+    for k, joint in enumerate(chain.joints):
+        motion = rigid.joint_motion(joint.kind, joint.axis, q[k])
+        T = T @ rigid.constant(joint.placement) @ motion
+        if k >= j:
+            heights += [ca.dot(up, T[:3, 3]), *ca.vertsplit(T[:3, :3].T @ up)]
+    return -ca.jacobian(ca.vertcat(*heights), q)[:, j]
+
+
+def independent(chain: Chain, j: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Which of `weight_torques` of joint j (0-based) make up all of them, and their rms over the
+    joints' ranges and all directions of the vertical."""
+    shape = tuple(
+        (joint.kind, joint.placement.tobytes(), tuple(map(float, joint.axis)),
+         float(joint.lower), float(joint.upper))
+        for joint in chain.joints
+    )  # fmt: skip
+    return _independent(shape, j)
+
+
+@lru_cache(maxsize=256)
+def _independent(shape: tuple[tuple, ...], j: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    joints = tuple(
+        Joint("", kind, np.frombuffer(placement).reshape(4, 4), np.array(axis), lower, upper)
+        for kind, placement, axis, lower, upper in shape
+    )
+    chain = Chain("", joints, np.eye(4))
+    q, up = ca.SX.sym("q", len(joints)), ca.SX.sym("up", 3)
+    torques = ca.Function("torques", [q, up], [weight_torques(chain, q, up, j)])
+    rng = np.random.default_rng(0)
+    limits = np.array([[joint.lower, joint.upper] for joint in joints]).T
+    at = rng.uniform(*finite_ranges(chain, *limits), (POSES, len(joints)))
+    upward = rng.normal(size=(POSES, 3))
+    upward /= np.linalg.norm(upward, axis=1, keepdims=True)
+    values: Array = torques.map(POSES)(at.T, upward.T).full().T
+    R, pivot = qr(values, mode="r", pivoting=True)
+    diagonal = np.abs(np.diag(R))
+    chosen = np.sort(pivot[: int((diagonal > DEPENDENT * diagonal[0]).sum())])
+    rms = np.sqrt((values[:, chosen] ** 2).mean(axis=0))
+    return tuple(map(int, chosen)), tuple(map(float, rms))
+
+
+class GravitySag(DrivenEffect):
+    """δq_j = Σ_i a_i φ_i(q), φ_i the torques of unknown weights about joint j; a_i in rad.
+
+    φ_i are −∂(height)/∂q_j of points on the links that the joint carries, as many as are
+    independent of each other, at the commanded joints, each divided by its rms over the joints'
+    ranges: so a_i is how far the joint gives way on average.  The vertical is z of the tracker
+    frame, seen from the base wherever that stands.  It needs no masses: a_i is compliance times
+    g times a sum of masses and first moments.  Setting: the prior size `sag_size_rad` of each a_i.
+    Where masses are known, `link_gravity` and `joint_compliance` say more with less.
+    """
+
+    name = "gravity_sag"
+    stage = "transmission"
+    entry = JointMotion()
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        return False  # judged with all other components of the gap, not by itself
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return turning_joints(chain)
+
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        return (Setting("sag_size_rad", "range", 2e-4, 1e-12, 1.0),)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        size = cell.model.nominal.settings.get(place, {}).get("sag_size_rad", 2e-4)
+        return tuple(
+            ParameterSpec(f"sag_{k + 1}", "rad", 0.0, float(size), shrunk=True)
+            for k in range(len(independent(chain, index(place))[0]))
+        )
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        chosen, rms = independent(arm.chain, index(place))
+        up = arm.T_tracker_base[2, :3].T
+        torques = weight_torques(arm.chain, arm.q_commanded, up, index(place))
+        terms = (
+            p[f"sag_{k + 1}"] * torques[i] / r
+            for k, (i, r) in enumerate(zip(chosen, rms, strict=True))
+        )
+        return sum(terms, ca.SX(0))

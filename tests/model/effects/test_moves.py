@@ -1,0 +1,101 @@
+"""How the arm came to a visit: by the order of times or rows, kept with rows that are taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model.effects.stick import model, positions, rows, stick
+from support.cells import kr270_cell, kr270_chain, random_table
+
+from elastocal.errors import InputError
+from elastocal.measurements import read_measurements, visits, with_moves
+from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
+
+Q = np.array([[0.0, 0.0], [0.5, 0.0], [0.2, -0.4], [0.2, 0.1]])
+MOVE = np.array([[0.0, 0.0], [0.5, 0.0], [-0.3, -0.4], [0.0, 0.5]])
+DIRECTION = np.array([[0, 0], [1, 0], [-1, -1], [-1, 1]])
+
+
+def test_a_move_is_from_one_visit_to_the_next_and_a_joint_keeps_its_last_direction() -> None:
+    table = with_moves(rows(Q))
+    np.testing.assert_allclose(table.move, MOVE, atol=1e-15)
+    np.testing.assert_array_equal(table.direction, DIRECTION)
+
+
+def test_times_decide_where_there_are_any() -> None:
+    shuffled = np.array([2, 0, 3, 1])
+    table = with_moves(rows(Q[shuffled], time=np.arange(4.0)[shuffled]))
+    np.testing.assert_allclose(table.move, MOVE[shuffled], atol=1e-15)
+    np.testing.assert_array_equal(table.direction, DIRECTION[shuffled])
+
+
+def test_a_visit_that_moves_nothing_keeps_the_move_before_it() -> None:
+    """A load is hung on, or a second marker is read; what an encoder reads may tremble."""
+    twice = np.repeat(np.arange(4), 2)
+    table = rows(Q[twice] + 1e-6 * np.arange(8)[:, None])
+    table = replace(table, configuration=twice, force=np.tile([[0, 0, 0], [0, 0, -9.0]], (4, 1)))
+    assert len(np.unique(visits(table))) == 8
+    np.testing.assert_allclose(with_moves(table).move, MOVE[twice], atol=1e-5)
+    np.testing.assert_array_equal(with_moves(table).direction, DIRECTION[twice])
+    np.testing.assert_allclose(
+        with_moves(replace(table, force=np.zeros((8, 3)))).move, MOVE[twice], atol=1e-5
+    )
+
+
+def test_visits_are_numbered_by_configuration_repeat_and_force() -> None:
+    table = random_table(kr270_chain(), 9, seed=4)
+    force = np.round(table.force, 6)
+    key = np.column_stack([table.configuration, table.repeat, force])
+    expected = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+    np.testing.assert_array_equal(visits(table), expected)
+
+
+def test_rows_that_are_taken_from_a_table_that_was_read_keep_their_moves(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    lines = [f"{a},{b},0,0,0" for a, b in Q]
+    path.write_text("\n".join(["q1_rad,q2_rad,x_m,y_m,z_m", *lines]) + "\n")
+    table = read_measurements(path, joint_kinds=("revolute", "revolute"))
+    np.testing.assert_allclose(table.take([3, 1]).move, MOVE[[3, 1]], atol=1e-15)
+    np.testing.assert_array_equal(table.take([3, 1]).direction, DIRECTION[[3, 1]])
+    assert "move" not in "".join(table.columns())
+
+
+def test_an_arm_lags_by_its_share_of_the_longest_way() -> None:
+    m = model(stick("zz", (1.0, 1.0)), "move_lag:joint2")
+    lag, sign = (
+        positions(m, rows(Q), **{key: 1e-3}) - positions(m, rows(Q))
+        for key in ("move_lag", "move_lag_sign")
+    )
+    far = np.linalg.norm(lag, axis=1)
+    np.testing.assert_allclose(far, 1e-3 * np.array([0.0, 0.0, 1.0, 1.0]), rtol=1e-6, atol=1e-12)
+    ahead = np.cross(positions(m, rows(Q)) - np.column_stack(
+        [np.cos(Q[:, 0]), np.sin(Q[:, 0]), np.zeros(4)]), sign)[:, 2]  # fmt: skip
+    np.testing.assert_allclose(ahead, 1e-3 * np.sign(MOVE[:, 1]), atol=1e-9)
+
+
+@pytest.mark.parametrize("effect", ["hysteresis", "backlash"])
+def test_the_order_of_visits_says_what_a_missing_column_would(effect: str) -> None:
+    chain, side = kr270_chain(), "load_and_approach"
+    table = replace(random_table(chain, 6, seed=1), approach=None)
+    by_order = Model.assembled(chain, kr270_cell([effect], play_side=side, approach="order"))
+    by_column = Model.assembled(chain, kr270_cell([effect], play_side=side))
+    x = np.array([p.typical or 1e-8 for p in by_column.parameters])
+    told = replace(table, approach=with_moves(table).direction)
+    np.testing.assert_array_equal(by_order.predict(table, x), by_column.predict(told, x))
+    with pytest.raises(InputError, match="needs the column approach_1"):
+        by_column.predict(table, x)
+    assert "approach" not in CATALOGUE[effect].needed(by_order.cell)
+    assert "approach" in CATALOGUE[effect].needed(by_column.cell)
+
+
+def test_a_recorded_column_counts_unless_the_cell_says_otherwise() -> None:
+    chain = kr270_chain()
+    table = random_table(chain, 6, seed=1)
+    m = Model.assembled(chain, kr270_cell(["hysteresis"]))
+    other = replace(table, approach=-table.approach)
+    x = np.array([p.typical or 1e-8 for p in m.parameters])
+    assert np.abs(m.predict(table, x) - m.predict(other, x)).max() > 1e-6
