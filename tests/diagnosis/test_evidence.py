@@ -10,7 +10,8 @@ from scipy import stats
 from scipy.special import logsumexp
 from support.diagnosis_data import dense_noise, random_data, used_rows
 
-from elastocal.diagnosis import NoiseValues, NoisyData, direct, evidence_of, project
+from elastocal.diagnosis import NoiseValues, NoisyData, direct, evidence_of, exceedance, project
+from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.evidence import SCALES
 
 NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), 0.5)
@@ -109,3 +110,39 @@ def test_strong_evidence_does_not_overflow() -> None:
     lam, beta = np.array([[1e6]]), np.array([[1e6]])
     assert np.isfinite(evidence_of(lam, beta, SCALES)).all()
     assert evidence_of(lam, beta, SCALES)[0] == pytest.approx(5e5, rel=1e-3)
+
+
+FLIPS = np.sort(np.random.default_rng(3).chisquare(3, 199) / 2)
+
+
+def test_where_flips_reach_it_a_p_value_is_their_share() -> None:
+    assert exceedance(FLIPS, FLIPS[100]) == pytest.approx(100 / 200)
+    assert exceedance(FLIPS, FLIPS[-1]) == pytest.approx(2 / 200)
+    assert exceedance(FLIPS[:0], 5.0) == 1.0
+
+
+def test_beyond_all_flips_a_p_value_goes_on_falling_down_to_its_floor() -> None:
+    beyond = [exceedance(FLIPS, FLIPS[-1] + step) for step in (1e-9, 1.0, 2.0, 3.0, 30.0)]
+    assert beyond[0] <= 1 / 200 and beyond[-1] == SMALLEST_P
+    assert beyond == sorted(beyond, reverse=True) and len(set(beyond)) == 5
+
+
+@pytest.mark.parametrize("kind", ["one", "many", "sum", "largest", "rare"])
+@pytest.mark.parametrize("true", [2e-3, 5e-4])
+def test_p_values_from_the_tail_are_not_below_what_they_are(kind: str, true: float) -> None:
+    """Log evidences of one effect and of many, their sums and maxima: the p-value at the quantile
+    that leaves `true` beyond it is no smaller in the median, and nine times as large at most."""
+
+    def draw(rng: np.random.Generator, n: int) -> np.ndarray:
+        return {
+            "one": lambda: rng.chisquare(1, n) / 2,
+            "many": lambda: rng.chisquare(8, n) / 2,
+            "sum": lambda: logsumexp(rng.chisquare(3, (n, 60)) / 2, axis=1),
+            "largest": lambda: rng.chisquare(2, (n, 20)).max(axis=1) / 2,
+            "rare": lambda: logsumexp(rng.chisquare(1, (n, 100)) / 2 - 2, axis=1),
+        }[kind]()
+
+    rng = np.random.default_rng(5)
+    observed = float(np.quantile(draw(rng, 100_000), 1 - true))
+    told = [exceedance(draw(rng, 199), observed) for _ in range(200)]
+    assert true < np.median(told) < 9 * true

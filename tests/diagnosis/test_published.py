@@ -10,7 +10,7 @@ import pytest
 from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, EXTRA, UNKNOWN, VERDICTS
 
-from elastocal.diagnosis import Diagnosis, Gap, publish
+from elastocal.diagnosis import Diagnosis, Gap, NearRepeats, publish
 from elastocal.identification import BudgetStep
 from elastocal.model import Model
 
@@ -44,7 +44,13 @@ def test_keys_and_units_of_the_design(model):
     assert content["schema"] == "elastocal/diagnosis/1"
     assert content["verdict"] == "explained"
     assert content["gap"] == pytest.approx(
-        {"nominal_um": 3200, "calibrated_um": 84, "explained_um": 21, "noise_floor_um": 19}
+        {
+            "nominal_um": 3200,
+            "calibrated_um": 84,
+            "explained_um": 21,
+            "noise_floor_um": 19,
+            "unexplained_um": 0,
+        }
     )
     last = content["budget"][-2]
     assert last["step"] == "gear_eccentricity:joint2"
@@ -77,7 +83,21 @@ def test_what_is_not_known_is_null(model):
     assert content["budget"][0] == {"step": "nominal", "heldout_rms_um": None, "ci95": [None] * 2}
     assert content["location"] is None
     assert content["noise"]["pure_error_um"] is None
+    assert content["noise"]["near_repeat_um"] is None and content["noise"]["near_repeats"] is None
     assert content["extra_plan"] is None
+
+
+def test_near_repeats_and_what_is_unexplained_are_told(model):
+    near = NearRepeats(26e-6, 12, 10, 20e-6)
+    d = replace(
+        EXPLAINED, noise=replace(EXPLAINED.noise, near_repeats=near),
+        gap=replace(EXPLAINED.gap, unexplained=5e-5),
+    )  # fmt: skip
+    content = publish(d, model, "data.csv")
+    assert content["gap"]["unexplained_um"] == pytest.approx(50.0)
+    assert content["noise"]["near_repeat_um"] == pytest.approx(26.0)
+    told = {"pairs": 12, "independent": 10, "soon_um": pytest.approx(20.0), "later_um": None}
+    assert content["noise"]["near_repeats"] == told
 
 
 def test_curves_and_extra_poses(model):

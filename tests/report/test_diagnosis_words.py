@@ -25,7 +25,7 @@ from support.diagnoses import (
     VERDICTS,
 )
 
-from elastocal.diagnosis import EffectAt, NoiseFloor
+from elastocal.diagnosis import EffectAt, NearRepeats, NoiseFloor
 from elastocal.report.diagnosis_view import (
     diagnosis_headline,
     diagnosis_lines,
@@ -95,7 +95,7 @@ def test_an_unknown_effect_has_a_place_a_driver_and_a_chance_but_no_name():
     text = spoken(UNKNOWN)
     assert "joint 2, in the transmission (probability 0.98)" in text
     assert "joint 2 angle (p = 0.0040)" in text
-    assert "p < 0.001" in text
+    assert "p = 0.00040" in text
     # The curve is 80 µrad · sin(3q) over more than a turn of its argument.
     assert "Shape" in dict(diagnosis_lines(UNKNOWN))
     (moved,) = re.findall(r"joint 2 angle moves joint 2 rotation by ([\d.]+) mrad", text)
@@ -209,6 +209,24 @@ def test_names_that_are_no_effects():
 def test_settings_have_units():
     text = settings_text({"jump_time_s": 4325.5, "ripple_order": 100.7, "time_constant_s": 60.0})
     assert text == "jump time 72.1 min, ripple order 100.7, time constant 60.0 s"
+
+
+def test_near_repeats_are_told_with_their_number():
+    bare = NoiseFloor(False, 1.0, 2e-5, (0.0,) * 6, 0.0, None)
+
+    def told(near):
+        return " ".join(noise_floor_lines(replace(bare, near_repeats=near), KINDS))
+
+    assert "nearly the same pose (1 pair) scatter by 26.0 µm rms" in told(NearRepeats(26e-6, 1, 1))
+    text = told(NearRepeats(26e-6, 40, 35, 20e-6, 31e-6))
+    assert "(40 pairs)" in text and "soon after each other 20.0 µm" in text and "31.0 µm)" in text
+
+
+@pytest.mark.parametrize("d", [EXPLAINED, NOTHING])
+def test_what_is_no_noise_is_called_unexplained(d):
+    assert "unexplained" not in spoken(d)
+    text = spoken(replace(d, gap=replace(d.gap, unexplained=0.2e-3)))
+    assert "200 µm rms look like scatter of the arm and are no noise" in text
 
 
 def test_lists():

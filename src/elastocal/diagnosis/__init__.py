@@ -8,17 +8,17 @@ ROOMS = {
     "diagnose": "DiagnosisOptions write_extended_cell",
     "diagnosis": (
         "Candidate Curve Diagnosis EffectAt ExtraPlan FaultyReading FittedParameter "
-        "FoundEffect Gap Location NoiseFloor RivalPair StructureTest Untested publish"
+        "FoundEffect Gap Location NearRepeats NoiseFloor RivalPair StructureTest Untested publish"
     ),
     "diagnosis_data": (
-        "DiagnosisData OutlierScreening describe_faulty diagnosis_data_of from_centre "
+        "DiagnosisData OutlierScreening diagnosis_data_of from_centre "
         "prior_deviations reading_errors screen_outliers"
     ),
     "discrimination": (
         "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"
     ),
     "effect_search": "ForwardSelection SelectedEffects Slot base_score is_far relinearised",
-    "evidence": "EntrySums Grams Prior Scan direct evidence_of scan",
+    "evidence": "EntrySums Grams Prior Scan direct evidence_of exceedance scan",
     "extra_poses": "expected expected_of_random fewest measuring_order plan_extra",
     "hypotheses": (
         "Hypothesis SettingsGrid change_times compute_columns grid_of model_keys possible "
@@ -35,7 +35,11 @@ ROOMS = {
     "rivals": "RivalSet Suspects alternatives with_neighbours",
     "shrinkage": (
         "Change Confirmation PosteriorDraw blocks_of_time left_out_residual new_pose_table "
-        "noise_rms rms_with_interval squared_lengths"
+        "rms_with_interval squared_lengths"
+    ),
+    "stated_floor": (
+        "SupportedFloor describe_faulty near_pairs near_repeats noise_rms pure_error returned "
+        "smooth_scatter supported_floor"
     ),
     "unknown": "Covariates Generic generic_blocks monomials waves",
     "verdict": "warnings",

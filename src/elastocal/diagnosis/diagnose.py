@@ -20,7 +20,6 @@ from elastocal.diagnosis.diagnosis_data import (
     DiagnosisData,
     OutlierScreening,
     diagnosis_data_of,
-    noise_floor,
     screen_outliers,
 )
 from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
@@ -28,6 +27,7 @@ from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import model_keys, possible, with_recorded_drivers
 from elastocal.diagnosis.model_set import settings_of
 from elastocal.diagnosis.shrinkage import Confirmation, between_visits, budget, refit, shrinkage
+from elastocal.diagnosis.stated_floor import noise_floor
 from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
     Answer,

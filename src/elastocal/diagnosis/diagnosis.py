@@ -66,6 +66,7 @@ MICRO = 1e6
 # A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
 # Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
 VISIBLE, FAINTEST = 5.0, 3.0
+SMALLEST_P = 1e-4  # a p-value that stands for itself and all that are smaller
 STRUCTURE = 0.05  # family-wise p-value up to which the dependence on a covariate is told
 
 
@@ -151,12 +152,17 @@ class Untested:
 
 @dataclass(frozen=True)
 class Gap:
-    """3-D rms marker errors in m on held-out poses; the noise floor is what noise alone gives."""
+    """3-D rms marker errors in m on held-out poses; the noise floor is what noise alone gives.
+
+    `unexplained` is scatter that fits as if it were noise, and is none: repeats do not show it,
+    or it goes with the joints' angles.
+    """
 
     nominal: float
     calibrated: float
     explained: float
     noise_floor: float
+    unexplained: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -216,6 +222,22 @@ class FaultyReading:
 
 
 @dataclass(frozen=True)
+class NearRepeats:
+    """Readings at poses that nearly coincide, after the fitted model's own difference.
+
+    `scatter` (m): rms per axis of a reading, over `pairs` of which so many are `independent`;
+    `soon` and `later` the same of pairs measured one soon after the other and of the others, None
+    where one of them has few.
+    """
+
+    scatter: float
+    pairs: int
+    independent: int
+    soon: float | None = None
+    later: float | None = None
+
+
+@dataclass(frozen=True)
 class NoiseFloor:
     """The noise that the data themselves show.
 
@@ -223,7 +245,7 @@ class NoiseFloor:
     was).  `reading_sigma` (m): rms per axis of a single reading.  `repeatability` (joints,) in rad
     or m: scatter of each joint from visit to visit.  `shared`: scatter common to all visits of
     a configuration, as a multiple of it.  `pure_error` (m): rms per axis within repeats, None
-    without repeats.
+    without repeats.  `near_repeats`: what readings at nearly the same pose differ by, None without.
     """
 
     stated: bool
@@ -233,6 +255,7 @@ class NoiseFloor:
     shared: float
     pure_error: float | None
     faulty: tuple[FaultyReading, ...] = ()
+    near_repeats: NearRepeats | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -251,7 +274,8 @@ class Diagnosis(Result):
         structure: What the residual depends on, without naming an effect.
         probability_nothing: That no effect is missing.
         probability_unknown: That something without a name is at work.
-        p_value: Of what was found, against the whole family of hypotheses.
+        p_value: Of what was found, against the whole family of hypotheses; 0.0001 stands for that
+            and all that is smaller.
         curves: The shape of an unknown dependence.
         untested: Effects that the data cannot test, and what to record so that they can.
         findings: The judgements about it, the verdict first, each with its numbers and what to do.
@@ -311,11 +335,13 @@ class Diagnosis(Result):
         """The rms motion of the markers (m) from which an effect would have been seen; NaN where
         there are no configurations.
 
-        d² = Σ |δ|² / σ² per axis, with a configuration as one reading of the noise floor: more
-        readings and loads per configuration only make smaller effects visible.
+        d² = Σ |δ|² / σ² per axis, with a configuration as one reading of the noise floor and of
+        what is unexplained, in which effects hide as well: more readings and loads per
+        configuration only make smaller effects visible.
         """
         independent = 3 * self.n_configurations
-        return VISIBLE * self.gap.noise_floor / math.sqrt(independent) if independent else math.nan
+        hidden_in = math.hypot(self.gap.noise_floor, self.gap.unexplained)
+        return VISIBLE * hidden_in / math.sqrt(independent) if independent else math.nan
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -400,6 +426,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
             "calibrated_um": d.gap.calibrated * MICRO,
             "explained_um": d.gap.explained * MICRO,
             "noise_floor_um": d.gap.noise_floor * MICRO,
+            "unexplained_um": d.gap.unexplained * MICRO,
         },
         "budget": [_step(step) for step in d.budget],
         "effects": [_found(effect) for effect in d.effects],
@@ -439,6 +466,7 @@ def _location(location: Location) -> dict[str, Any]:
 
 
 def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
+    near = noise.near_repeats
     return {
         "stated": noise.stated,
         "stated_factor": noise.stated_factor,
@@ -449,8 +477,16 @@ def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
         ],
         "shared": noise.shared,
         "pure_error_um": None if noise.pure_error is None else noise.pure_error * MICRO,
+        "near_repeat_um": None if near is None else near.scatter * MICRO,
+        "near_repeats": None if near is None else _near_repeats(near),
         "faulty": [_faulty(reading) for reading in noise.faulty],
     }
+
+
+def _near_repeats(near: NearRepeats) -> dict[str, Any]:
+    times = {"soon_um": near.soon, "later_um": near.later}
+    parts = {key: None if value is None else value * MICRO for key, value in times.items()}
+    return {"pairs": near.pairs, "independent": near.independent} | parts
 
 
 def _faulty(reading: FaultyReading) -> dict[str, Any]:

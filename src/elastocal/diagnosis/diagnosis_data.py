@@ -10,7 +10,6 @@ import numpy as np
 from scipy import stats
 
 from elastocal.diagnosis.baseline import Baseline, Blocks, VisitPlaces
-from elastocal.diagnosis.diagnosis import FaultyReading, NoiseFloor
 from elastocal.diagnosis.hypotheses import (
     Columns,
     EntryKey,
@@ -250,9 +249,15 @@ def from_centre(base: Baseline) -> Array:
 
 
 def prior_deviations(base: Baseline) -> Array:
-    """Prior standard deviation (parameters,) of each fitted parameter."""
+    """Prior standard deviation (parameters,) of each fitted parameter.
+
+    At least how far the fit has moved it.  Where a prior is narrower than what the readings say,
+    an addition with the same columns spares the fitted parameter a part of the way, and is
+    believed for that alone: half of v in each of two columns costs v²/4w² less than v in one.
+    """
     compliant = [effect_of(p.effect).sized_by_value for p in base.model.parameters]
     wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
+    wide = np.maximum(wide, np.abs(from_centre(base)))
     return np.where(is_placed(base.model), PLACED, wide)
 
 
@@ -375,61 +380,3 @@ def _moments(dataset: DiagnosisData) -> Array | IntArray:
     """When each observation (N,) was made; its row in the table where no times are recorded."""
     time = dataset.table.time
     return dataset.lead if time is None else time[dataset.lead]
-
-
-def describe_faulty(
-    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues
-) -> tuple[FaultyReading, ...]:
-    """The readings left out, with their error against the fit to the others."""
-    blocks, size = dataset.blocks, dataset.blocks.size
-    out = data.faulty
-    if not out.any():
-        return ()
-    at = project(data, noise)
-    e = blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
-    sigma = np.sqrt(np.einsum("nii->ni", blocks.unpack_square(data.covariance)) * noise.factor**2)
-    table, lead = dataset.table, dataset.lead
-    return tuple(
-        FaultyReading(
-            int(table.row[lead[k]]),
-            table.configuration_labels[table.configuration[lead[k]]],
-            table.marker_names[table.marker[lead[k]]],
-            float(np.linalg.norm(e[k, :3])),
-            float(np.linalg.norm(e[k, :size] / sigma[k])),
-        )
-        for k in np.flatnonzero(out)
-    )
-
-
-# The noise floor as the report states it.
-
-
-def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> NoiseFloor:
-    """Tracker noise, repeatability, shared scatter, pure error and faulty readings."""
-    used = ~data.left_out
-    variance = np.diagonal(data.covariance, axis1=1, axis2=2)[used]
-    return NoiseFloor(
-        data.stated, noise.factor, float(noise.factor * np.sqrt(variance.mean())),
-        tuple(float(s) for s in noise.joint), noise.shared, pure_error(dataset),
-        describe_faulty(dataset, data, noise),
-    )  # fmt: skip
-
-
-def pure_error(dataset: DiagnosisData) -> float | None:
-    """Scatter in m per axis among repeats of the same pose, load and marker; None without any."""
-    observed, table, good = dataset.base.observed, dataset.table, ~dataset.data.faulty
-    rows = observed.lead[good]
-    force = np.round(table.force[rows], 6)
-    key = np.column_stack([table.configuration[rows], table.marker[rows], force])
-    _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    group = group.ravel()
-    repeated = count[group] > 1
-    if not repeated.any():
-        return None
-    values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
-    mean = np.zeros((len(count), values.shape[1]))
-    np.add.at(mean, group, values)
-    mean /= count[:, None]
-    squares = ((values - mean[group])[repeated] ** 2).sum()
-    dof = (count[count > 1] - 1).sum() * values.shape[1]
-    return float(np.sqrt(squares / dof))

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from elastocal.diagnosis.baseline import VisitPlaces
+from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
@@ -65,9 +66,28 @@ class Spectrum:
         return evidence_of(self.lam, self.flips, scales)
 
 
+# Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,
+# since the evidence's ratio has the mean 1 under the noise (Markov's inequality); where the flips
+# spread more widely than that, as they do about a noise that does not fit, their own mean excess
+# counts.  Of the n largest, whose mean excess over the next one is m, the next is predicted to
+# exceed it by y with probability (1 + y/nm)^−n: the exponential tail, its scale not known better
+# than n excesses tell (a tail as in Knijnenburg et al. 2009, Bioinformatics 25, of shape zero).
+
+TAIL = 0.25  # share of the flips that shows it
+
+
 def exceedance(flipped: Array, observed: float) -> float:
-    """p-value of `observed` among what the flips (F,) yield, itself counted as one of them."""
-    return (1 + int((flipped >= observed).sum())) / (1 + len(flipped))
+    """p-value of the log evidence `observed` among what the flips (F,) yield, itself counted as
+    one of them; where none of them reaches it, by their tail, SMALLEST_P at least."""
+    beyond, F = int((flipped >= observed).sum()), len(flipped)
+    counted = (1 + beyond) / (1 + F)
+    n = int(TAIL * F)
+    if beyond or not n:
+        return counted
+    top = np.sort(flipped)[-n - 1 :]
+    mean = max(float((top[1:] - top[0]).mean()), 1.0)
+    by_tail = n / (1 + F) * (1 + (observed - float(top[0])) / (n * mean)) ** -n
+    return max(min(counted, by_tail), SMALLEST_P)
 
 
 def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:

@@ -32,10 +32,10 @@ from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
     Projection,
-    covariance,
     noise_draws,
     project,
 )
+from elastocal.diagnosis.stated_floor import supported_floor
 from elastocal.identification.findings import BudgetStep, resampled_rms, stage_of
 from elastocal.measurements import Measurements, visits
 from elastocal.model.effects.placements import BaseFrame
@@ -96,17 +96,6 @@ def rms_with_interval(
     return resampled_rms(*squared_lengths(data, packed), rng)
 
 
-def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
-    """3-D rms in m that the noise alone gives a reading."""
-    V = covariance(data, noise)
-    variance = np.diagonal(V, axis1=1, axis2=2) * ~data.left_out
-    blocks: Blocks = data.blocks
-    C, M = blocks.member.shape
-    part = variance.reshape(C, M, blocks.size)[:, :, : min(blocks.size, 3)]
-    used = ~data.left_out.reshape(C, M, blocks.size)[:, :, 0]
-    return float(np.sqrt(part.sum() / used.sum()))
-
-
 # The gap, step by step: from the nominal arm through the fitted effects to the noise floor.
 
 
@@ -133,14 +122,16 @@ def budget(
         steps.append(_step(name, data, chosen, together, rng))
     # Where the noise model does not fit, the readings still say what scatter they leave.
     left = rms_with_interval(chosen.data, left_out_residual(chosen.at, together), rng)[0]
-    floor = min(noise_rms(chosen.data, chosen.noise), left)
     calibrated = steps[len(steps) - len(known) - 1].heldout_rms
-    nominal = steps[0].heldout_rms
-    gap = Gap(nominal, calibrated, steps[-1].heldout_rms, floor)
+    nominal, explained = steps[0].heldout_rms, steps[-1].heldout_rms
     unknown = [item.what.where for item in chosen.items if not item.known]
     if unknown:
         # What a smooth curve without a name takes away: no explanation, but how much is at stake.
         steps.append(_step("unknown:" + "+".join(unknown), chosen.data, chosen, together, rng))
+    best = min([left, *(step.heldout_rms for step in steps)])
+    supported = supported_floor(found.dataset, chosen.data, chosen.noise, best)
+    floor = supported.noise
+    gap = Gap(nominal, calibrated, explained, floor, supported.unexplained)
     return gap, (*steps, BudgetStep("noise_floor", floor, (floor, floor)))
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from elastocal.diagnosis.diagnosis import (
+    SMALLEST_P,
     Candidate,
     Curve,
     Diagnosis,
@@ -16,6 +17,7 @@ from elastocal.diagnosis.diagnosis import (
     ExtraPlan,
     FoundEffect,
     Location,
+    NearRepeats,
     NoiseFloor,
 )
 from elastocal.identification.findings import BudgetStep
@@ -92,14 +94,14 @@ def probability(p: float) -> str:
 
 
 def p_value(p: float) -> str:
-    """Two digits, or that it is below a thousandth."""
+    """Two digits, or that it is below the smallest that is told."""
     if not math.isfinite(p):
         return "–"
-    return "< 0.001" if p < 0.001 else significant(p, 2)
+    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
 
 
 def size_of(p: float) -> str:
-    """ "p = 0.02", "p < 0.001"."""
+    """ "p = 0.02", "p < 0.0001"."""
     text = p_value(p)
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
@@ -159,6 +161,8 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
         lines.append("No reading is repeated, so the noise is known from the residuals only.")
     else:
         lines.append(f"Repeats scatter by {length(noise.pure_error)} rms per axis.")
+    if noise.near_repeats is not None:
+        lines.append(_near_repeats_line(noise.near_repeats))
     if noise.faulty:
         n = len(noise.faulty)
         lines.append(
@@ -166,6 +170,19 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
             f"the worst {length(max(f.error for f in noise.faulty))} off."
         )
     return lines
+
+
+def _near_repeats_line(near: NearRepeats) -> str:
+    pairs = f"{near.pairs} pair{'s' if near.pairs > 1 else ''}"
+    text = (
+        f"Readings at nearly the same pose ({pairs}) scatter by {length(near.scatter)} rms per axis"
+    )
+    if near.soon is not None and near.later is not None:
+        text += (
+            f" (measured soon after each other {length(near.soon)}, in other parts of the campaign "
+            f"{length(near.later)})"
+        )
+    return f"{text}."
 
 
 ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
@@ -238,19 +255,32 @@ def diagnosis_lines(d: Diagnosis) -> list[tuple[str, str]]:
 def _error_lines(d: Diagnosis) -> list[str]:
     """Error on held-out poses before and after, and the part of it that the effects remove."""
     calibrated, floor = length(d.gap.calibrated), length(d.gap.noise_floor)
+    rest = _unexplained_lines(d)
     if not d.effects:
         return [
             f"On held-out poses the calibrated arm is off by {calibrated} rms; noise alone "
-            f"gives {floor}."
-        ]
+            f"gives {floor}.", *rest,
+        ]  # fmt: skip
     text = (
         f"On held-out poses the error falls from {calibrated} to {length(d.gap.explained)} rms "
         f"(noise alone: {floor})."
     )
     if len(d.effects) == 1:
-        return [f"{text} The noise-free error of new poses shrinks by {reduction(d.effects[0])}."]
+        shrinks = f"The noise-free error of new poses shrinks by {reduction(d.effects[0])}."
+        return [f"{text} {shrinks}", *rest]
     each = [f"{effect_at(f)} takes away {reduction(f)}" for f in d.effects]
-    return [f"{text} Of the noise-free error of new poses {together(each)}."]
+    return [f"{text} Of the noise-free error of new poses {together(each)}.", *rest]
+
+
+def _unexplained_lines(d: Diagnosis) -> list[str]:
+    """What looks like noise and is none."""
+    if not d.gap.unexplained:
+        return []
+    return [
+        f"{length(d.gap.unexplained)} rms look like scatter of the arm and are no noise: readings "
+        "at the same or nearly the same pose do not show them, or they go with the joints' angles. "
+        "They are unexplained."
+    ]
 
 
 def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:

@@ -1,0 +1,289 @@
+"""The noise floor as it is stated: what repeats, near-repeats and neighbours say of the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.spatial import cKDTree
+
+from elastocal.diagnosis.diagnosis import FaultyReading, NearRepeats, NoiseFloor
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, covariance, project
+from elastocal.units import Array, BoolArray, IntArray
+
+# The noise floor as the report states it.
+
+
+def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> NoiseFloor:
+    """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
+    used = ~data.left_out
+    variance = np.diagonal(data.covariance, axis1=1, axis2=2)[used]
+    return NoiseFloor(
+        data.stated, noise.factor, float(noise.factor * np.sqrt(variance.mean())),
+        tuple(float(s) for s in noise.joint), noise.shared, pure_error(dataset),
+        describe_faulty(dataset, data, noise), near_repeats(dataset, data, project(data, noise)),
+    )  # fmt: skip
+
+
+def describe_faulty(
+    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues
+) -> tuple[FaultyReading, ...]:
+    """The readings left out, with their error against the fit to the others."""
+    blocks, size = dataset.blocks, dataset.blocks.size
+    out = data.faulty
+    if not out.any():
+        return ()
+    at = project(data, noise)
+    e = blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
+    sigma = np.sqrt(np.einsum("nii->ni", blocks.unpack_square(data.covariance)) * noise.factor**2)
+    table, lead = dataset.table, dataset.lead
+    return tuple(
+        FaultyReading(
+            int(table.row[lead[k]]),
+            table.configuration_labels[table.configuration[lead[k]]],
+            table.marker_names[table.marker[lead[k]]],
+            float(np.linalg.norm(e[k, :3])),
+            float(np.linalg.norm(e[k, :size] / sigma[k])),
+        )
+        for k in np.flatnonzero(out)
+    )
+
+
+def pure_error(dataset: DiagnosisData) -> float | None:
+    """Scatter in m per axis among repeats of the same pose, load and marker; None without any."""
+    observed, table, good = dataset.base.observed, dataset.table, ~dataset.data.faulty
+    rows = observed.lead[good]
+    force = np.round(table.force[rows], 6)
+    key = np.column_stack([table.configuration[rows], table.marker[rows], force])
+    group = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+    values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
+    square, dof = _within(group, values)
+    return float(np.sqrt(square)) if dof else None
+
+
+# Near-repeats: readings of the same marker under the same load at poses that nearly coincide.
+#
+# Two readings i, j whose joints all differ by less than NEAR see the same arm.  A Gaussian process
+# of length ℓ and variance A² (squared exponential) has half the mean square difference
+#
+#     γ(d) = A² (1 − exp(−d²/2ℓ²)),
+#
+# 0.5 % of A² at d = NEAR and ℓ = 10 NEAR = 0.05 rad, half the length of the roughest error curve
+# of a joint that is common; the fitted model's own difference is subtracted.  What is rougher
+# only makes the scatter larger: near-repeats bound the noise from above.
+
+NEAR = 5e-3  # rad, or m
+SOON = 0.1  # share of the campaign within which two visits follow each other soon
+ENOUGH_PAIRS = 8  # that are stated by themselves
+
+
+def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> NearRepeats | None:
+    """Scatter in m per axis among near-repeats, beside the model of `data` at `at`; None without.
+
+    Half the mean square of e_i − e_j over pairs of nearest neighbours, e = r − Xβ̂.
+    """
+    pairs = near_pairs(dataset, ~data.faulty)
+    if not len(pairs):
+        return None
+    size = min(dataset.blocks.size, 3)
+    e = dataset.blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :size, 0]
+    squares = ((e[pairs[:, 0]] - e[pairs[:, 1]]) ** 2).mean(axis=1) / 2
+    moment = _order(dataset)
+    apart = np.abs(moment[pairs[:, 0]] - moment[pairs[:, 1]]) > SOON * np.ptp(moment)
+
+    def scatter(chosen: BoolArray) -> float | None:
+        if min(chosen.sum(), (~chosen).sum()) < ENOUGH_PAIRS:
+            return None
+        return float(np.sqrt(squares[chosen].mean()))
+
+    return NearRepeats(
+        float(np.sqrt(squares.mean())), len(pairs), _independent(pairs), scatter(~apart),
+        scatter(apart),
+    )  # fmt: skip
+
+
+def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
+    """Pairs (k, 2) of `good` (N,) observations of one marker and load in different configurations,
+    each with its nearest neighbour in the joints, all within NEAR."""
+    table, lead = dataset.table, dataset.lead
+    force = np.unique(np.round(table.force[lead], 6), axis=0, return_inverse=True)[1].ravel()
+    found: list[IntArray] = []
+    for kind in np.unique(np.column_stack([table.marker[lead], force]), axis=0):
+        mine = np.flatnonzero((table.marker[lead] == kind[0]) & (force == kind[1]) & good)
+        # One reading of each configuration: the others are repeats.
+        mine = mine[np.unique(table.configuration[lead[mine]], return_index=True)[1]]
+        if len(mine) < 2:
+            continue
+        tree = cKDTree(table.q[lead[mine]])
+        distance, other = tree.query(table.q[lead[mine]], k=2, p=np.inf)
+        # Of a pose that stands there twice, either one may come first.
+        itself = other[:, 0] == np.arange(len(mine))
+        near = np.where(itself, other[:, 1], other[:, 0])
+        close = np.where(itself, distance[:, 1], distance[:, 0]) <= NEAR
+        pairs = np.column_stack([mine[close], mine[near[close]]])
+        found.append(np.unique(np.sort(pairs, axis=1), axis=0))
+    return np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
+
+
+def _independent(pairs: IntArray) -> int:
+    """Number of differences between paired readings that do not follow from each other: of a
+    group of k that hang together k − 1."""
+    group: dict[int, int] = {}
+
+    def root(k: int) -> int:
+        while group.setdefault(k, k) != k:
+            k = group[k]
+        return k
+
+    joined = 0
+    for i, j in pairs.tolist():
+        a, b = root(i), root(j)
+        if a != b:
+            group[b], joined = a, joined + 1
+    return joined
+
+
+def _order(dataset: DiagnosisData) -> Array:
+    """When each observation (N,) was made; its row in the table where no times are recorded."""
+    time = dataset.table.time
+    return dataset.lead.astype(float) if time is None else time[dataset.lead]
+
+
+# Repeats to which the arm came back: it was elsewhere in between, in the order of times or rows.
+
+
+def returned(dataset: DiagnosisData) -> tuple[float, int]:
+    """Mean square (m²) per axis among repeats that the arm came back for, and degrees of freedom.
+
+    Readings one after the other, the arm standing still, show the tracker's noise alone.
+    """
+    observed, table, good = dataset.base.observed, dataset.table, ~dataset.data.faulty
+    rows, moment = observed.lead[good], _order(dataset)[good]
+    order = np.argsort(moment, kind="stable")
+    moved = np.diff(table.configuration[rows][order], prepend=-1) != 0
+    stay = np.empty(len(rows), dtype=np.int64)
+    stay[order] = np.cumsum(moved)
+    force = np.round(table.force[rows], 6)
+    key = np.column_stack([table.configuration[rows], table.marker[rows], force])
+    _, group = np.unique(key, axis=0, return_inverse=True)
+    values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
+    # The first reading of each stay.
+    first = np.unique(np.column_stack([group.ravel(), stay]), axis=0, return_index=True)[1]
+    return _within(group.ravel()[first], values[first])
+
+
+def _within(group: IntArray, values: Array) -> tuple[float, int]:
+    """Mean square of `values` (n, d) about the mean of their `group` (n,), and its degrees of
+    freedom; (0, 0) where no group has two."""
+    _, group, count = np.unique(group, return_inverse=True, return_counts=True)
+    group = group.ravel()
+    dof = int((count - 1).sum()) * values.shape[1]
+    if not dof:
+        return 0.0, 0
+    mean = np.zeros((len(count), values.shape[1]))
+    np.add.at(mean, group, values)
+    mean /= count[:, None]
+    return float(((values - mean[group]) ** 2).sum() / dof), dof
+
+
+# Scatter of a joint that goes with an angle is no scatter.
+#
+# The best estimate of joint j's deviation in configuration c is in proportion to
+# z = gᵀPr / √(gᵀPg), standard normal under the noise model and independent from configuration to
+# configuration.  In the order of an angle q_k, neighbours then have no correlation:
+# √n ρ̂ ~ N(0, 1).  Where they have, ρ̂ is the share of z that is a function of q_k (one less the
+# nugget of its semivariogram over the sill), and ρ̂ / (gᵀPg) the variance of the deviation that is.
+
+FEWEST_NEIGHBOURS = 30  # configurations, from which the normal approximation holds
+FALSE_SMOOTH = 0.01  # chance that any joint of an arm whose joints only scatter seems smooth
+
+
+def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Array:
+    """Variance (joints,) in rad² or m² of each joint's deviation that is a function of angles."""
+    of = data.counting
+    J, C = of.G.shape[2], len(of.G)
+    out = np.zeros(J)
+    used = (~data.left_out).any(axis=1)
+    if used.sum() < FEWEST_NEIGHBOURS:
+        return out
+    q = dataset.table.q[dataset.lead[dataset.blocks.member[:, 0]]]
+    limit = float(stats.norm.isf(FALSE_SMOOTH / J**2))
+    h = np.einsum("cmj,cmj->cj", of.G, at.P @ of.G)
+    a = np.einsum("cmj,cm->cj", of.G, at.u)
+    for j in range(J):
+        known = np.flatnonzero(used & (h[:, j] > 1e-9 * h[:, j].max(initial=1e-300)))
+        if len(known) < FEWEST_NEIGHBOURS:
+            continue
+        z = a[known, j] / np.sqrt(h[known, j])
+        # In no order but that of the angle: where angles are equal, neighbours are drawn.
+        drawn = np.random.default_rng(C).permutation(len(known))
+        share = 0.0
+        for k in range(J):
+            order = drawn[np.argsort(q[known[drawn], k], kind="stable")]
+            rho = float((z[order][1:] * z[order][:-1]).sum() / (z**2).sum())
+            if rho * np.sqrt(len(z) - 1) > limit:
+                share += rho
+        out[j] = min(share, 1.0) * float((z**2).mean()) / float(h[known, j].mean())
+    return out
+
+
+# The floor that is supported: by repeats where there are some, else by what does not go with
+# angles.  The rest of what the fit takes for noise is unexplained.
+
+CONTRADICTED = 0.05  # chance of repeats that scatter so little if the fitted noise were noise
+
+
+@dataclass(frozen=True)
+class SupportedFloor:
+    """3-D rms (m) that is `noise`, and the rest of the fitted noise, which is `unexplained`."""
+
+    noise: float
+    unexplained: float
+
+
+def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
+    """3-D rms in m that the noise alone gives a reading."""
+    V = covariance(data, noise)
+    return float(np.sqrt(_per_reading(data, np.diagonal(V, axis1=1, axis2=2))))
+
+
+def _per_reading(data: NoisyData, variance: Array) -> float:
+    """Mean over the readings of the sum of their components' `variance` (C, m)."""
+    C, M = data.blocks.member.shape
+    size = data.blocks.size
+    used = ~data.left_out
+    part = (variance * used).reshape(C, M, size)[:, :, : min(size, 3)]
+    return float(part.sum() / used.reshape(C, M, size)[:, :, 0].sum())
+
+
+def supported_floor(
+    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, best: float
+) -> SupportedFloor:
+    """How much of the fitted noise is noise; `best` (m) is the smallest error left at held-out
+    poses, which no noise exceeds.
+
+    Repeats and near-repeats together (ν degrees of freedom, mean square s²) contradict the fitted
+    variance σ² where νs²/σ² is below the χ² quantile; they are then the floor themselves.
+    """
+    at = project(data, noise)
+    fitted = min(noise_rms(data, noise), best)
+    size = min(data.blocks.size, 3)
+    smooth = np.minimum(smooth_scatter(dataset, data, at), noise.joint**2 * (1 + noise.shared**2))
+    going_with_angle = _per_reading(data, (data.G**2) @ smooth)
+    variance = max(fitted**2 - going_with_angle, 0.0)
+    mean, dof = returned(dataset)
+    total = mean * dof
+    near = near_repeats(dataset, data, at)
+    if near is not None:
+        total += near.scatter**2 * near.independent * size
+        dof += near.independent * size
+    if dof:
+        shown = size * total / dof
+        low = float(stats.chi2.ppf(CONTRADICTED, dof)) / dof
+        high = float(stats.chi2.isf(CONTRADICTED, dof)) / dof
+        if shown < low * fitted**2 or shown > high * variance:
+            variance = shown
+    floor = min(float(np.sqrt(variance)), fitted)
+    return SupportedFloor(floor, float(np.sqrt(max(fitted**2 - floor**2, 0.0))))
