@@ -98,8 +98,9 @@ def diagnose(
         if plan is not None:
             told.append(_write_extra_poses(plan, found.extra, kinds))
         if cell_out is not None:
-            write_extended_cell(cell, cell_out, found.effects, found.model_keys)
-            added = ", ".join(f"{f.effect}:{f.where}" for f in found.effects)
+            extra = (*found.effects, *found.fields)
+            write_extended_cell(cell, cell_out, extra, found.model_keys)
+            added = ", ".join(f"{f.effect}:{f.where}" for f in extra)
             told.append(f"wrote {cell_out} with {added or 'no further effect'}")
             if added:
                 again = shlex.join(["elastocal", "identify", str(cell_out), str(data)])

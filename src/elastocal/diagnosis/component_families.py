@@ -1,10 +1,9 @@
-"""What may be at work at once: the components of every joint, link, load, base, tool and tracker."""
+"""What may be at work at once: components of joints, links, loads, base, tool and tracker."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,14 +11,13 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, recorded
+from elastocal.diagnosis.hypotheses import Constants, Hypothesis, RegressorDirection, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.diagnosis.unknown import Generic
-from elastocal.model.chain import Chain
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
 from elastocal.model.effects.driven import DrivenEffect
-from elastocal.model.effects.gears import GearRipple
+from elastocal.model.effects.gears import GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
@@ -38,6 +36,8 @@ OF_NEED: dict[str, Family] = {"time": "time", "temperature": "temperature", "app
 
 def family_of(effect: Effect, cell: Cell) -> Family:
     """What an effect depends on in the first place."""
+    if effect.family:
+        return effect.family  # type: ignore[return-value]
     needed = effect.needed(cell)
     for need, family in OF_NEED.items():
         if need in needed:
@@ -45,23 +45,6 @@ def family_of(effect: Effect, cell: Cell) -> Family:
     if effect.stage == "transmission" and "load" in needed:
         return "torque"
     return OF_STAGE[effect.stage]
-
-
-@dataclass(frozen=True)
-class Constants:
-    """A chain and a cell with further settings: all that the direction of a driven effect asks of
-    a model, which need not be assembled for it."""
-
-    chain: Chain
-    cell: Cell
-
-    @classmethod
-    def of(cls, model: Model, where: str, settings: dict[str, float]) -> Constants:
-        spec = model.cell.model
-        places = {place: dict(values) for place, values in spec.nominal.settings.items()}
-        places[where] = places.get(where, {}) | settings
-        nominal = replace(spec.nominal, settings=places)
-        return cls(model.chain, replace(model.cell, model=replace(spec, nominal=nominal)))
 
 
 def driven_columns(
@@ -72,7 +55,7 @@ def driven_columns(
     parameters = effect.parameters(where, constants.chain, constants.cell)
     direction = RegressorDirection(Hypothesis(effect, where, parameters, ()), constants)
     D = direction(dataset.table, np.zeros((1, 0)))[:, 0]
-    entry = effect.entry_at(where) if isinstance(effect, ResidualField) else effect.entry
+    entry = effect.entry_at(where)
     E = dataset.columns.entry((entry.name, effect.entered_at(where, constants.chain)))
     return dataset.pack(E @ D)
 
@@ -108,7 +91,7 @@ def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
     """Every hypothesis whose columns need no search."""
     cell = dataset.base.model.cell
     for h in dataset.hypotheses:
-        if h.settings or (h.driven and h.effect.together):
+        if h.settings:
             continue
         columns = dataset.packed(h, np.zeros(0))
         if np.abs(columns).max(initial=0.0) > 0:
@@ -124,7 +107,7 @@ def judged_together(model: Model, table: object) -> list[Hypothesis]:
         Hypothesis(effect, where, parameters, ())
         for effect in CATALOGUE.values()
         if effect.together
-        and not isinstance(effect, JointCurve | ResidualField)
+        and not isinstance(effect, JointCurve | ResidualField | GearSpectrum)
         and all(recorded(table, need) for need in effect.needed(cell))  # type: ignore[arg-type]
         for where in effect.places(chain, cell)
         if (effect.name, where) not in active
@@ -174,7 +157,9 @@ def _refined_order(grams: Grams, h: Hypothesis, order: float, step: float) -> fl
     for width in step / 8.0 ** np.arange(3):
         trial = order + np.linspace(-width, width, 21)
         trial = np.clip(trial, h.settings[0].lower, h.settings[0].upper)
-        order = float(trial[int(np.argmax(grams.of_hypothesis(h, trial[:, None]).evidence(h.scales)))])
+        order = float(
+            trial[int(np.argmax(grams.of_hypothesis(h, trial[:, None]).evidence(h.scales)))]
+        )
     return order
 
 

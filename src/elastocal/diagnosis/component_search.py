@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
-from scipy import linalg
 
 from elastocal.diagnosis.component_families import (
     catalogue_components,
+    family_of,
     fields,
     joint_curves,
     judged_together,
     lines,
 )
-from elastocal.diagnosis.components import Component, FittedSum, Sizes, fit_sum
+from elastocal.diagnosis.components import Component, FittedSum, fit_sum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.evidence import Grams, direct
+from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet, packed_columns
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
-from elastocal.units import Array, Progress
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
+from elastocal.units import Progress
 
 SEARCHES = 3  # for lines and fields beside what has been found
 MOST_FIELDS = 4  # that one search adds
@@ -28,8 +29,8 @@ MOST_FIELDS = 4  # that one search adds
 
 def search_components(
     dataset: DiagnosisData, chosen: ModelSet, progress: Progress = lambda message: None
-) -> FittedSum:
-    """The most probable sum beside the fitted parameters.
+) -> tuple[DiagnosisData, FittedSum]:
+    """The most probable sum beside the fitted parameters, and the data with all its columns.
 
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
@@ -38,7 +39,7 @@ def search_components(
     noise = chosen.noise.of_instrument() if data.stated else _started(data)
     components = [*joint_curves(full), *catalogue_components(full), *_searched(full, chosen)]
     progress(f"sizes of {len(components)} components at once")
-    found = fit_sum(data, components, noise)
+    found = _swapped(full, data, fit_sum(data, components, noise), components)
     for _ in range(SEARCHES):
         progress("lines and fields beside the components")
         more = lines(full, found.data, found.noise, found.components)
@@ -52,6 +53,64 @@ def search_components(
         if wider.score <= found.score + 0.5:
             break
         found = wider
+    return full, found
+
+
+# What else could stand in a component's place, the others given.
+
+# Sizes that are tried, in typical ones, and nats by which a rival must be better to be tried.
+WIDE = np.exp(np.linspace(-3.0, 5.0, 9))
+BETTER, SWAPS = 1.0, 6
+
+
+def rivals_of(
+    dataset: DiagnosisData, found: FittedSum, k: int
+) -> tuple[float, dict[tuple[str, str], float]]:
+    """Log evidence of component k over none in its place, and that of every other hypothesis."""
+    at = project(found.without(k), found.noise)
+    grams = Grams(dataset, found.data, at)
+    own = direct(found.data.masked(found.components[k].columns), at)
+    taken = {id(c.hypothesis) for c in found.components}
+    others = {
+        h.key: float(grams.of_hypothesis(h).evidence(WIDE)[0])
+        for h in dataset.hypotheses
+        if not h.settings and id(h) not in taken
+    }
+    return float(own.evidence(WIDE)[0]), others
+
+
+def _swapped(
+    dataset: DiagnosisData, data: NoisyData, found: FittedSum, components: Sequence[Component]
+) -> FittedSum:
+    """The sum with every named component that another one beats replaced by it.
+
+    Of several causes that these poses hardly tell apart, the sizes that are estimated at once end
+    with any.
+    """
+    known = {(c.effect.name, c.where): c for c in components if c.hypothesis is not None}
+    tried: set[tuple[str, str]] = set()
+    for _ in range(SWAPS):
+        best = None
+        for k, c in enumerate(found.components):
+            if c.hypothesis is None or c.settings:
+                continue
+            own, others = rivals_of(dataset, found, k)
+            for key, evidence in others.items():
+                if key in tried or key not in known or evidence <= own + BETTER:
+                    continue
+                if best is None or evidence - own > best[0]:
+                    best = evidence - own, k, key
+        if best is None:
+            break
+        _, k, key = best
+        tried.add(key)
+        kept = [i for i in range(len(found.components)) if i != k]
+        start = found.sizes.chosen(kept).and_one(known[key])
+        other = fit_sum(
+            data, [*(found.components[i] for i in kept), known[key]], found.noise, start
+        )
+        if other.score > found.score:
+            found = other
     return found
 
 
@@ -69,13 +128,15 @@ def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:
     """What the forward search found at settings of its own."""
     found = []
     for item in chosen.items:
-        if item.known and len(item.settings):
-            h = item.what
+        h = item.what
+        if isinstance(h, Hypothesis) and len(item.settings):
             pairs = zip((s.key for s in h.settings), item.settings.tolist(), strict=True)
-            found.append(
-                Component("time", h.effect, h.where, packed_columns(dataset, item),
-                          settings=tuple(pairs), hypothesis=h)
-            )  # fmt: skip
+            family = family_of(h.effect, dataset.base.model.cell)
+            columns = packed_columns(dataset, item)
+            component = Component(
+                family, h.effect, h.where, columns, settings=tuple(pairs), hypothesis=h
+            )
+            found.append(component)
     return found
 
 
@@ -97,53 +158,3 @@ def with_equal_noise(dataset: DiagnosisData) -> NoisyData:
 
 def _started(data: NoisyData) -> NoiseValues:
     return replace(NoiseValues.usual(data.G.shape[2]).of_instrument(), factor=0.3)
-
-
-# How large each component is: posterior draws of what it does to the markers.
-
-DRAWS = 400
-
-
-@dataclass(frozen=True)
-class Shares:
-    """Of each component: `share` of the gap's mean square (draws, K), and `square` in m² (draws,
-    K) per reading, once the fitted parameters have followed; `total` (draws,) of all together."""
-
-    share: Array
-    square: Array
-    total: Array
-
-
-def shares_of(found: FittedSum, rng: np.random.Generator) -> Shares:
-    """Draws of the components' sizes from the posterior.
-
-    What geometry takes up is no part of the gap: with Q the projection off the fitted columns X,
-    at equal weights, a component C w leaves |Q C w|², and its share is that over |Q Σ C w|².
-    """
-    data = found.data
-    at = project(data, found.noise)
-    p = data.X.shape[2] - sum(c.width for c in found.components)
-    draws = at.beta[:, None] + at.beta_deviation.T @ rng.normal(size=(len(at.beta), DRAWS))
-    position = _position_rows(data)
-    X = data.masked(data.X)[position]
-    size = np.linalg.norm(X[:, :p], axis=0)
-    Q, R = linalg.qr(X[:, :p] / np.maximum(size, 1e-300), mode="economic", pivoting=False)
-    keep = np.abs(np.diag(R)) > 1e-9
-    Q = Q[:, keep]
-    C = X[:, p:] - Q @ (Q.T @ X[:, p:])
-    readings = len(X) / min(data.blocks.size, 3)
-    G = C.T @ C / readings
-    squares, w = [], draws[p:]
-    for span in found.spans:
-        own = slice(span.start - p, span.stop - p)
-        squares.append(np.einsum("kd,kl,ld->d", w[own], G[own, own], w[own], optimize=True))
-    total = np.einsum("kd,kd->d", w, G @ w)
-    square = np.array(squares).T
-    return Shares(square / np.maximum(total, 1e-300)[:, None], square, total)
-
-
-def _position_rows(data: NoisyData) -> Array:
-    """Rows (C, m) that count and are positions (or distances)."""
-    size = data.blocks.size
-    of_size = np.arange(data.r.shape[1]) % size < 3
-    return ~data.left_out & of_size[None, :]

@@ -222,9 +222,7 @@ class SumOfComponents:
         return out
 
 
-def posed(
-    data: NoisyData, components: Sequence[Component], noise: NoiseValues
-) -> SumOfComponents:
+def posed(data: NoisyData, components: Sequence[Component], noise: NoiseValues) -> SumOfComponents:
     """The sum of these components beside the data's own columns, under one noise."""
     columns = [data.masked(c.columns) for c in components]
     wide = replace(
@@ -256,6 +254,12 @@ class FittedSum:
         widths = [c.width for c in self.components]
         ends = self.data.X.shape[2] - sum(widths) + np.cumsum(widths, dtype=np.int64)
         return tuple(slice(int(e) - w, int(e)) for e, w in zip(ends, widths, strict=True))
+
+    def without(self, k: int) -> NoisyData:
+        """The data without the columns of component k."""
+        kept = np.ones(self.data.X.shape[2], dtype=bool)
+        kept[self.spans[k]] = False
+        return replace(self.data, X=self.data.X[:, :, kept], precision=self.data.precision[kept])
 
 
 STEPS, ROUNDS = 30, 12
@@ -322,7 +326,9 @@ def _narrowed(problem: SumOfComponents, kept: list[int]) -> dict:
 
 
 def _scaled(noise: NoiseValues, factor: float) -> NoiseValues:
-    return NoiseValues(noise.factor * float(np.exp(factor)), noise.joint * np.exp(factor), noise.shared)
+    return NoiseValues(
+        noise.factor * float(np.exp(factor)), noise.joint * np.exp(factor), noise.shared
+    )
 
 
 def _noise_beside(
@@ -331,7 +337,9 @@ def _noise_beside(
     """The most probable noise beside the components at their sizes, from SOME configurations."""
     some = data.every(step) if (step := max(1, len(data.r) // SOME)) > 1 else data
     columns = [
-        _compressed(some.masked(c.columns[::step]), np.exp(2 * s) * c.shares(length)[0], some, noise)
+        _compressed(
+            some.masked(c.columns[::step]), np.exp(2 * s) * c.shares(length)[0], some, noise
+        )
         for c, s, length in zip(components, at.size, at.length, strict=True)
     ]
     wide = some.with_columns(

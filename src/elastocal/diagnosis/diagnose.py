@@ -15,7 +15,9 @@ import tomli_w
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
-from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
+from elastocal.diagnosis.component_answer import SumAnswer
+from elastocal.diagnosis.component_search import search_components
+from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Gap, Untested
 from elastocal.diagnosis.diagnosis_data import (
     DiagnosisData,
     OutlierScreening,
@@ -26,8 +28,15 @@ from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import model_keys, possible, with_recorded_drivers
 from elastocal.diagnosis.model_set import settings_of
-from elastocal.diagnosis.shrinkage import Confirmation, between_visits, budget, refit, shrinkage
-from elastocal.diagnosis.stated_floor import noise_floor
+from elastocal.diagnosis.shrinkage import (
+    Confirmation,
+    between_visits,
+    budget,
+    first_steps,
+    refit,
+    shrinkage,
+)
+from elastocal.diagnosis.stated_floor import noise_floor, supported_floor
 from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
     Answer,
@@ -41,6 +50,7 @@ from elastocal.diagnosis.verdict import (
 )
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_write_text
+from elastocal.identification.findings import BudgetStep
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE
@@ -191,9 +201,16 @@ def diagnose(
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
     dataset, found, screened = _searched(dataset, options, progress)
-    answer = judge(found)
+    progress("judging all that may act at once")
+    full, total = search_components(dataset, found.chosen, progress)
     progress("confirming")
     rng = np.random.default_rng(options.seed)
+    if total.score > max(found.chosen.score, found.nothing.score) + CLEARLY:
+        answer_of_sum = SumAnswer(full, total, rng)
+        return _diagnosis_of_sum(
+            answer_of_sum, dataset, found, screened, untested, left_out, given, source
+        )
+    answer = judge(found)
     gap, steps = budget(dataset, found, rng)
     findings = _findings(found, answer, base, rng)
     tests = structure_tests(found.first)
@@ -217,6 +234,63 @@ def diagnose(
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
         model_keys=model_keys(base.model, findings),
+        model=given,
+        data=source,
+        calibrated=base,
+    )
+
+
+# Nats by which a sum of components must be more probable than what the forward search found.
+CLEARLY = 10.0
+
+
+def _diagnosis_of_sum(
+    answer: SumAnswer,
+    dataset: DiagnosisData,
+    found: SelectedEffects,
+    screened: OutlierScreening,
+    untested: list[Untested],
+    left_out: str | None,
+    given: Model,
+    source: str,
+) -> Diagnosis:
+    """The diagnosis where many causes act at once; candidates are those of the forward search."""
+    rng, base, data = answer.rng, dataset.base, answer.found.data
+    first = first_steps(dataset, found.nothing, None, rng)
+    steps = answer.budget(first)
+    named = [step for step in steps if not step.step.startswith("unknown")]
+    best = min(step.heldout_rms for step in steps)
+    supported = supported_floor(answer.dataset, data, answer.found.noise, best)
+    floor = supported.noise
+    gap = Gap(
+        steps[0].heldout_rms, first[-1].heldout_rms, named[-1].heldout_rms, floor,
+        supported.unexplained,
+    )  # fmt: skip
+    tests = structure_tests(found.first)
+    slot, rivals = found.slots[0], judge(found)
+    p = found.p_values[0] if found.p_values else exceedance(found.first.flipped, found.first.odds)
+    return Diagnosis(
+        verdict=answer.verdict,
+        gap=gap,
+        budget=(*steps, BudgetStep("noise_floor", floor, (floor, floor))),
+        effects=answer.effects,
+        candidates=candidates(dataset, found, rivals),
+        indistinguishable=answer.indistinguishable,
+        location=location(found, tests),
+        noise=noise_floor(answer.dataset, data, answer.found.noise),
+        structure=tests,
+        probability_nothing=slot.probabilities()[1],
+        probability_unknown=min(1.0, answer.unnamed_probability),
+        p_value=p,
+        curves=answer.curves(),
+        components=answer.components,
+        groups=answer.groups,
+        fields=answer.fields,
+        untested=(*untested, *too_small(dataset, found)),
+        warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
+        n_readings=dataset.blocks.n,
+        n_configurations=len(dataset.blocks.member),
+        model_keys=model_keys(base.model, answer.effects),
         model=given,
         data=source,
         calibrated=base,

@@ -108,6 +108,45 @@ class FoundEffect:
 
 
 @dataclass(frozen=True)
+class ComponentShare:
+    """What errors of one kind at one place contribute to the gap, all components judged together.
+
+    `family` says what the error depends on: "angle" (the joint's own), "gravity", "torque",
+    "load", "move" (the last one), "time", "temperature", "pose", "tool".  `share` is the fraction
+    of the mean square gap after geometry that it makes alone, with its 90 % interval; shares of
+    components that go together do not add up to one.  `rms` in m, with its 95 % interval.
+    `probability` that it is there at all; `named` where some effect of the catalogue is in it.
+    """
+
+    family: str
+    where: str
+    effects: tuple[str, ...]
+    share: float
+    share_ci90: Interval
+    rms: float
+    rms_ci95: Interval
+    probability: float
+    named: bool
+
+
+@dataclass(frozen=True)
+class EffectGroup:
+    """One finding: an effect at all the places where it acts, with its share of the gap and the
+    fraction by which the error of new poses falls once all of it is in the model.
+
+    `name` is the effect's, or "gear_errors" for all that goes with a joint's own angle.
+    """
+
+    name: str
+    places: tuple[str, ...]
+    effects: tuple[str, ...]
+    share: float
+    share_ci90: Interval
+    gap_reduction: float
+    gap_reduction_ci90: Interval
+
+
+@dataclass(frozen=True)
 class Candidate:
     """A hypothesis that was tried.
 
@@ -278,6 +317,9 @@ class Diagnosis(Result):
             and all that is smaller.
         curves: The shape of an unknown dependence.
         untested: Effects that the data cannot test, and what to record so that they can.
+        components: What errors of each kind at each place contribute, where many act at once.
+        groups: The same by effect, at all its places: one finding each.
+        fields: Smooth corrections without a name, which explain nothing.
         findings: The judgements about it, the verdict first, each with its numbers and what to do.
         warnings: What to know before one relies on it, in sentences.
         n_readings: Number of readings; `n_configurations` that of configurations.
@@ -308,6 +350,9 @@ class Diagnosis(Result):
     curves: tuple[Curve, ...] = ()
     untested: tuple[Untested, ...] = ()
     warnings: tuple[str, ...] = ()
+    components: tuple[ComponentShare, ...] = ()
+    groups: tuple[EffectGroup, ...] = ()
+    fields: tuple[FoundEffect, ...] = ()
     n_readings: int = 0
     n_configurations: int = 0
     extra: ExtraPlan | None = field(default=None)
@@ -430,6 +475,9 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         },
         "budget": [_step(step) for step in d.budget],
         "effects": [_found(effect) for effect in d.effects],
+        "components": [_component(component) for component in d.components],
+        "groups": [vars(group) for group in d.groups],
+        "fields": [_found(effect) for effect in d.fields],
         "candidates": [vars(candidate) for candidate in d.candidates],
         "indistinguishable": [[vars(e) for e in rivals] for rivals in d.indistinguishable],
         "location": None if d.location is None else _location(d.location),
@@ -458,6 +506,12 @@ def _found(f: FoundEffect) -> dict[str, Any]:
         return [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]
 
     return vars(f) | {"parameters": [vars(p) | {"ci95": ends(p)} for p in f.parameters]}
+
+
+def _component(c: ComponentShare) -> dict[str, Any]:
+    content = {key: value for key, value in vars(c).items() if key not in ("rms", "rms_ci95")}
+    ends = [end * MICRO for end in c.rms_ci95]
+    return content | {"effect": c.effects[0], "rms_um": c.rms * MICRO, "rms_ci95_um": ends}
 
 
 def _location(location: Location) -> dict[str, Any]:

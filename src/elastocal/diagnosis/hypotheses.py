@@ -513,17 +513,37 @@ def _as_placed(model: Model, x: Array) -> Cell:
     return replace(model.cell, model=replace(model.cell.model, nominal=nominal))
 
 
+@dataclass(frozen=True)
+class Constants:
+    """A chain and a cell with further settings: all that the direction of a driven effect asks of
+    a model, which need not be assembled for it."""
+
+    chain: Chain
+    cell: Cell
+
+    @classmethod
+    def of(cls, model: Model, where: str, settings: dict[str, float]) -> Constants:
+        spec = model.cell.model
+        places = {place: dict(values) for place, values in spec.nominal.settings.items()}
+        places[where] = places.get(where, {}) | settings
+        nominal = replace(spec.nominal, settings=places)
+        return cls(model.chain, replace(model.cell, model=replace(spec, nominal=nominal)))
+
+
 class RegressorDirection:
     """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.
 
     With `x` (parameters,) of the model the base stands as fitted, else as the cell says.
     """
 
-    def __init__(self, hypothesis: Hypothesis, model: Model, x: Array | None = None) -> None:
+    def __init__(
+        self, hypothesis: Hypothesis, model: Model | Constants, x: Array | None = None
+    ) -> None:
         effect = hypothesis.effect
         assert isinstance(effect, DrivenEffect)
         self.hypothesis = hypothesis
-        self._arm = Arm(model.chain, model.cell if x is None else _as_placed(model, x))
+        placed = _as_placed(model, x) if isinstance(model, Model) and x is not None else model.cell
+        self._arm = Arm(model.chain, placed)
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
         # Settings that are not searched are as the model has them.

@@ -107,12 +107,9 @@ def budget(
     `dataset` is about the fit without further effects.  Where an effect goes with time, what is
     left out are tenths of the time: between neighbours a drift needs no model.
     """
-    nothing, chosen = found.nothing, found.chosen
+    chosen = found.chosen
     together = _left_out_together(dataset, chosen)
-    # The nominal arm, base and markers placed, as the baseline left it.
-    placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
-    steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
-    steps += [_step(name, data, nothing, together, rng) for name, data in _fitted_steps(dataset)]
+    steps = first_steps(dataset, found.nothing, together, rng)
     known = [k for k, item in enumerate(chosen.items) if item.known]
     for n, last in enumerate(known, 1):
         items = tuple(chosen.items[k] for k in known[:n])
@@ -133,6 +130,16 @@ def budget(
     floor = supported.noise
     gap = Gap(nominal, calibrated, explained, floor, supported.unexplained)
     return gap, (*steps, BudgetStep("noise_floor", floor, (floor, floor)))
+
+
+def first_steps(
+    dataset: DiagnosisData, nothing: ModelSet, together: IntArray | None, rng: np.random.Generator
+) -> list[BudgetStep]:
+    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects."""
+    placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
+    steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
+    fitted = _fitted_steps(dataset)
+    return steps + [_step(name, data, nothing, together, rng) for name, data in fitted]
 
 
 def _left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | None:

@@ -87,6 +87,10 @@ class Effect:
     formats: ClassVar[tuple[Format, ...]] = ()
     # One of many causes at once: a diagnosis judges it only in the sum of all components.
     together: ClassVar[bool] = False
+    # The setting that is the prior size of its shrunk parameters.
+    sized_by: ClassVar[str] = ""
+    # What it depends on in the first place, where its stage and needs do not say so.
+    family: ClassVar[str] = ""
     # What to measure besides more poses where those do not tell it from other effects.
     remedy: ClassVar[str] = ""
 

@@ -162,10 +162,10 @@ class GearSpectrum(DrivenEffect):
 
     name = "gear_spectrum"
     stage = "transmission"
+    together = True
+    family = "angle"
+    sized_by = "spectrum_size_rad"
     entry = JointMotion()
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return False  # judged with all other components of the gap, not by itself
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return turning_joints(chain)

@@ -93,10 +93,10 @@ class GravitySag(DrivenEffect):
 
     name = "gravity_sag"
     stage = "transmission"
+    together = True
+    family = "gravity"
+    sized_by = "sag_size_rad"
     entry = JointMotion()
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return False  # judged with all other components of the gap, not by itself
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return turning_joints(chain)

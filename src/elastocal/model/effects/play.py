@@ -124,10 +124,9 @@ class MoveLag(DrivenEffect):
 
     name = "move_lag"
     stage = "transmission"
+    together = True
+    family = "move"
     entry = JointMotion()
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return False  # rests on an assumption: judged with all other components of the gap
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return turning_joints(chain)

@@ -61,7 +61,7 @@ class Waves:
             period = 2 * math.pi
         count = math.ceil(HIGHEST / length * period / (2 * math.pi))
         order = np.arange(1, min(max(count, 1), MOST_WAVES) + 1)
-        return cls(low, 2 * np.pi * order / period)
+        return cls(low, np.asarray(2 * np.pi / period * order, dtype=np.float64))
 
     def variances(self, size: float, length: float) -> Array:
         """Prior variances (2K,) of the coefficients, cosines first."""
@@ -116,6 +116,8 @@ class JointCurve(DrivenEffect):
     name = "joint_curve"
     stage = "transmission"
     together = True
+    family = "angle"
+    sized_by = "curve_size_rad"
     entry = JointMotion()
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
@@ -162,6 +164,7 @@ class ResidualField(DrivenEffect):
     name = "residual_field"
     stage = "geometry"
     together = True
+    family = "pose"
     entry = JointMotion()  # at a joint; see `entry_at`
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:

@@ -39,11 +39,11 @@ class TorqueCoupling(DrivenEffect):
 
     name = "torque_coupling"
     stage = "transmission"
+    together = True
+    family = "torque"
+    sized_by = "coupling_rad_per_Nm"
     needs = ("torque",)
     entry = JointMotion()
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return False  # judged with all other components of the gap, not by itself
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return joints(chain)
@@ -87,11 +87,11 @@ class TorqueTilt(DrivenEffect):
 
     name = "torque_tilt"
     stage = "geometry"
+    together = True
+    family = "torque"
+    sized_by = "tilt_rad_per_Nm"
     needs = ("torque",)
     entry = LinkFrame()
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return False  # judged with all other components of the gap, not by itself
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return tuple(link for link in links(chain) if tilt_axes(chain, index(link)))

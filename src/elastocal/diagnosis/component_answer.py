@@ -1,0 +1,362 @@
+"""What a sum of components says: shares of the gap, findings with names, fields without."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg
+from scipy.special import expit, softmax
+
+from elastocal.diagnosis.component_search import rivals_of
+from elastocal.diagnosis.components import Component, FittedSum
+from elastocal.diagnosis.diagnosis import (
+    ComponentShare,
+    Curve,
+    EffectAt,
+    EffectGroup,
+    FittedParameter,
+    FoundEffect,
+    Verdict,
+)
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.noise_floor import NoisyData, Projection, covariance, project
+from elastocal.diagnosis.shrinkage import left_out_residual, rms_with_interval
+from elastocal.identification.findings import BudgetStep
+from elastocal.model.effects.gears import GearRipple, GearSpectrum
+from elastocal.model.effects.smooth import JointCurve
+from elastocal.units import Array, BoolArray
+
+DRAWS = 400
+NAMED = 0.9  # probability from which a named effect needs no rivals beside it
+CHANCE = 0.05  # probability from which a rival is told
+LARGE = 0.1  # share of the gap from which what has no name leaves the verdict open
+
+
+@dataclass(frozen=True)
+class SumAnswer:
+    """The pieces of a diagnosis that a sum of components fills."""
+
+    dataset: DiagnosisData
+    found: FittedSum
+    rng: np.random.Generator
+
+    @cached_property
+    def at(self) -> Projection:
+        return project(self.found.data, self.found.noise)
+
+    @cached_property
+    def _own(self) -> int:
+        """Number of the columns that were fitted before."""
+        return self.dataset.data.X.shape[2]
+
+    @cached_property
+    def draws(self) -> Array:
+        """Posterior draws (Σ k, draws) of the components' coefficients."""
+        at = self.at
+        normal = self.rng.normal(size=(len(at.beta), DRAWS))
+        return np.asarray((at.beta[:, None] + at.beta_deviation.T @ normal)[self._own :])
+
+    @cached_property
+    def gram(self) -> Array:
+        """G (Σ k, Σ k): w'Gw is the mean square in m² per reading that coefficients w leave once
+        the fitted parameters have followed them, at equal weights."""
+        data, own = self.found.data, self._own
+        X = data.X[_position_rows(data)]
+        size = np.maximum(np.linalg.norm(X[:, :own], axis=0), 1e-300)
+        Q, R = linalg.qr(X[:, :own] / size, mode="economic")
+        Q = Q[:, np.abs(np.diag(R)) > 1e-9]
+        C = X[:, own:] - Q @ (Q.T @ X[:, own:])
+        return np.asarray(C.T @ C / (len(X) / min(data.blocks.size, 3)))
+
+    def _span(self, k: int) -> slice:
+        span = self.found.spans[k]
+        return slice(span.start - self._own, span.stop - self._own)
+
+    def squares(self, members: Sequence[int]) -> Array:
+        """Mean squares (draws,) in m² of what these components do together."""
+        index = np.concatenate([np.r_[self._span(k)] for k in members])
+        w = self.draws[index]
+        return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
+
+    @cached_property
+    def total(self) -> Array:
+        return self.squares(range(len(self.found.components)))
+
+    # Shares.
+
+    @cached_property
+    def components(self) -> tuple[ComponentShare, ...]:
+        """One for each kind of dependence at each place, the largest first."""
+        groups: dict[tuple[str, str], list[int]] = {}
+        for k, c in enumerate(self.found.components):
+            groups.setdefault((c.family, c.where), []).append(k)
+        rows = [self._share(family, where, own) for (family, where), own in groups.items()]
+        return tuple(sorted(rows, key=lambda row: -row.share))
+
+    def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
+        square = self.squares(members)
+        share = square / np.maximum(self.total, 1e-300)
+        rms = np.sqrt(square)
+        chosen = [self.found.components[k] for k in members]
+        low, high = np.quantile(share, [0.05, 0.95]).tolist()
+        low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
+        return ComponentShare(
+            family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
+            float(np.median(share)), (low, high), float(np.median(rms)), (low95, high95),
+            max(self._there(k) for k in members), any(c.named for c in chosen),
+        )  # fmt: skip
+
+    @cached_property
+    def groups(self) -> tuple[EffectGroup, ...]:
+        """One for each effect at all its places, lines and curves of joints as one."""
+        kinds: dict[str, list[int]] = {}
+        for k, c in enumerate(self.found.components):
+            if c.named:
+                kinds.setdefault(GEARS if _of_gear(c) else c.effect.name, []).append(k)
+        return tuple(sorted((self._group(*item) for item in kinds.items()), key=lambda g: -g.share))
+
+    def _group(self, name: str, members: list[int]) -> EffectGroup:
+        share = self.squares(members) / np.maximum(self.total, 1e-300)
+        low, high = np.quantile(share, [0.05, 0.95]).tolist()
+        chosen = [self.found.components[k] for k in members]
+        reduction, ci90, _ = self._reduction(members)
+        return EffectGroup(
+            name, tuple(sorted(dict.fromkeys(c.where for c in chosen))),
+            tuple(dict.fromkeys(c.effect.name for c in chosen)),
+            float(np.median(share)), (low, high), reduction, ci90,
+        )  # fmt: skip
+
+    # How far the gap falls.
+
+    @cached_property
+    def _excess(self) -> float:
+        """Mean square in m² per reading that the fit itself is uncertain by at poses left out."""
+        V = covariance(self.found.data, self.found.noise)
+        uncertain = np.linalg.inv(self.at.P) - V
+        rows = _position_rows(self.found.data)
+        each = np.diagonal(uncertain, axis1=1, axis2=2)[rows]
+        return float(each.sum() / (len(each) / min(self.found.data.blocks.size, 3)))
+
+    def _reduction(
+        self, members: Sequence[int]
+    ) -> tuple[float, tuple[float, float], tuple[float, float]]:
+        """Fraction by which the noise-free error of new poses falls by these components.
+
+        Before, the error is all that is not in the model; after, what is left of it beside the
+        estimate of these components, and the error of the whole fit in proportion to their part.
+        """
+        index = np.concatenate([np.r_[self._span(k)] for k in members])
+        w = self.draws.copy()
+        w[index] -= self.at.beta[self._own :][index, None]
+        after = np.einsum("kd,kd->d", w, self.gram @ w)
+        part = np.median(self.squares(members)) / np.maximum(np.median(self.total), 1e-300)
+        # Draws about the mean already hold the error at the poses measured; at others it is more.
+        after = after + min(part, 1.0) * self._excess
+        fall = 1 - np.sqrt(after / np.maximum(self.total, 1e-300))
+        low95, low90, middle, high90, high95 = np.quantile(
+            fall, [0.025, 0.05, 0.5, 0.95, 0.975]
+        ).tolist()
+        return middle, (low90, high90), (low95, high95)
+
+    # Names.
+
+    @cached_property
+    def _rivals(self) -> dict[int, dict[tuple[str, str], float]]:
+        """Of each named component that has a hypothesis the probability of what it may be."""
+        out = {}
+        for k, c in enumerate(self.found.components):
+            if c.hypothesis is None or c.settings:
+                continue
+            own, others = rivals_of(self.dataset, self.found, k)
+            keys = [c.hypothesis.key, *others]
+            p = softmax(np.array([own, *others.values()]))
+            known = {key: float(v) for key, v in zip(keys, p, strict=True) if v >= CHANCE}
+            out[k] = dict(sorted(known.items(), key=lambda pair: -pair[1]))
+        return out
+
+    @cached_property
+    def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
+        sets = []
+        for k, rivals in self._rivals.items():
+            own = self.found.components[k].hypothesis
+            assert own is not None
+            if rivals.get(own.key, 0.0) < NAMED:
+                keys = [own.key, *(key for key in rivals if key != own.key)][:3]
+                sets.append(tuple(EffectAt(*key) for key in keys))
+        return tuple(s for s in sets if len(s) > 1)
+
+    @property
+    def unnamed_share(self) -> float:
+        """Median share of the gap of what has no name."""
+        members = [k for k, c in enumerate(self.found.components) if not c.named]
+        if not members:
+            return 0.0
+        return float(np.median(self.squares(members) / np.maximum(self.total, 1e-300)))
+
+    @property
+    def unnamed_probability(self) -> float:
+        """Probability that something without a name is at work."""
+        members = [k for k, c in enumerate(self.found.components) if not c.named]
+        return max((self._probability(k) for k in members), default=0.0)
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.unnamed_share > LARGE:
+            return "unknown_effect"
+        return "ambiguous" if self.indistinguishable else "explained"
+
+    @cached_property
+    def effects(self) -> tuple[FoundEffect, ...]:
+        """What has a name, each effect at a place once, the largest first."""
+        return tuple(self._found_effects(named=True))
+
+    @cached_property
+    def fields(self) -> tuple[FoundEffect, ...]:
+        """What has none, and corrects the arm all the same."""
+        return tuple(self._found_effects(named=False))
+
+    def _found_effects(self, named: bool) -> Iterator[FoundEffect]:
+        at_place: dict[tuple[str, str], list[int]] = {}
+        for k, c in enumerate(self.found.components):
+            if c.named == named:
+                name = GearSpectrum.name if isinstance(c.effect, GearRipple) else c.effect.name
+                at_place.setdefault((name, c.where), []).append(k)
+        order = sorted(at_place.items(), key=lambda pair: -float(np.median(self.squares(pair[1]))))
+        for (name, where), members in order:
+            settings = self._settings(members)
+            if name == GearSpectrum.name and len(members) == 1:
+                c = self.found.components[members[0]]
+                name, settings = c.effect.name, dict(c.settings)
+            reduction, ci90, ci95 = self._reduction(members)
+            probability = max(self._probability(k) for k in members)
+            parameters = tuple(p for k in members for p in self._parameters(k))
+            yield FoundEffect(name, where, probability, reduction, ci90, ci95, parameters, settings)
+
+    def _there(self, k: int) -> float:
+        """Probability that there is anything at a component's place."""
+        return float(expit(self.found.earned[k] - self.found.components[k].cost))
+
+    def _probability(self, k: int) -> float:
+        there = self._there(k)
+        hypothesis = self.found.components[k].hypothesis
+        if k in self._rivals and hypothesis is not None:
+            return there * self._rivals[k].get(hypothesis.key, CHANCE)
+        return there
+
+    def _settings(self, members: list[int]) -> dict[str, float]:
+        """The constants of the effect at its place that these components stand for."""
+        found = [self.found.components[k] for k in members]
+        sizes, lengths = self.found.sizes.size, self.found.sizes.length
+        settings: dict[str, float] = {}
+        for k, c in zip(members, found, strict=True):
+            size, length = float(np.exp(sizes[k]) * c.unit), float(np.exp(lengths[k]))
+            if isinstance(c.effect, GearRipple):
+                continue
+            settings |= dict(c.settings)
+            if c.follows:
+                settings |= {f"field_{c.follows}_size": size, f"field_{c.follows}_length": length}
+            elif isinstance(c.effect, JointCurve):
+                settings |= {"curve_size_rad": size, "curve_length_rad": length}
+            elif c.effect.sized_by:
+                settings[c.effect.sized_by] = size * self._typical(c)
+        ripples = [k for k in members if isinstance(self.found.components[k].effect, GearRipple)]
+        if len(ripples) > 1:
+            lines = sorted(self._line(k) for k in ripples)
+            settings |= {f"order_{n + 1}": order for n, (order, _) in enumerate(lines)}
+            # Of each coefficient, the prior is one size for all lines of a joint.
+            size = math.sqrt(float(np.mean([s**2 for _, s in lines])))
+            settings["spectrum_size_rad"] = size
+            q = self.dataset.table.q[:, int(found[0].where[5:]) - 1]
+            settings["spectrum_centre_rad"] = float((q.max() + q.min()) / 2)
+        return settings
+
+    def _typical(self, c: Component) -> float:
+        """Typical size of the parameters of an effect that one setting sizes."""
+        assert c.hypothesis is not None
+        return float(np.max([p.typical or 0.0 for p in c.hypothesis.parameters]))
+
+    def _line(self, k: int) -> tuple[float, float]:
+        """Order of a line and its prior size in rad."""
+        c = self.found.components[k]
+        return float(c.settings[0][1]), float(np.exp(self.found.sizes.size[k])) * GearRipple.typical
+
+    def _parameters(self, k: int) -> Iterator[FittedParameter]:
+        """Estimates of a component's parameters, where they are few and not shrunk."""
+        c = self.found.components[k]
+        if c.hypothesis is None or any(p.shrunk for p in c.hypothesis.parameters):
+            return
+        span, sizes = self.found.spans[k], self.dataset_sizes(c)
+        mean = self.at.beta[span]
+        std = np.linalg.norm(self.at.beta_deviation[:, span], axis=0)
+        for p, size, m, s in zip(c.hypothesis.parameters, sizes, mean, std, strict=True):
+            yield FittedParameter(
+                f"{c.where}.{p.key}", float(p.nominal + m * size), p.unit, float(s * size)
+            )
+
+    def dataset_sizes(self, c: Component) -> Array:
+        """What one unit of each coefficient stands for."""
+        assert c.hypothesis is not None
+        return self.dataset.sizes[c.hypothesis.key]
+
+    # The budget, and shapes.
+
+    def budget(self, first: Sequence[BudgetStep]) -> tuple[BudgetStep, ...]:
+        """The steps so far, and one for each group of components, the largest first."""
+        steps: list[BudgetStep] = list(first)
+        members: list[int] = []
+        for group in self.groups[:MOST_STEPS]:
+            members += [
+                k for k, c in enumerate(self.found.components)
+                if c.named and c.where in group.places and c.effect.name in group.effects
+            ]  # fmt: skip
+            steps.append(self._step(f"{group.name}:{'+'.join(group.places)}", members))
+        if len(members) < len(self.found.components):
+            everything = list(range(len(self.found.components)))
+            rest = "unknown:" + "+".join(dict.fromkeys(f.where for f in self.fields))
+            steps.append(self._step(rest if self.fields else "rest", everything))
+        return tuple(steps)
+
+    def _step(self, name: str, members: list[int]) -> BudgetStep:
+        keep = np.zeros(self.found.data.X.shape[2], dtype=bool)
+        keep[: self._own] = True
+        for k in members:
+            keep[self.found.spans[k]] = True
+        data = self.found.data
+        part = replace(data, X=data.X[:, :, keep], precision=data.precision[keep])
+        left = left_out_residual(project(part, self.found.noise))
+        return BudgetStep(name, *rms_with_interval(part, left, self.rng))
+
+    def curves(self) -> tuple[Curve, ...]:
+        """The error curve of every joint that has one."""
+        out = []
+        for k, c in enumerate(self.found.components):
+            if not isinstance(c.effect, JointCurve) or c.waves is None:
+                continue
+            settings = dict(c.settings)
+            x = np.linspace(settings["curve_low_rad"], settings["curve_high_rad"], 400)
+            phase = c.waves.frequency * (x[:, None] - c.waves.low)
+            F = np.concatenate([np.cos(phase), np.sin(phase)], axis=1) * c.unit
+            span = self.found.spans[k]
+            y = F @ self.at.beta[span]
+            sd = np.linalg.norm(F @ self.at.beta_deviation.T[span], axis=1)
+            values = (tuple(v.tolist()) for v in (x, y - y.mean(), sd))
+            out.append(Curve(f"{c.where} angle", "rad", c.where, "rad", *values))
+        return tuple(out)
+
+
+GEARS = "gear_errors"
+MOST_STEPS = 4
+
+
+def _of_gear(c: Component) -> bool:
+    return c.family == "angle" and c.where.startswith("joint")
+
+
+def _position_rows(data: NoisyData) -> BoolArray:
+    """Rows (C, m) that count and are positions (or distances)."""
+    of_size = np.arange(data.r.shape[1]) % data.blocks.size < 3
+    return np.asarray(~data.left_out & of_size[None, :])
