@@ -198,6 +198,17 @@ class SumAnswer:
         return float(np.median(self.squares(members) / np.maximum(self.total, 1e-300)))
 
     @property
+    def n_causes(self) -> int:
+        """How many kinds of dependence at how many places."""
+        return len({(c.family, c.where) for c in self.found.components})
+
+    @property
+    def without_names(self) -> tuple[FoundEffect, ...]:
+        """Curves and fields, which correct the arm though the verdict knows no name for them."""
+        curves = (f for f in self.effects if f.effect == JointCurve.name)
+        return (*curves, *self.fields)
+
+    @property
     def unnamed_probability(self) -> float:
         """Probability that something without a name is at work."""
         members = [k for k, c in enumerate(self.found.components) if not c.named]

@@ -15,9 +15,9 @@ from elastocal.diagnosis.component_families import (
     judged_together,
     lines,
 )
-from elastocal.diagnosis.components import Component, FittedSum, fit_sum
+from elastocal.diagnosis.components import COST, Component, FittedSum, fit_sum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import Grams, direct
+from elastocal.diagnosis.evidence import ANOTHER, Grams, Prior, direct
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
@@ -54,6 +54,28 @@ def search_components(
             break
         found = wider
     return full, found
+
+
+def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -> float:
+    """Log posterior of a sum under the priors that the forward search's sets have.
+
+    Within a sum many causes are expected, so that each costs little; to be believed instead of a
+    few, each has to pay what one more effect of the catalogue pays there, and a line or what has
+    no name what its search costs.
+    """
+    prior = Prior.of(dataset.hypotheses, [], ANOTHER)
+    odds = {h.key: float(w) for h, w in zip(dataset.hypotheses, prior.hypotheses, strict=True)}
+    usual = min(odds.values(), default=-COST)
+    known = {item.key: item.log_prior for item in chosen.items if item.known}
+    score = found.score
+    for c in found.components:
+        price = odds.get(c.hypothesis.key, usual) if c.hypothesis is not None else usual
+        if c.hypothesis is not None and c.settings:
+            grid = dataset.grids[c.hypothesis.key]
+            price += float(grid.log_prior[grid.nearest(np.array([v for _, v in c.settings]))])
+            price = known.get(c.hypothesis.key, price)
+        score += c.cost + price
+    return score
 
 
 # What else could stand in a component's place, the others given.

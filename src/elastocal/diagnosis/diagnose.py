@@ -16,7 +16,7 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import SumAnswer
-from elastocal.diagnosis.component_search import search_components
+from elastocal.diagnosis.component_search import compared_score, search_components
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Gap, Untested
 from elastocal.diagnosis.diagnosis_data import (
     DiagnosisData,
@@ -205,8 +205,10 @@ def diagnose(
     full, total = search_components(dataset, found.chosen, progress)
     progress("confirming")
     rng = np.random.default_rng(options.seed)
-    if total.score > max(found.chosen.score, found.nothing.score) + CLEARLY:
-        answer_of_sum = SumAnswer(full, total, rng)
+    few = max(found.chosen.score, found.nothing.score)
+    answer_of_sum = SumAnswer(full, total, rng)
+    gained = compared_score(full, total, found.chosen) - few
+    if gained > CLEARLY and answer_of_sum.n_causes >= MANY:
         return _diagnosis_of_sum(
             answer_of_sum, dataset, found, screened, untested, left_out, given, source
         )
@@ -229,6 +231,7 @@ def diagnose(
         probability_unknown=_unknown(found),
         p_value=found.p_values[0] if found.p_values else p_first,
         curves=curves_of(found.dataset, found.chosen),
+        fields=answer_of_sum.without_names if answer.verdict == "unknown_effect" else (),
         untested=(*untested, *too_small(dataset, found)),
         warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
         n_readings=dataset.blocks.n,
@@ -242,6 +245,8 @@ def diagnose(
 
 # Nats by which a sum of components must be more probable than what the forward search found.
 CLEARLY = 10.0
+# Causes from which on a sum is a sum: of one or two the forward search is the better judge.
+MANY = 3
 
 
 def _diagnosis_of_sum(
