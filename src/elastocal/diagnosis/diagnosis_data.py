@@ -12,6 +12,7 @@ from scipy import stats
 from elastocal.diagnosis.baseline import Baseline, Blocks, VisitPlaces
 from elastocal.diagnosis.diagnosis import FaultyReading, NoiseFloor
 from elastocal.diagnosis.hypotheses import (
+    NO_SETTINGS,
     Columns,
     EntryKey,
     Hypothesis,
@@ -128,7 +129,10 @@ class DiagnosisData:
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
         """Settings that are searched, by effect and place."""
         table = self.visit_table.take(self.present.ravel())
-        return {h.key: grid_of(h, table) for h in self.hypotheses if h.driven}
+        grids = {h.key: grid_of(h, table) for h in self.hypotheses if h.driven}
+        for key, share in self.columns.shares.items():
+            grids[key] = replace(NO_SETTINGS, log_prior=np.array([share]))
+        return grids
 
     @cached_property
     def moments(self) -> Array:
