@@ -9,11 +9,12 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
-from elastocal.diagnosis.baseline import Baseline, made_once
+from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Untested
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
@@ -345,15 +346,16 @@ ROWS = 3000  # of the equations, as many as tell one start from another
 REFERENCES = 12  # starts about which the whole model is evaluated, for the factors of the rows
 KEPT_STARTS = 12
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
-ROUNDS, TRIALS, SHRINKS = 8, 64, 0.6  # of the refinement
+MOST_STEPS = 40  # of the refinement
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """Columns (n_rows, size, k) of an effect about the `start` that it proposes, at the amplitude
-    that the residual asks for, and what is `left` of the residual's sum of squares."""
+    """Columns (n_rows, size, k) of an effect about a start that it proposes, at the amplitude that
+    the residual asks for; its parameters `at` (k,) there, and what is `left` of the residual's sum
+    of squares."""
 
-    start: Mapping[str, float]
+    at: Array
     columns: Array
     left: float
 
@@ -364,7 +366,6 @@ def with_tangents(
     """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none, x
     with the best start in it, and of each effect that was screened the log of its mean likelihood
     over that at its best start."""
-    names = {name: k for k, name in enumerate(full.names)}
     shares: dict[tuple[str, str], float] = {}
     for h in hypotheses:
         own = own_columns(full, h)
@@ -377,9 +378,7 @@ def with_tangents(
         else:
             best, shares[h.key] = next(search.tangents()), search.screened[1]
         B, x = B.copy(), x.copy()
-        B[:, :, own] = best.columns
-        for key, value in best.start.items():
-            x[names[f"{h.where}.{key}"]] = value
+        B[:, :, own], x[own] = best.columns, best.at
     return B, x, shares
 
 
@@ -387,32 +386,44 @@ def with_tangents(
 class StartSearch:
     """The starts of one hypothesis against the residual of the fitted arm.
 
-    `X` (rows, parameters) are the fitted columns and `r` (rows,) the residual in some `rows` of the
-    equations.  The effect's first parameter is the amplitude that the others have no columns
-    without.
+    `X` (rows, parameters) are the fitted columns and `r` (rows,) the residual, both over the noise
+    in some of the `equations`, followed by an equation for the prior of each fitted parameter;
+    `whitening` (N, size, size) divides by the noise.  The effect's first parameter is the
+    amplitude that the others have no columns without.
     """
 
     full: Model
     h: Hypothesis
     base: Baseline
     x: Array
+    whitening: Array
+    equations: IntArray
     X: Array
-    rows: IntArray
+    r: Array
 
     @classmethod
     def of(cls, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> StartSearch:
         """x (K,) and B (n_rows, size, K) are those of `full`."""
         names = {name: k for k, name in enumerate(full.names)}
         fitted = [names[name] for name in base.model.names]
-        X = base.observed.apply(B[:, :, fitted]).reshape(len(base.residual), -1) * base.sizes
         # What is only planned has no residual yet that a spring could answer for.
         last = base.n_measured * base.observed.size - 1
-        rows = np.unique(np.linspace(0, last, min(ROWS, last + 1)).astype(int))
-        return cls(full, h, base, x, X[rows], rows)
+        equations = np.unique(np.linspace(0, last, min(ROWS, last + 1)).astype(int))
+        whitening = np.linalg.inv(np.linalg.cholesky(base.covariance))
+        width = prior_deviations(base)
+        X = base.observed.apply(B[:, :, fitted]) * width
+        r = base.residual.reshape(-1, base.observed.size, 1) + (
+            X @ (from_centre(base) / width)[:, None]
+        )
+        X, r = ((whitening @ each).reshape(-1, each.shape[2])[equations] for each in (X, r))
+        X = np.vstack([X, np.eye(X.shape[1])])
+        r = np.append(r[:, 0], np.zeros(X.shape[1]))
+        return cls(full, h, base, x, whitening, equations, X, r)
 
-    @property
-    def r(self) -> Array:
-        return self.base.residual[self.rows]
+    def seen(self, columns: Array) -> Array:
+        """Columns (n_rows, size, k) of the table as (rows, k) of the equations."""
+        C = (self.whitening @ self.base.observed.apply(columns)).reshape(-1, columns.shape[2])
+        return np.vstack([C[self.equations], np.zeros((self.X.shape[1], C.shape[1]))])
 
     @cached_property
     def starts(self) -> tuple[dict[str, float], ...]:
@@ -426,20 +437,18 @@ class StartSearch:
     def _about(self, start: Mapping[str, float]) -> Tangent:
         own, table = own_columns(self.full, self.h), self.base.observed.table
         at, column = self._amplitude(start)
+        left, amplitude, _ = self._fits(column[:, :, None])
+        at[own[0]] += amplitude[0]
         observed = observe(table, self.full.observe)
-        c = self.base.observed.apply(column[:, :, None]).ravel()
-        size = max(float(np.abs(c).max()), 1e-300)
-        A = np.column_stack([self.X, c[self.rows] / size])
-        solution, *_ = np.linalg.lstsq(A, self.r, rcond=1e-9)
-        at[own[0]] += solution[-1] / size
         columns = self.full.regressor(table, at, np.array(own), observed).B
         columns = columns.reshape(len(table), observed.size, -1)
         columns[:, :, 0] = column
-        return Tangent(start, columns, float(((self.r - A @ solution) ** 2).sum()))
+        return Tangent(at[own], columns, float(left[0]))
 
     def _amplitude(self, start: Mapping[str, float]) -> tuple[Array, Array]:
-        """x (K,) at a start, and the column (n_rows, size) of the amplitude there."""
+        """x (K,) at a start, and the column (n_rows, size) of the amplitude there, from none."""
         table, at = self.base.observed.table, self.x.copy()
+        at[own_columns(self.full, self.h)[0]] = self.h.parameters[0].nominal
         for key, value in start.items():
             at[self.full.names.index(f"{self.h.where}.{key}")] = value
         own = np.array(own_columns(self.full, self.h)[:1])
@@ -457,7 +466,7 @@ class StartSearch:
             return None
         left, beside = self._left(starts, profiles)
         order = np.argsort(left, kind="stable")
-        dof = max(len(self.r) - self._span.shape[1] - 1, 1)
+        dof = max(len(self.equations) - 1, 1)  # those of the prior are as many as its parameters
         variance = max(float(left[order[0]]), 1e-300) / dof
         share = float(np.log(np.exp((left[order[0]] - left) / (2 * variance)).mean()))
         kept: list[int] = []
@@ -472,19 +481,26 @@ class StartSearch:
     def _refined(
         self, starts: list[dict[str, float]], best: Mapping[str, float], least: float
     ) -> Mapping[str, float]:
-        """A better start near `best`, which leaves `least`, by draws that come ever closer."""
-        keys, rng = list(best), np.random.default_rng(0)
+        """The start near `best`, which leaves `least`, that leaves the least: least squares with
+        the amplitude solved for (variable projection; Golub and Pereyra 1973)."""
+        keys = list(best)
         width = np.array([np.std([start[key] for start in starts]) for key in keys])
-        for k in range(ROUNDS):
-            drawn = SHRINKS ** (k + 1) * width * rng.normal(size=(TRIALS, len(keys)))
-            at = np.array([best[key] for key in keys]) + drawn
-            trials = [dict(zip(keys, map(float, values), strict=True)) for values in at]
+        x0 = np.array([best[key] for key in keys])
+
+        def start_of(values: Array) -> dict[str, float]:
+            return dict(zip(keys, map(float, x0 + width * values), strict=True))
+
+        def columns_of(trials: list[dict[str, float]]) -> tuple[Array, Array]:
             profiles = self._profiles(trials)
             assert profiles is not None
-            left, _ = self._left(trials, profiles)
-            if left.min() < least:
-                best, least = trials[int(left.argmin())], float(left.min())
-        return best
+            return self._left(trials, profiles)
+
+        def residual(values: Array) -> Array:
+            c = columns_of([start_of(values)])[1][:, 0]
+            return np.asarray(self._unexplained - c * (c @ self._unexplained))
+
+        found = start_of(least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS).x)
+        return found if columns_of([found])[0][0] < least else best
 
     def _profiles(self, starts: Sequence[Mapping[str, float]]) -> Array | None:
         """(n_rows, starts)."""
@@ -512,19 +528,27 @@ class StartSearch:
     def _left(self, starts: Sequence[Mapping[str, float]], profiles: Array) -> tuple[Array, Array]:
         """What is left of the residual's sum of squares (starts,), all of it where the amplitude
         is one that the effect cannot have, and the unit columns (rows, starts)."""
-        columns = self._factor[:, :, None] * profiles[:, None, :]
-        C = self.base.observed.apply(columns).reshape(-1, len(starts))[self.rows]
-        C = C - self._span @ (self._span.T @ C)
-        size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
-        C /= size
-        r = self.r - self._span @ (self._span.T @ self.r)
-        explained = C.T @ r
+        left, amplitudes, C = self._fits(self._factor[:, :, None] * profiles[:, None, :])
         name = f"{self.h.where}.{self.h.parameters[0].key}"
         chain, cell = self.base.model.chain, self.base.model.cell
-        for k, amplitude in enumerate(explained / size):
+        for k, amplitude in enumerate(amplitudes):
             if self.h.effect.unphysical({name: float(amplitude)}, chain, cell):
-                explained[k] = 0.0
-        return r @ r - explained**2, C
+                left[k] = self._unexplained @ self._unexplained
+        return left, C
+
+    @cached_property
+    def _unexplained(self) -> Array:
+        return np.asarray(self.r - self._span @ (self._span.T @ self.r))
+
+    def _fits(self, columns: Array) -> tuple[Array, Array, Array]:
+        """Of each of the columns (n_rows, size, k) by itself what it leaves of the residual's sum
+        of squares (k,), its amplitude (k,), and itself of unit length beside the span (rows, k)."""
+        C = self.seen(columns)
+        C -= self._span @ (self._span.T @ C)
+        size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
+        C /= size
+        explained = C.T @ self._unexplained
+        return self._unexplained @ self._unexplained - explained**2, explained / size, C
 
 
 def own_columns(full: Model, h: Hypothesis) -> list[int]:

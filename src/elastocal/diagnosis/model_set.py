@@ -332,7 +332,8 @@ def settings_of(item: Item) -> dict[str, float]:
 
 
 def linear_estimates(dataset: DiagnosisData, chosen: ModelSet) -> dict[str, float]:
-    """Posterior means of the known items' parameters by name."""
+    """Posterior means of the known items' parameters by name; where one was looked for from many
+    starts, its columns' own point: its geometry is far from linear."""
     out: dict[str, float] = {}
     model, columns = dataset.base.model, dataset.columns
     about = dict(zip(columns.full.names, columns.x, strict=True))
@@ -341,10 +342,9 @@ def linear_estimates(dataset: DiagnosisData, chosen: ModelSet) -> dict[str, floa
         if isinstance(what, Hypothesis):
             values = chosen.at.beta[span] * dataset.sizes[what.key]
             starts = what.effect.starts(what.where, model.chain, model.cell)
-            open_keys = {key for start in starts for key in start}
             for p, v in zip(what.parameters, values, strict=True):
                 name = f"{what.where}.{p.key}"
-                out[name] = float(v) + (float(about[name]) if p.key in open_keys else p.nominal)
+                out[name] = float(about[name]) if starts else float(v) + p.nominal
     return out
 
 
