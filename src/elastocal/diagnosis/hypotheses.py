@@ -19,6 +19,7 @@ from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Untested
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
 from elastocal.model.chain import Chain
+from elastocal.model.choice import set_constants
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Stage, index
 from elastocal.model.effects.changes_in_time import ThermalExpansion
@@ -681,7 +682,8 @@ def _as_placed(model: Model, x: Array) -> Cell:
 class RegressorDirection:
     """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.
 
-    With `x` (parameters,) of the model the base stands as fitted, else as the cell says.
+    With `x` (parameters,) of the model the base stands as fitted, else as the cell says; settings
+    of the effect are the cell's where the hypothesis searches none.
     """
 
     def __init__(self, hypothesis: Hypothesis, model: Model, x: Array | None = None) -> None:
@@ -691,7 +693,9 @@ class RegressorDirection:
         self._arm = Arm(model.chain, model.cell if x is None else _as_placed(model, x))
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
-        u = effect.drive(self._arm, hypothesis.where, {**fitted, **searched})
+        where, cell = hypothesis.where, self._arm.cell
+        held = {} if searched else set_constants(effect, where, model.chain, cell)
+        u = effect.drive(self._arm, where, {**held, **fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
         # Most directions ask for one or two numbers of a row: evaluated at thousands of settings,
