@@ -265,7 +265,7 @@ class CompensatorTable(Table):
         "two numbers in m"
     )
     arm_m: Positive | None = key("a positive number in m")
-    free_length_m: NonNegative | None = key("a number >= 0 in m")
+    free_length_m: AnyFloat | None = key("a number in m, below 0 with initial tension")
 
 
 @record

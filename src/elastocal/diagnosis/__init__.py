@@ -4,15 +4,17 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "backlash_model": "doubt under_other_backlash_model with_likelier_backlash_model",
-    "baseline": "Baseline Blocks VisitPlaces fit_baseline made_once thinned",
+    "baseline": (
+        "Baseline Blocks VisitPlaces fit_baseline from_centre made_once prior_deviations thinned"
+    ),
     "diagnose": "DiagnosisOptions write_extended_cell",
     "diagnosis": (
         "Candidate Curve Diagnosis EffectAt ExtraPlan FaultyReading FittedParameter "
         "FoundEffect Gap Location NearRepeats NoiseFloor RivalPair StructureTest Untested publish"
     ),
     "diagnosis_data": (
-        "DiagnosisData OutlierScreening diagnosis_data_of from_centre "
-        "prior_deviations reading_errors screen_outliers"
+        "DiagnosisData OutlierScreening diagnosis_data_of "
+        "reading_errors screen_outliers"
     ),
     "discrimination": (
         "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"

@@ -20,6 +20,7 @@ from elastocal.identification.weighted_problem import (
     weights_for,
 )
 from elastocal.measurements import Measurements, visits
+from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, available_noise, observe
 from elastocal.units import Array, IntArray
@@ -215,6 +216,36 @@ def _stated(observed: Observations, model: Model, weights: Weights) -> Array | N
         return None
     stated = observed.combine.power(2) @ rows.reshape(len(rows), -1)
     return np.asarray(stated).reshape(-1, observed.size, observed.size)
+
+
+# Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough
+# to leave them to the data, narrow enough that what no reading shows stays where it is.
+FITTED, FITTED_COMPLIANCE = 5.0, 1.0
+# m or rad: base and markers.  The fit has placed them, but an error that it took for another
+# geometry may have moved them by as much; the true effect must be free to bring them back.
+PLACED = 0.1
+
+
+def from_centre(base: Baseline) -> Array:
+    """How far (parameters,) the fit is from the centre of the prior: nominal, but for what
+    registration placed, which is where it is.
+
+    An unmodelled effect bends parameters that little else holds; they must be free to return.
+    """
+    return np.where(is_placed(base.model), 0.0, base.x - base.model.nominal)
+
+
+def prior_deviations(base: Baseline) -> Array:
+    """Prior standard deviation (parameters,) of each fitted parameter.
+
+    At least how far the fit has moved it.  Where a prior is narrower than what the readings say,
+    an addition with the same columns spares the fitted parameter a part of the way, and is
+    believed for that alone: half of v in each of two columns costs v²/4w² less than v in one.
+    """
+    compliant = [effect_of(p.effect).sized_by_value for p in base.model.parameters]
+    wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
+    wide = np.maximum(wide, np.abs(from_centre(base)))
+    return np.where(is_placed(base.model), PLACED, wide)
 
 
 # Large tables are looked at in part: what more readings would add is time and memory.

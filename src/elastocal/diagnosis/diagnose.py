@@ -53,7 +53,7 @@ from elastocal.files import atomic_write_text
 from elastocal.identification.findings import BudgetStep
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model
 from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import did_you_mean, listed
@@ -105,6 +105,9 @@ def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
     for f in found:
         if (entry := f"{f.effect}:{f.where}") not in effects:
             effects.append(entry)
+        values = {p.name.removeprefix(f"{f.where}."): p.value for p in f.parameters}
+        if hints := effect_of(f.effect).hints(f.where, values):
+            model.setdefault("nominal", {}).update(hints)
         if f.settings:
             places = model.setdefault("nominal", {}).setdefault("settings", {})
             places[f.where] = places.get(f.where, {}) | f.settings

@@ -9,8 +9,15 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from elastocal.diagnosis.baseline import Baseline, Blocks, VisitPlaces
+from elastocal.diagnosis.baseline import (
+    Baseline,
+    Blocks,
+    VisitPlaces,
+    from_centre,
+    prior_deviations,
+)
 from elastocal.diagnosis.hypotheses import (
+    NO_SETTINGS,
     Columns,
     EntryKey,
     Hypothesis,
@@ -23,19 +30,12 @@ from elastocal.diagnosis.hypotheses import (
     typical_sizes,
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, fit_noise, project
-from elastocal.identification.solve import is_placed
 from elastocal.measurements import Measurements
-from elastocal.model.effects import CATALOGUE, effect_of
+from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray, IntArray
 
-# Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough
-# to leave them to the data, narrow enough that what no reading shows stays where it is.
-FITTED, FITTED_COMPLIANCE = 5.0, 1.0
-# m or rad: base and markers.  The fit has placed them, but an error that it took for another
-# geometry may have moved them by as much; the true effect must be free to bring them back.
-PLACED = 0.1
 KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
 # The load hangs on a flange frame that the markers' freedom leaves undetermined to millimetres.
 LOAD_POINT_TOLERANCE = 2e-3
@@ -127,7 +127,10 @@ class DiagnosisData:
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
         """Settings that are searched, by effect and place."""
         table = self.visit_table.take(self.present.ravel())
-        return {h.key: grid_of(h, table) for h in self.hypotheses if h.driven}
+        grids = {h.key: grid_of(h, table) for h in self.hypotheses if h.driven}
+        for key, share in self.columns.shares.items():
+            grids[key] = replace(NO_SETTINGS, log_prior=np.array([share]))
+        return grids
 
     @cached_property
     def moments(self) -> Array:
@@ -237,28 +240,6 @@ def diagnosis_data_of(
     )
     fitted = tuple(e for e, u in zip(effects, used, strict=True) if u)
     return DiagnosisData(base, columns, tuple(hypotheses), data, fitted, load_point)
-
-
-def from_centre(base: Baseline) -> Array:
-    """How far (parameters,) the fit is from the centre of the prior: nominal, but for what
-    registration placed, which is where it is.
-
-    An unmodelled effect bends parameters that little else holds; they must be free to return.
-    """
-    return np.where(is_placed(base.model), 0.0, base.x - base.model.nominal)
-
-
-def prior_deviations(base: Baseline) -> Array:
-    """Prior standard deviation (parameters,) of each fitted parameter.
-
-    At least how far the fit has moved it.  Where a prior is narrower than what the readings say,
-    an addition with the same columns spares the fitted parameter a part of the way, and is
-    believed for that alone: half of v in each of two columns costs v²/4w² less than v in one.
-    """
-    compliant = [effect_of(p.effect).sized_by_value for p in base.model.parameters]
-    wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
-    wide = np.maximum(wide, np.abs(from_centre(base)))
-    return np.where(is_placed(base.model), PLACED, wide)
 
 
 def _load_hypotheses(base: Baseline) -> list[Hypothesis]:

@@ -104,8 +104,10 @@ def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
         ]
         back[:, :, 0] += about_fit.columns.observed(about_fit.columns.of(what)) @ np.array(moved_by)
     r = about_fit.data.r + about_fit.blocks.pack(back)[:, :, 0]
+    shares = dataset.columns.shares | about_fit.columns.shares
+    columns = replace(about_fit.columns, shares=shares)
     return replace(
-        about_fit, base=replace(moved, residual=fitted.residual + back.ravel()),
+        about_fit, columns=columns, base=replace(moved, residual=fitted.residual + back.ravel()),
         other_backlash=dataset.other_backlash,
         data=replace(about_fit.data, r=r, left_out=dataset.data.left_out),
     )  # fmt: skip

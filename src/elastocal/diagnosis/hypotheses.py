@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
-from elastocal.diagnosis.baseline import Baseline, made_once
+from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Untested
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
@@ -36,7 +38,7 @@ from elastocal.model.effects.play import BY_ORDER, Backlash, Hysteresis
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 # What each need of an effect asks the user to record.
 RECORD = {
@@ -337,56 +339,217 @@ def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
 #
 # The geometry of a spring has no derivative at stiffness zero.  So the stiffness is estimated for
 # each start that the effect proposes, the best start is kept, and the geometry's columns are those
-# at that stiffness.
+# at that stiffness.  An effect that knows the profile of its column about a start is tried from
+# hundreds of them by a product of matrices each, and the best is refined; the evidence is then
+# that of the mean over all starts, as with settings.
 
 ROWS = 3000  # of the equations, as many as tell one start from another
+REFERENCES = 12  # starts about which the whole model is evaluated, for the factors of the rows
+KEPT_STARTS = 12
+ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
+MOST_STEPS = 40  # of the refinement
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """Columns (n_rows, size, k) of an effect about a start that it proposes, at the amplitude that
+    the residual asks for; its parameters `at` (k,) there, and what is `left` of the residual's sum
+    of squares."""
+
+    at: Array
+    columns: Array
+    left: float
 
 
 def with_tangents(
     full: Model, hypotheses: list[Hypothesis], base: Baseline, x: Array, B: Array
-) -> Array:
-    """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none."""
+) -> tuple[Array, Array, dict[tuple[str, str], float]]:
+    """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none, x
+    with the best start in it, and of each effect that was screened the log of its mean likelihood
+    over that at its best start."""
+    shares: dict[tuple[str, str], float] = {}
     for h in hypotheses:
         own = own_columns(full, h)
         shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
         if shown.all() or shown.sum() != 1:
             continue
-        B = B.copy()
-        B[:, :, own] = min(tangents(full, h, base, x, B), key=lambda tangent: tangent[0])[1]
-    return B
+        search = StartSearch.of(full, h, base, x, B)
+        if search.screened is None:
+            best = min(search.tangents(), key=lambda tangent: tangent.left)
+        else:
+            best, shares[h.key] = next(search.tangents()), search.screened[1]
+        B, x = B.copy(), x.copy()
+        B[:, :, own], x[own] = best.columns, best.at
+    return B, x, shares
 
 
-def tangents(
-    full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array
-) -> Iterator[tuple[float, Array]]:
-    """For each start that the effect proposes what is left of the residual's sum of squares, and
-    the effect's columns (n_rows, size, k) about it, at the amplitude that the residual asks for.
+@dataclass(frozen=True)
+class StartSearch:
+    """The starts of one hypothesis against the residual of the fitted arm.
 
-    x (K,) and B (n_rows, size, K) are those of `full`.  The effect's first parameter is the
+    `X` (rows, parameters) are the fitted columns and `r` (rows,) the residual, both over the noise
+    in some of the `equations`, followed by an equation for the prior of each fitted parameter;
+    `whitening` (N, size, size) divides by the noise.  The effect's first parameter is the
     amplitude that the others have no columns without.
     """
-    table, model = base.observed.table, base.model
-    observed = observe(table, full.observe)
-    names = {name: k for k, name in enumerate(full.names)}
-    fitted, own = [names[name] for name in model.names], own_columns(full, h)
-    X = base.observed.apply(B[:, :, fitted]).reshape(len(base.residual), -1) * base.sizes
-    # What is only planned has no residual yet that a spring could answer for.
-    last = base.n_measured * base.observed.size - 1
-    rows = np.unique(np.linspace(0, last, min(ROWS, last + 1)).astype(int))
-    for start in h.effect.starts(h.where, model.chain, model.cell) or ({},):
-        at = x.copy()
-        for key, value in start.items():
-            at[names[f"{h.where}.{key}"]] = value
-        column = full.regressor(table, at, np.array(own[:1]), observed).B
-        c = base.observed.apply(column.reshape(len(table), observed.size, 1)).ravel()
-        size = max(float(np.abs(c).max()), 1e-300)
-        A = np.column_stack([X, c / size])[rows]
-        solution, *_ = np.linalg.lstsq(A, base.residual[rows], rcond=1e-9)
-        at[own[0]] += solution[-1] / size
-        columns = full.regressor(table, at, np.array(own), observed).B
+
+    full: Model
+    h: Hypothesis
+    base: Baseline
+    x: Array
+    whitening: Array
+    equations: IntArray
+    X: Array
+    r: Array
+
+    @classmethod
+    def of(cls, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> StartSearch:
+        """x (K,) and B (n_rows, size, K) are those of `full`."""
+        names = {name: k for k, name in enumerate(full.names)}
+        fitted = [names[name] for name in base.model.names]
+        # What is only planned has no residual yet that a spring could answer for.
+        last = base.n_measured * base.observed.size - 1
+        equations = np.unique(np.linspace(0, last, min(ROWS, last + 1)).astype(int))
+        whitening = np.linalg.inv(np.linalg.cholesky(base.covariance))
+        width = prior_deviations(base)
+        X = base.observed.apply(B[:, :, fitted]) * width
+        r = base.residual.reshape(-1, base.observed.size, 1) + (
+            X @ (from_centre(base) / width)[:, None]
+        )
+        X, r = ((whitening @ each).reshape(-1, each.shape[2])[equations] for each in (X, r))
+        X = np.vstack([X, np.eye(X.shape[1])])
+        r = np.append(r[:, 0], np.zeros(X.shape[1]))
+        return cls(full, h, base, x, whitening, equations, X, r)
+
+    def seen(self, columns: Array) -> Array:
+        """Columns (n_rows, size, k) of the table as (rows, k) of the equations."""
+        C = (self.whitening @ self.base.observed.apply(columns)).reshape(-1, columns.shape[2])
+        return np.vstack([C[self.equations], np.zeros((self.X.shape[1], C.shape[1]))])
+
+    @cached_property
+    def starts(self) -> tuple[dict[str, float], ...]:
+        model = self.base.model
+        return self.h.effect.starts(self.h.where, model.chain, model.cell) or ({},)
+
+    def tangents(self) -> Iterator[Tangent]:
+        """About each start; where they were screened about the best ones, the best first."""
+        return map(self._about, self.starts if self.screened is None else self.screened[0])
+
+    def _about(self, start: Mapping[str, float]) -> Tangent:
+        own, table = own_columns(self.full, self.h), self.base.observed.table
+        at, column = self._amplitude(start)
+        left, amplitude, _ = self._fits(column[:, :, None])
+        at[own[0]] += amplitude[0]
+        observed = observe(table, self.full.observe)
+        columns = self.full.regressor(table, at, np.array(own), observed).B
         columns = columns.reshape(len(table), observed.size, -1)
-        columns[:, :, 0] = column.reshape(len(table), observed.size)
-        yield float(((base.residual[rows] - A @ solution) ** 2).sum()), columns
+        columns[:, :, 0] = column
+        return Tangent(at[own], columns, float(left[0]))
+
+    def _amplitude(self, start: Mapping[str, float]) -> tuple[Array, Array]:
+        """x (K,) at a start, and the column (n_rows, size) of the amplitude there, from none."""
+        table, at = self.base.observed.table, self.x.copy()
+        at[own_columns(self.full, self.h)[0]] = self.h.parameters[0].nominal
+        for key, value in start.items():
+            at[self.full.names.index(f"{self.h.where}.{key}")] = value
+        own = np.array(own_columns(self.full, self.h)[:1])
+        observed = observe(table, self.full.observe)
+        column = self.full.regressor(table, at, own, observed).B
+        return at, column.reshape(len(table), observed.size)
+
+    @cached_property
+    def screened(self) -> tuple[list[Mapping[str, float]], float] | None:
+        """The best starts, the first of them refined, and the log of the mean likelihood over all
+        relative to the best one's; None where the effect knows no profiles."""
+        starts = list(self.starts)
+        profiles = self._profiles(starts)
+        if profiles is None:
+            return None
+        left, beside = self._left(starts, profiles)
+        order = np.argsort(left, kind="stable")
+        dof = max(len(self.equations) - 1, 1)  # those of the prior are as many as its parameters
+        variance = max(float(left[order[0]]), 1e-300) / dof
+        share = float(np.log(np.exp((left[order[0]] - left) / (2 * variance)).mean()))
+        kept: list[int] = []
+        for k in order:
+            if len(kept) == KEPT_STARTS:
+                break
+            if np.abs(beside[:, kept].T @ beside[:, k]).max(initial=0.0) < ALIKE:
+                kept.append(int(k))
+        best = self._refined(starts, starts[kept[0]], float(left[kept[0]]))
+        return [best, *(starts[k] for k in kept[1:])], share
+
+    def _refined(
+        self, starts: list[dict[str, float]], best: Mapping[str, float], least: float
+    ) -> Mapping[str, float]:
+        """The start near `best`, which leaves `least`, that leaves the least: least squares with
+        the amplitude solved for (variable projection; Golub and Pereyra 1973)."""
+        keys = list(best)
+        width = np.array([np.std([start[key] for start in starts]) for key in keys])
+        x0 = np.array([best[key] for key in keys])
+
+        def start_of(values: Array) -> dict[str, float]:
+            return dict(zip(keys, map(float, x0 + width * values), strict=True))
+
+        def columns_of(trials: list[dict[str, float]]) -> tuple[Array, Array]:
+            profiles = self._profiles(trials)
+            assert profiles is not None
+            return self._left(trials, profiles)
+
+        def residual(values: Array) -> Array:
+            c = columns_of([start_of(values)])[1][:, 0]
+            return np.asarray(self._unexplained - c * (c @ self._unexplained))
+
+        found = start_of(least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS).x)
+        return found if columns_of([found])[0][0] < least else best
+
+    def _profiles(self, starts: Sequence[Mapping[str, float]]) -> Array | None:
+        """(n_rows, starts)."""
+        if not starts[0]:
+            return None
+        return self.h.effect.profiles(self.h.where, starts, self.base.observed.table.q)
+
+    @cached_property
+    def _factor(self) -> Array:
+        """(n_rows, size): what a profile is to be multiplied with for the amplitude's column."""
+        chosen = np.linspace(0, len(self.starts) - 1, REFERENCES).astype(int)
+        references = [self.starts[k] for k in chosen]
+        profiles = self._profiles(references)
+        assert profiles is not None
+        columns = np.stack([self._amplitude(start)[1] for start in references])
+        products = np.einsum("sni,ns->ni", columns, profiles)
+        return np.asarray(products / np.maximum((profiles**2).sum(axis=1), 1e-300)[:, None])
+
+    @cached_property
+    def _span(self) -> Array:
+        """Orthonormal columns (rows, rank) of what the fitted parameters can do."""
+        U, s, _ = np.linalg.svd(self.X, full_matrices=False)
+        return np.asarray(U[:, s > 1e-9 * s.max(initial=0.0)])
+
+    def _left(self, starts: Sequence[Mapping[str, float]], profiles: Array) -> tuple[Array, Array]:
+        """What is left of the residual's sum of squares (starts,), all of it where the amplitude
+        is one that the effect cannot have, and the unit columns (rows, starts)."""
+        left, amplitudes, C = self._fits(self._factor[:, :, None] * profiles[:, None, :])
+        name = f"{self.h.where}.{self.h.parameters[0].key}"
+        chain, cell = self.base.model.chain, self.base.model.cell
+        for k, amplitude in enumerate(amplitudes):
+            if self.h.effect.unphysical({name: float(amplitude)}, chain, cell):
+                left[k] = self._unexplained @ self._unexplained
+        return left, C
+
+    @cached_property
+    def _unexplained(self) -> Array:
+        return np.asarray(self.r - self._span @ (self._span.T @ self.r))
+
+    def _fits(self, columns: Array) -> tuple[Array, Array, Array]:
+        """Of each of the columns (n_rows, size, k) by itself what it leaves of the residual's sum
+        of squares (k,), its amplitude (k,), and itself of unit length beside the span (rows, k)."""
+        C = self.seen(columns)
+        C -= self._span @ (self._span.T @ C)
+        size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
+        C /= size
+        explained = C.T @ self._unexplained
+        return self._unexplained @ self._unexplained - explained**2, explained / size, C
 
 
 def own_columns(full: Model, h: Hypothesis) -> list[int]:
@@ -408,7 +571,8 @@ class Columns:
     """B of the model, of direct hypotheses and of the chain's entries, row by row of the table.
 
     `rows` (n_rows, size, K) at the fitted values, raw; `places` says which columns of it belong to
-    an effect (or entry) at a place.  `full` is the model with all of them, at x (K,).
+    an effect (or entry) at a place.  `full` is the model with all of them, at x (K,); `shares`
+    are what effects that were looked for from many starts pay for them, see `with_tangents`.
     """
 
     base: Baseline
@@ -416,6 +580,7 @@ class Columns:
     places: dict[tuple[str, str], slice]
     full: Model
     x: Array
+    shares: dict[tuple[str, str], float]
 
     def observed(self, rows: Array) -> Array:
         """Per table row (n_rows, size, k) → per observation (N, size, k)."""
@@ -426,9 +591,10 @@ class Columns:
         return self.rows[:, :, self.places[hypothesis.key]]
 
     def from_each_start(self, hypothesis: Hypothesis) -> Iterator[Array]:
-        """Its columns (n_rows, size, k) about each of the starts of which `of` has the best."""
-        for _, columns in tangents(self.full, hypothesis, self.base, self.x, self.rows):
-            yield columns
+        """Its columns (n_rows, size, k) about the starts of which `of` has the best."""
+        search = StartSearch.of(self.full, hypothesis, self.base, self.x, self.rows)
+        for tangent in search.tangents():
+            yield tangent.columns
 
     def torques(self) -> Array:
         """The load's torque τ (n_rows, joints) on every joint, zero where nothing depends on it.
@@ -480,12 +646,12 @@ def compute_columns(
     x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
     observed = observe(table, full.observe)
     B = full.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
-    B = with_tangents(full, direct, base, x, B)
+    B, x, shares = with_tangents(full, direct, base, x, B)
     spans: dict[tuple[str, str], list[int]] = {}
     for k, p in enumerate(full.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
-    return Columns(base, B, places, full, x)
+    return Columns(base, B, places, full, x, shares)
 
 
 def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:
@@ -533,7 +699,8 @@ class Constants:
 class RegressorDirection:
     """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.
 
-    With `x` (parameters,) of the model the base stands as fitted, else as the cell says.
+    With `x` (parameters,) of the model the base stands as fitted, else as the cell says; settings
+    of the effect are the cell's where the hypothesis searches none.
     """
 
     def __init__(
@@ -546,9 +713,9 @@ class RegressorDirection:
         self._arm = Arm(model.chain, placed)
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
-        # Settings that are not searched are as the model has them.
-        held = {} if searched else set_constants(effect, hypothesis.where, model.chain, model.cell)
-        u = effect.drive(self._arm, hypothesis.where, {**held, **fitted, **searched})
+        where, cell = hypothesis.where, self._arm.cell
+        held = {} if searched else set_constants(effect, where, model.chain, cell)
+        u = effect.drive(self._arm, where, {**held, **fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
         # Most directions ask for one or two numbers of a row: evaluated at thousands of settings,

@@ -332,13 +332,19 @@ def settings_of(item: Item) -> dict[str, float]:
 
 
 def linear_estimates(dataset: DiagnosisData, chosen: ModelSet) -> dict[str, float]:
-    """Posterior means of the known items' parameters by name."""
+    """Posterior means of the known items' parameters by name; where one was looked for from many
+    starts, its columns' own point: its geometry is far from linear."""
     out: dict[str, float] = {}
+    model, columns = dataset.base.model, dataset.columns
+    about = dict(zip(columns.full.names, columns.x, strict=True))
     for item, span in zip(chosen.items, chosen.spans, strict=True):
-        if isinstance(item.what, Hypothesis):
-            values = chosen.at.beta[span] * dataset.sizes[item.what.key]
-            for p, v in zip(item.what.parameters, values, strict=True):
-                out[f"{item.what.where}.{p.key}"] = float(v) + p.nominal
+        what = item.what
+        if isinstance(what, Hypothesis):
+            values = chosen.at.beta[span] * dataset.sizes[what.key]
+            starts = what.effect.starts(what.where, model.chain, model.cell)
+            for p, v in zip(what.parameters, values, strict=True):
+                name = f"{what.where}.{p.key}"
+                out[name] = float(about[name]) if starts else float(v) + p.nominal
     return out
 
 

@@ -54,6 +54,7 @@ def origin_attributes(T: Array) -> dict[str, str]:
 # What a spring in a file cannot follow, named like effects among the omissions.
 LEVELS, LINEAR, NEGATIVE = "levels of a joint", "linear deflections", "negative compliance"
 OPTIONS = {"time": "time_s", "temperature": "temperature_c"}  # which state what an effect needs
+RECORDED = {"torque": "recorded torques"}  # what an effect needs and only a table has
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Conditions:
 
     def state(self, need: str) -> bool:
         """Is what an effect needs ("time", "temperature", …) stated here?"""
-        return getattr(self, need, 0.0) is not None
+        return need not in RECORDED and getattr(self, need, 0.0) is not None
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         if name not in kept_names
     ]
     omissions += [
-        Omission(name, f"no cost without {' and '.join(option(OPTIONS[n]) for n in needs)}", None)
+        Omission(name, f"no cost without {' and '.join(map(_stating, needs))}", None)
         for name, needs in unstated.items()
         if needs
     ]
@@ -175,6 +176,11 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
             Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
         ]
     return Kept(full, exported, conditions, tuple(omissions), instrument)
+
+
+def _stating(need: str) -> str:
+    """What would state what an effect needs."""
+    return RECORDED.get(need) or option(OPTIONS[need])
 
 
 def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import casadi as ca
 
@@ -13,6 +13,7 @@ from elastocal.model.arm import ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.plugin_loader import check_registered
 from elastocal.text import listed
+from elastocal.units import Array
 
 if TYPE_CHECKING:
     from elastocal.model.arm import Arm
@@ -106,6 +107,17 @@ class Effect:
         """Values of some parameters from which to look for the others, where nominal ones say
         nothing about this arm."""
         return ()
+
+    def profiles(self, place: str, starts: Sequence[Mapping[str, float]], q: Array) -> Array | None:
+        """(n, starts): how the first parameter's columns depend on the joints q (n, joints) about
+        each of some starts, but for a factor of the row that all starts share.  None where only
+        the whole model says; with profiles many starts cost little."""
+        return None
+
+    def hints(self, place: str, values: Mapping[str, float]) -> dict[str, Any]:
+        """Keys of [model.nominal] from which a fit of this effect finds `values` (by key) again;
+        none where it does so from nominal."""
+        return {}
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         """Constants of the expression at one place that are set or searched, not fitted."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -23,6 +23,8 @@ from elastocal.model.effects.base import (
     joints,
     links,
 )
+from elastocal.model.effects.placements import SHORTEST, link_ends
+from elastocal.units import Array
 
 
 class Payload(Effect):
@@ -165,6 +167,9 @@ class LinkMassError(Effect):
         arm.add_potential(STANDARD_GRAVITY * height)
 
 
+GEOMETRY = (
+    "compensator_anchor_x", "compensator_anchor_y", "compensator_arm", "compensator_free_length",
+)  # fmt: skip
 # Rough geometry of a KR 270 compensator: an example to start from, to be identified.
 EXAMPLE: dict[str, Any] = {
     "stiffness_N_per_m": 0.0,
@@ -172,6 +177,20 @@ EXAMPLE: dict[str, Any] = {
     "arm_m": 0.185,
     "free_length_m": 0.458,
 }
+# Geometries from which an unknown compensator is sought.  Only its shape counts, the angle of the
+# anchor, the arm and the free length over the anchor's distance a: sizes trade with the stiffness.
+ANCHOR_SHARE = 0.3  # of the length of the joint's link
+ANCHOR_DEFAULT = 0.4  # m, where it has none
+ANGLES, ARMS = 24, (0.12, 0.25, 0.4, 0.6, 0.8)
+# s₀/a of springs that pull and push a little and much, of gas springs that push and pull with
+# nearly the same force everywhere, in shares of the shortest and the longest length or of a.
+PULLING, PUSHING, GAS = (0.0, 0.7), (1.3,), (6.0, -4.0)
+
+
+def spring_energy(q: Any, x: Any, y: Any, arm: Any, free: Any) -> ca.SX:
+    """½ (s − s₀)² of a spring of unit stiffness between (x, y) and an arm turned by q."""
+    s = ca.sqrt(x**2 + y**2 + arm**2 + 2 * arm * (x * ca.cos(q) + y * ca.sin(q)))
+    return (s - free) ** 2 / 2
 
 
 class GravityCompensator(Effect):
@@ -180,7 +199,9 @@ class GravityCompensator(Effect):
     s² = a² + L² + 2 a L cos(α − q), a = |(a_x, a_y)|, α = atan2(a_y, a_x), V = ½ K_c (s − s₀)²,
     hence the torque M = −K_c (1 − s₀/s) a L sin(α − q) about the joint, taken at the deflected
     angle (Klimchik et al. 2013, section 5).  Geometry comes from `[model.nominal]
-    gravity_compensator`; without it an example geometry and zero stiffness are the start.
+    gravity_compensator`; without it an example geometry and zero stiffness are the start, and a
+    diagnosis looks through others: pulling, pushing and gas springs (nearly constant force: a free
+    length far from s, below zero where it pulls) anchored anywhere.
     """
 
     name = "gravity_compensator"
@@ -208,15 +229,43 @@ class GravityCompensator(Effect):
     def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
         if cell.model.nominal.gravity_compensator is not None:
             return ()
-        x, y = EXAMPLE["anchor_m"]
-        turns = np.radians(np.arange(0, 360, 30))
+        length = float(np.linalg.norm(link_ends(chain)[index(place)][:3, 3]))
+        a = ANCHOR_SHARE * length if length > SHORTEST else ANCHOR_DEFAULT
+        shapes = [
+            (share, free)
+            for share in ARMS
+            for free in (
+                *(f * (1 - share) for f in PULLING), *(f * (1 + share) for f in PUSHING), *GAS
+            )
+        ]  # fmt: skip
         return tuple(
-            {
-                "compensator_anchor_x": float(np.cos(t) * x - np.sin(t) * y),
-                "compensator_anchor_y": float(np.sin(t) * x + np.cos(t) * y),
-            }
-            for t in turns
+            dict(zip(GEOMETRY, (a * np.cos(t), a * np.sin(t), a * share, a * free), strict=True))
+            for t in np.linspace(0, 2 * np.pi, ANGLES, endpoint=False)
+            for share, free in shapes
         )
+
+    def profiles(self, place: str, starts: Sequence[Mapping[str, float]], q: Array) -> Array | None:
+        """The torque of a spring of unit stiffness."""
+        angle, shape = ca.SX.sym("q"), ca.SX.sym("shape", len(GEOMETRY))
+        energy = spring_energy(angle, *ca.vertsplit(shape))
+        torque = ca.Function("torque", [angle, shape], [ca.gradient(energy, angle)])
+        shapes = np.array([[start[key] for key in GEOMETRY] for start in starts]).T
+        known, row = np.unique(q[:, index(place)], return_inverse=True)
+        angles, every = np.repeat(known, len(starts)), np.tile(shapes, len(known))
+        values = torque.map(len(angles))(angles[None], every).full()
+        return np.asarray(values.reshape(len(known), len(starts))[row.ravel()])
+
+    def hints(self, place: str, values: Mapping[str, float]) -> dict[str, Any]:
+        x, y, arm, free = (values[key] for key in GEOMETRY)
+        turned = -1.0 if arm < 0 else 1.0  # the other end of the arm, seen from the other side
+        table = {
+            "joint": place,
+            "stiffness_N_per_m": values["compensator_stiffness"],
+            "anchor_m": [turned * x, turned * y],
+            "arm_m": turned * arm,
+            "free_length_m": free,
+        }
+        return {"gravity_compensator": table}
 
     def unphysical(self, values: Mapping[str, float], chain: Chain, cell: Cell) -> str:
         keys = (".compensator_stiffness", ".compensator_free_length")
@@ -225,7 +274,4 @@ class GravityCompensator(Effect):
 
     def load(self, arm: Arm, place: str, p: Symbols) -> None:
         q = arm.joint_angle(index(place))
-        ax, ay, L = p["compensator_anchor_x"], p["compensator_anchor_y"], p["compensator_arm"]
-        s = ca.sqrt(ax**2 + ay**2 + L**2 + 2 * L * (ax * ca.cos(q) + ay * ca.sin(q)))
-        stretch = s - p["compensator_free_length"]
-        arm.add_potential(p["compensator_stiffness"] * stretch**2 / 2)
+        arm.add_potential(p["compensator_stiffness"] * spring_energy(q, *(p[k] for k in GEOMETRY)))
