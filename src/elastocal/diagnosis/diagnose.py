@@ -195,7 +195,7 @@ def diagnose(
     progress("confirming")
     rng = np.random.default_rng(options.seed)
     gap, steps = budget(dataset, found, rng)
-    findings = _findings(found, answer, base, rng)
+    findings = _findings(found, answer, base, gap.unexplained**2, rng)
     tests = structure_tests(found.first)
     p_first = exceedance(found.first.flipped, found.first.odds)
     return Diagnosis(
@@ -268,9 +268,13 @@ def _check_enough(table: Measurements) -> None:
 
 
 def _findings(
-    found: SelectedEffects, answer: Answer, plain: Baseline, rng: np.random.Generator
-) -> tuple[FoundEffect, ...]:
-    """The known items with their probabilities, parameters and confirmed shrinkage."""
+    found: SelectedEffects, answer: Answer, plain: Baseline, unexplained: float,
+    rng: np.random.Generator,
+) -> tuple[FoundEffect, ...]:  # fmt: skip
+    """The known items with their probabilities, parameters and confirmed shrinkage.
+
+    `unexplained` (m²) is no noise, and stays whichever effect joins the model.
+    """
     chosen, dataset = found.chosen, found.dataset
     known = [k for k, item in enumerate(chosen.items) if item.known]
     if not known:
@@ -283,9 +287,8 @@ def _findings(
         posterior_draws = confirmation.posterior_draws(k, answer.rivals[k])
         change = between_visits(dataset, chosen, k)
         measured = len(dataset.blocks.member)
-        reduction, ci90, ci95 = shrinkage(
-            posterior_draws, measured, confirmation.unnamed, change, rng
-        )
+        stays = confirmation.unnamed + unexplained
+        reduction, ci90, ci95 = shrinkage(posterior_draws, measured, stays, change, rng)
         fitted, settings = parameters[item.key], settings_of(item)
         findings.append(
             FoundEffect(*item.key, answer.probability[k], reduction, ci90, ci95, fitted, settings)
