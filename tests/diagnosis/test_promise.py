@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import DOWN, kr270_chain, random_poses, table_of
+from support.cells import kr270_chain, random_poses, table_of
 from support.diagnosis_data import FAULTS, SIGMA, cell, measured, zigzag
 
 from elastocal.cell.arm_description import Nominal

@@ -15,17 +15,13 @@ import tomli_w
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
-from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
-from elastocal.diagnosis.diagnosis_data import (
-    DiagnosisData,
-    OutlierScreening,
-    diagnosis_data_of,
-    screen_outliers,
-)
+from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Gap
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import model_keys, possible, with_recorded_drivers
 from elastocal.diagnosis.model_set import settings_of
+from elastocal.diagnosis.reading_faults import OutlierScreening, screen_outliers
 from elastocal.diagnosis.shrinkage import Confirmation, between_visits, budget, refit, shrinkage
 from elastocal.diagnosis.stated_floor import noise_floor
 from elastocal.diagnosis.unknown import generic_blocks
@@ -195,7 +191,7 @@ def diagnose(
     progress("confirming")
     rng = np.random.default_rng(options.seed)
     gap, steps = budget(dataset, found, rng)
-    findings = _findings(found, answer, base, gap.unexplained**2, rng)
+    findings = _findings(found, answer, base, gap, rng)
     tests = structure_tests(found.first)
     p_first = exceedance(found.first.flipped, found.first.odds)
     return Diagnosis(
@@ -268,12 +264,12 @@ def _check_enough(table: Measurements) -> None:
 
 
 def _findings(
-    found: SelectedEffects, answer: Answer, plain: Baseline, unexplained: float,
-    rng: np.random.Generator,
-) -> tuple[FoundEffect, ...]:  # fmt: skip
+    found: SelectedEffects, answer: Answer, plain: Baseline, gap: Gap, rng: np.random.Generator
+) -> tuple[FoundEffect, ...]:
     """The known items with their probabilities, parameters and confirmed shrinkage.
 
-    `unexplained` (m²) is no noise, and stays whichever effect joins the model.
+    What is unexplained is no noise, and stays whichever effect joins the model; beside something
+    without a name so does all that the named effects leave at held-out poses above the noise.
     """
     chosen, dataset = found.chosen, found.dataset
     known = [k for k, item in enumerate(chosen.items) if item.known]
@@ -281,13 +277,15 @@ def _findings(
         return ()
     confirmation = Confirmation.of(found, plain, rng)
     parameters = refit(confirmation.parameters, [chosen.items[k] for k in known])
+    stays = confirmation.unnamed + gap.unexplained**2
+    if chosen.unknown:
+        stays = max(stays, gap.explained**2 - gap.noise_floor**2)
     findings = []
     for k in known:
         item = chosen.items[k]
         posterior_draws = confirmation.posterior_draws(k, answer.rivals[k])
         change = between_visits(dataset, chosen, k)
         measured = len(dataset.blocks.member)
-        stays = confirmation.unnamed + unexplained
         reduction, ci90, ci95 = shrinkage(posterior_draws, measured, stays, change, rng)
         fitted, settings = parameters[item.key], settings_of(item)
         findings.append(
