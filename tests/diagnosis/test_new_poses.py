@@ -10,7 +10,7 @@ import pytest
 from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import new_pose_table
-from elastocal.diagnosis.shrinkage import _box, _raked
+from elastocal.diagnosis.shrinkage import _box, _joints, _raked, _recombined, _unlike
 from elastocal.measurements import Measurements
 from elastocal.model import Model, observe
 
@@ -123,3 +123,34 @@ def test_repeats_keep_their_own_side_of_approach(n: int) -> None:
     new = new_pose_table(model, repeated, N, np.random.default_rng(1))
     np.testing.assert_array_equal(new.approach[new.repeat == 0], 1.0)
     np.testing.assert_array_equal(new.approach[new.repeat == 1], -1.0)
+
+
+def upright() -> tuple[Model, Measurements]:
+    """A campaign whose last three joints follow the first three, as with a tool held upright."""
+    model, table = campaign(n=80)
+    q = table.q.copy()
+    q[:, 3:] = 0.7 * q[:, :3] @ np.array([[1.0, 0.5, 0], [0, 1, -0.5], [0.3, 0, 1]])
+    return model, replace(table, q=q)
+
+
+def test_poses_of_a_campaign_whose_joints_depend_on_each_other_do_so_too() -> None:
+    """Angles drawn independently would be poses that nobody measured or is going to."""
+    model, table = upright()
+    rng = np.random.default_rng(1)
+    assert _unlike(_joints(table), _joints(_recombined(table, N, rng)[0]), rng)
+    new = new_pose_table(model, table, N, rng)
+    assert len(np.unique(new.configuration)) == N
+    off = new.q[:, 3:] - 0.7 * new.q[:, :3] @ np.array([[1.0, 0.5, 0], [0, 1, -0.5], [0.3, 0, 1]])
+    np.testing.assert_allclose(off, 0.0, atol=1e-9)
+    assert not {tuple(q) for q in new.q} & {tuple(q) for q in table.q}
+    was, now = _joints(table), _joints(new)
+    np.testing.assert_allclose(now.std(axis=0), was.std(axis=0), rtol=0.25)
+    assert np.ptp(new.time) > 0.8 * np.ptp(table.time)
+
+
+def test_joints_that_are_independent_are_not_called_dependent() -> None:
+    found = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        found += _unlike(rng.uniform(-1, 1, (60, 6)), rng.uniform(-1, 1, (N, 6)), rng)
+    assert found <= 3

@@ -7,8 +7,10 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from support.diagnosis_data import SIGMA, campaign, diagnosed
+from support.cells import kr270_chain, random_poses, table_of
+from support.diagnosis_data import SIGMA, campaign, cell, diagnosed, measured
 
+from elastocal.cell.arm_description import Nominal
 from elastocal.diagnosis import (
     DiagnosisData,
     NoiseValues,
@@ -21,6 +23,7 @@ from elastocal.diagnosis import (
     screen_outliers,
 )
 from elastocal.measurements import Measurements
+from elastocal.model import Model
 
 POSES = 60  # × 2 loads × 3 markers
 
@@ -119,3 +122,108 @@ def test_readings_that_looked_faulty_before_their_effect_was_found_are_taken_bac
 ) -> None:
     """All readings are Gaussian, whatever the arm does: none is faulty once that is known."""
     assert diagnosed(name).noise.faulty == ()
+
+
+# Where the model is wrong, not the reading.
+
+RIGID = ("base_frame", "joint_offset", "marker_position")
+WRONG = 300  # poses
+
+
+@lru_cache
+def lagging(kind: str, markers: int, n: int = WRONG) -> tuple[Model, Measurements]:
+    """An arm that every move leaves short of its target by a different part of it, or that has
+    curves of errors at all joints, none of them in the model."""
+    chain, plain = kr270_chain(), cell(RIGID, link_gravity=False, nominal=Nominal())
+    q = random_poses(chain, n, 1)
+    table = table_of(q, np.zeros(3), both=False)
+    table = table.take(table.marker < markers)
+    off = table.q.copy()
+    if kind == "lag":
+        moved = np.diff(q, axis=0, prepend=q[:1])
+        part = moved / np.maximum(np.abs(moved).max(axis=1, keepdims=True), 1e-9)
+        random = np.random.default_rng(3).lognormal(0, 1, (n, 1))
+        off += (2e-4 * part * random)[table.configuration]
+    else:
+        off += 2e-4 * np.sin(7.3 * table.q + np.arange(6))
+    read = measured(chain, plain, [], replace(table, q=off), 1)
+    return Model.assembled(chain, plain), replace(read, q=table.q)
+
+
+def with_faults(table: Measurements, rows: np.ndarray, size: float = 1e-3) -> Measurements:
+    error = np.random.default_rng(4).normal(size=(len(rows), 3))
+    position = table.position.copy()
+    position[rows] += size * error / np.linalg.norm(error, axis=1, keepdims=True)
+    return replace(table, position=position)
+
+
+@pytest.mark.parametrize("markers", [1, 3])
+@pytest.mark.parametrize("kind", ["lag", "curves"])
+def test_an_arm_that_is_not_as_modelled_reads_nothing_wrong(kind: str, markers: int) -> None:
+    model, table = lagging(kind, markers)
+    dataset = diagnosis_data_of(fit_baseline(model, table), [])
+    found = screen_outliers(dataset, dataset.data)
+    assert not found.faulty.any()
+    assert found.suspects.mean() < 0.02
+
+
+@pytest.mark.parametrize("kind", ["lag", "curves"])
+def test_distances_of_the_markers_tell_the_faulty_readings_of_such_an_arm(kind: str) -> None:
+    model, table = lagging(kind, 3)
+    rows = np.sort(np.random.default_rng(2).choice(len(table), 6, replace=False))
+    read = with_faults(table, rows)
+    dataset = diagnosis_data_of(fit_baseline(model, read), [])
+    found = screen_outliers(dataset, dataset.data)
+    np.testing.assert_array_equal(np.flatnonzero(found.faulty), rows)
+    # Where no noise is stated, a millimetre is little beside what the arm does; but no other
+    # reading is suspected.
+    tracker = replace(model.cell.tracker, noise=None)
+    bare = Model.assembled(model.chain, replace(model.cell, tracker=tracker))
+    dataset = diagnosis_data_of(fit_baseline(bare, read), [])
+    assert not dataset.data.stated
+    found = screen_outliers(dataset, dataset.data)
+    assert found.faulty.any() and set(np.flatnonzero(found.faulty)) <= set(rows)
+
+
+def test_a_visit_whose_markers_moved_together_has_no_faulty_reading() -> None:
+    """A millimetre common to its markers: the flange was elsewhere."""
+    table = campaign(n=POSES)[1]
+    position = table.position.copy()
+    for c in (7, 23):
+        visit = (table.configuration == c) & (table.force[:, 2] == 0)
+        assert visit.sum() == 3
+        position[visit] += np.array([6e-4, -6e-4, 6e-4])
+    dataset = data_with(replace(table, position=position))
+    assert not screen_outliers(dataset, dataset.data).faulty.any()
+
+
+def test_a_visit_that_its_repeats_contradict_is_faulty() -> None:
+    table = campaign(n=POSES)[1]
+    rows = np.concatenate([np.arange(len(table))] * 3)
+    repeat = np.repeat(np.arange(3), len(table))
+    again = replace(table.take(rows), repeat=repeat, time=table.time[rows] + 3000.0 * repeat)
+    noise = SIGMA * np.random.default_rng(5).normal(size=again.position.shape)
+    bad = (again.configuration == 7) & (again.force[:, 2] == 0) & (repeat == 1)
+    position = again.position + noise + bad[:, None] * np.array([6e-4, -6e-4, 6e-4])
+    dataset = data_with(replace(again, position=position))
+    found = screen_outliers(dataset, dataset.data)
+    np.testing.assert_array_equal(np.flatnonzero(found.faulty), np.flatnonzero(bad))
+
+
+def test_an_error_that_neighbours_share_is_the_arms() -> None:
+    """Eight poses close together, measured at different times, a millimetre off alike; and one
+    reading by itself."""
+    chain, plain = kr270_chain(), cell(RIGID, link_gravity=False, nominal=Nominal())
+    q = random_poses(chain, 300, 1)
+    close = np.arange(20, 300, 37)
+    q[close] = q[20] + np.random.default_rng(7).uniform(-0.02, 0.02, (len(close), 6))
+    table = table_of(q, np.zeros(3), both=False)
+    table = table.take(table.marker == 0)
+    read = measured(chain, plain, [], table, 1)
+    position = read.position.copy()
+    position[close] += np.array([6e-4, -6e-4, 6e-4])
+    position[101] += np.array([0, 1e-3, 0])
+    model = Model.assembled(chain, plain)
+    dataset = diagnosis_data_of(fit_baseline(model, replace(read, position=position)), [])
+    found = screen_outliers(dataset, dataset.data)
+    assert np.flatnonzero(found.faulty).tolist() == [101]

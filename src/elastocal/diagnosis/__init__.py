@@ -12,10 +12,7 @@ ROOMS = {
         "Candidate Curve Diagnosis EffectAt ExtraPlan FaultyReading FittedParameter "
         "FoundEffect Gap Location NearRepeats NoiseFloor RivalPair StructureTest Untested publish"
     ),
-    "diagnosis_data": (
-        "DiagnosisData OutlierScreening diagnosis_data_of "
-        "reading_errors screen_outliers"
-    ),
+    "diagnosis_data": "DiagnosisData diagnosis_data_of",
     "discrimination": (
         "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"
     ),
@@ -34,6 +31,7 @@ ROOMS = {
         "NoiseValues NoisyData Weighted covariance fit_noise likelihood log_prior noise_draws "
         "posterior project"
     ),
+    "reading_faults": "OutlierScreening left_out_errors reading_errors screen_outliers",
     "rivals": "RivalSet Suspects alternatives with_neighbours",
     "shrinkage": (
         "Change Confirmation PosteriorDraw blocks_of_time left_out_residual new_pose_table "

@@ -18,16 +18,12 @@ from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import SumAnswer
 from elastocal.diagnosis.component_search import compared_score, search_components
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Gap, Untested
-from elastocal.diagnosis.diagnosis_data import (
-    DiagnosisData,
-    OutlierScreening,
-    diagnosis_data_of,
-    screen_outliers,
-)
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import model_keys, possible, with_recorded_drivers
 from elastocal.diagnosis.model_set import settings_of
+from elastocal.diagnosis.reading_faults import OutlierScreening, screen_outliers
 from elastocal.diagnosis.shrinkage import (
     Confirmation,
     between_visits,
@@ -217,7 +213,7 @@ def diagnose(
         )
     answer = judge(found)
     gap, steps = budget(dataset, found, rng)
-    findings = _findings(found, answer, base, rng)
+    findings = _findings(found, answer, base, gap, rng)
     tests = structure_tests(found.first)
     p_first = exceedance(found.first.flipped, found.first.odds)
     return Diagnosis(
@@ -350,24 +346,29 @@ def _check_enough(table: Measurements) -> None:
 
 
 def _findings(
-    found: SelectedEffects, answer: Answer, plain: Baseline, rng: np.random.Generator
+    found: SelectedEffects, answer: Answer, plain: Baseline, gap: Gap, rng: np.random.Generator
 ) -> tuple[FoundEffect, ...]:
-    """The known items with their probabilities, parameters and confirmed shrinkage."""
+    """The known items with their probabilities, parameters and confirmed shrinkage.
+
+    What is unexplained is no noise, and stays whichever effect joins the model; beside something
+    without a name so does all that the named effects leave at held-out poses above the noise.
+    """
     chosen, dataset = found.chosen, found.dataset
     known = [k for k, item in enumerate(chosen.items) if item.known]
     if not known:
         return ()
     confirmation = Confirmation.of(found, plain, rng)
     parameters = refit(confirmation.parameters, [chosen.items[k] for k in known])
+    stays = confirmation.unnamed + gap.unexplained**2
+    if chosen.unknown:
+        stays = max(stays, gap.explained**2 - gap.noise_floor**2)
     findings = []
     for k in known:
         item = chosen.items[k]
         posterior_draws = confirmation.posterior_draws(k, answer.rivals[k])
         change = between_visits(dataset, chosen, k)
         measured = len(dataset.blocks.member)
-        reduction, ci90, ci95 = shrinkage(
-            posterior_draws, measured, confirmation.unnamed, change, rng
-        )
+        reduction, ci90, ci95 = shrinkage(posterior_draws, measured, stays, change, rng)
         fitted, settings = parameters[item.key], settings_of(item)
         findings.append(
             FoundEffect(*item.key, answer.probability[k], reduction, ci90, ci95, fitted, settings)

@@ -194,7 +194,7 @@ class Gap:
     """3-D rms marker errors in m on held-out poses; the noise floor is what noise alone gives.
 
     `unexplained` is scatter that fits as if it were noise, and is none: repeats do not show it,
-    or it goes with the joints' angles.
+    or neighbours in pose or time share it.
     """
 
     nominal: float

@@ -1,4 +1,4 @@
-"""What a diagnosis looks at: readings, columns, possible additions, faulty readings, floor."""
+"""What a diagnosis looks at: readings, their noise, and the columns of all possible additions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from elastocal.diagnosis.baseline import (
     Baseline,
@@ -29,7 +28,7 @@ from elastocal.diagnosis.hypotheses import (
     recorded,
     typical_sizes,
 )
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, fit_noise, project
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
@@ -252,112 +251,3 @@ def _load_hypotheses(base: Baseline) -> list[Hypothesis]:
         Hypothesis(effect, w, effect.parameters(w, model.chain, model.cell), ())
         for w in effect.places(model.chain, model.cell)
     ]
-
-
-# Faulty readings, found one by one against all others, before anything is blamed on the arm.
-
-ROUNDS = 20
-LEVEL = 0.01  # chance that any of all good readings is taken for faulty
-MOST = 0.1  # share of readings from which on "faulty" is no accident of measuring
-RUN = 3  # so many neighbours in a row, of one marker, are no accident either
-ACCIDENT = 1e-3  # chance below which suspects stand together by more than accident
-
-
-@dataclass(frozen=True)
-class OutlierScreening:
-    """`faulty` (N,) readings, and `suspects` (N,) that were kept: too many, or too near each other
-    to be accidents of measuring."""
-
-    faulty: BoolArray
-    suspects: BoolArray
-
-
-def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening:
-    """The faulty ones among the readings of `data`, those of `dataset` with what was found beside.
-
-    A reading i left out has the error P_ii⁻¹u_i with covariance P_ii⁻¹ (u = P r), so
-    uᵢᵀP_ii⁻¹u_i follows χ² with as many degrees of freedom as it has components.  The noise is the
-    usual one and not the fitted one, which faulty readings swell; the median of all sets its
-    scale, so that an effect still missing from the model does not make readings faulty.  Of each
-    visit the worst goes first, for beside it the others look wrong too.  Runs of one marker's
-    readings are kept: something happened to it; and where suspects prefer one marker, load state
-    or half of the campaign, all are kept, for the same reason.
-    """
-    blocks = dataset.blocks
-    usual = NoiseValues.usual(data.G.shape[2])
-    limit = stats.chi2.isf(LEVEL / blocks.n, blocks.size)
-    median = stats.chi2.median(blocks.size)
-    faulty = np.zeros(blocks.n, dtype=bool)
-    conspicuous = faulty.copy()
-    for _ in range(ROUNDS):
-        squared = reading_errors(dataset, project(data.without(faulty), usual))
-        suspect = squared > limit * np.nanmedian(squared) / median
-        conspicuous |= suspect
-        suspect &= ~in_a_run(dataset, suspect)
-        worst = np.zeros(int(blocks.visit.max()) + 1)
-        np.maximum.at(worst, blocks.visit, np.where(suspect, squared, 0.0))
-        now = suspect & (squared == worst[blocks.visit])
-        if not now.any() or faulty.mean() > MOST:
-            break
-        faulty |= now
-    for k in np.flatnonzero(faulty):
-        # A good reading may have looked wrong beside a faulty one that was still there.
-        others = faulty.copy()
-        others[k] = False
-        squared = reading_errors(dataset, project(data.without(others), usual))
-        faulty[k] = squared[k] > limit * np.nanmedian(squared) / median
-    if faulty.mean() > MOST or not accidental(dataset, faulty):
-        faulty[:] = False
-    return OutlierScreening(faulty, conspicuous & ~faulty)
-
-
-def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
-    """Whether the faulty readings (N,) spread over markers, load states and time as all do."""
-    table, lead, moment = dataset.table, dataset.lead, _moments(dataset)
-    loaded = np.any(table.force != 0, axis=1)[lead]
-    for label in (table.marker[lead], loaded, moment > np.median(moment)):
-        groups = np.unique(label)
-        if len(groups) < 2 or not faulty.any():
-            continue
-        counts = np.array([[(faulty & (label == g)).sum(), (label == g).sum()] for g in groups])
-        found, size = counts.T
-        # Each group's count given the total is hypergeometric; the most conspicuous one decides.
-        p = stats.hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(groups)
-        if p < ACCIDENT:
-            return False
-    return True
-
-
-def reading_errors(dataset: DiagnosisData, at: Projection) -> Array:
-    """uᵢᵀP_ii⁻¹u_i (N,) of every observation; NaN where it is left out."""
-    blocks, size = dataset.blocks, dataset.blocks.size
-    C, M = blocks.member.shape
-    place = np.arange(M)
-    own = at.P.reshape(C, M, size, M, size)[:, place, :, place, :].transpose(1, 0, 2, 3)
-    u = at.u.reshape(C, M, size)
-    own = own + 1e-12 * np.trace(own, axis1=2, axis2=3)[..., None, None] * np.eye(size)
-    squared = (u * np.linalg.solve(own, u[..., None])[..., 0]).sum(axis=2)
-    squared[dataset.data.left_out.reshape(C, M, size)[:, :, 0]] = np.nan
-    out = np.full(blocks.n + 1, np.nan)
-    out[blocks.member.ravel()] = squared.ravel()
-    return out[:-1]
-
-
-def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
-    """Suspects (N,) that stand in a row of RUN or more readings of the same marker in time."""
-    marker_of, moment = dataset.table.marker[dataset.lead], _moments(dataset)
-    out = np.zeros(len(suspect), dtype=bool)
-    for marker in np.unique(marker_of):
-        mine = np.flatnonzero(marker_of == marker)
-        mine = mine[np.argsort(moment[mine], kind="stable")]
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], suspect[mine].astype(int), [0]])))
-        for start, stop in edges.reshape(-1, 2):
-            if stop - start >= RUN:
-                out[mine[start:stop]] = True
-    return out
-
-
-def _moments(dataset: DiagnosisData) -> Array | IntArray:
-    """When each observation (N,) was made; its row in the table where no times are recorded."""
-    time = dataset.table.time
-    return dataset.lead if time is None else time[dataset.lead]

@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
+from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.backlash_model import EFFECT, under_other_backlash_model
-from elastocal.diagnosis.baseline import Baseline, Blocks
+from elastocal.diagnosis.baseline import Baseline, Blocks, from_centre, prior_deviations
 from elastocal.diagnosis.diagnosis import FittedParameter, Gap
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, from_centre, prior_deviations
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis
@@ -265,6 +266,9 @@ def _reductions(
 # Poses that had no part in a fit: those that another campaign of the same kind might visit.
 
 CANDIDATES = 10  # times as many poses as are wanted
+UNLIKE = 0.01  # chance of poses so unlike the measured ones, if all came from one population
+PERMUTED = 199  # allotments of the names "measured" and "new" that it is judged by
+NEIGHBOURS = 4  # of a pose, between which and itself a new one may lie
 ROUNDS, HEAVIEST = 20, 20.0  # of raking, and how many times the mean weight a pose may count
 
 
@@ -280,16 +284,81 @@ def new_pose_table(
     hardly any is inside).  Of those, angles that lead out of the box more often are chosen more
     often, until every joint is as far from its middle as it was in the campaign.  Times are
     uniform over the campaign's.  Readings are left as they are and mean nothing.
+
+    Where the campaign's joints depend on each other (a grid of positions, the tool held upright),
+    such poses are unlike the measured ones; then each lies near a measured one instead, up to half
+    the way towards or away from one of its neighbours.
     """
     drawn, donors = _recombined(table, CANDIDATES * n, rng)
+    inside = _inside(model, table, drawn, n)
+    chosen = rng.choice(inside, n, replace=False, p=_raked(donors[inside]))
+    new = drawn.take(np.isin(drawn.configuration, chosen))
+    if _unlike(_joints(table), _joints(new), rng):
+        drawn = _beside_measured(table, CANDIDATES * n, rng)
+        chosen = rng.choice(_inside(model, table, drawn, n), n, replace=False)
+        new = drawn.take(np.isin(drawn.configuration, chosen))
+    return new
+
+
+def _inside(model: Model, table: Measurements, drawn: Measurements, n: int) -> IntArray:
+    """Configurations of `drawn` inside the table's box; all of them where fewer than n are."""
     low, high = _box(model.target_poses(table)[1], table.configuration)
     at = model.target_poses(drawn)[1]
     outside = ((at < low) | (at > high)).any(axis=1)
     inside = np.setdiff1d(drawn.configuration, drawn.configuration[outside])
-    if len(inside) < n:
-        inside = np.unique(drawn.configuration)
-    chosen = rng.choice(inside, n, replace=False, p=_raked(donors[inside]))
-    return drawn.take(np.isin(drawn.configuration, chosen))
+    return inside if len(inside) >= n else np.unique(drawn.configuration)
+
+
+def _joints(table: Measurements) -> Array:
+    """Joints (configurations, joints) of each configuration's first row."""
+    return table.q[np.unique(table.configuration, return_index=True)[1]]
+
+
+def _unlike(measured: Array, new: Array, rng: np.random.Generator) -> bool:
+    """Whether poses `new` (m, joints) are of another population than the `measured` (n, joints).
+
+    By how many have their nearest neighbour among their own kind (Schilling 1986, J. Am. Stat.
+    Assoc. 81), against the same names allotted at random.
+    """
+    if len(measured) > len(new):
+        measured = measured[rng.choice(len(measured), len(new), replace=False)]
+    both = np.concatenate([measured, new])
+    scaled = both / np.maximum(measured.std(axis=0), 1e-12)
+    near = cKDTree(scaled).query(scaled, k=2)[1]
+    near = np.where(near[:, 0] == np.arange(len(both)), near[:, 1], near[:, 0])
+    kind = np.arange(len(both)) < len(measured)
+    own = int((kind == kind[near]).sum())
+    allotted = rng.permuted(np.tile(kind, (PERMUTED, 1)), axis=1)
+    as_many = (allotted == allotted[:, near]).sum(axis=1) >= own
+    return bool((1 + as_many.sum()) / (1 + PERMUTED) <= UNLIKE)
+
+
+def _beside_measured(table: Measurements, n: int, rng: np.random.Generator) -> Measurements:
+    """n poses, each a measured one moved by up to half the way to one of its neighbours, or by as
+    much away from it."""
+    codes, first = np.unique(table.configuration, return_index=True)
+    q = table.q[first]
+    scaled = q / np.maximum(q.std(axis=0), 1e-12)
+    k = min(NEIGHBOURS, len(q) - 1)
+    near = cKDTree(scaled).query(scaled, k=k + 1)[1]
+    own = rng.integers(len(codes), size=n)
+    other = near[own, rng.integers(1, k + 1, n)]
+    step = rng.uniform(-0.5, 0.5, (n, 1)) * (q[other] - q[own])
+    rows_of = [np.flatnonzero(table.configuration == c) for c in codes]
+    new, _ = _repeated(table, [rows_of[c] for c in own])
+    new = replace(new, q=new.q + step[new.configuration])
+    return _timed(new, table, rng)
+
+
+def _repeated(table: Measurements, rows: list[IntArray]) -> tuple[Measurements, IntArray]:
+    """A configuration for each of the groups of rows, with fresh numbers; and each row's place
+    in its group."""
+    n = len(rows)
+    configuration = np.repeat(np.arange(n), [len(r) for r in rows])
+    labels = tuple(str(c + 1) for c in range(n))
+    new = table.take(np.concatenate(rows))
+    new = replace(new, configuration=configuration, configuration_labels=labels)
+    return new, np.concatenate([np.arange(len(r)) for r in rows])
 
 
 def _raked(donors: IntArray) -> Array:
@@ -328,12 +397,8 @@ def _recombined(
     """n poses, and which measured configuration (n, joints) each joint's angle is from."""
     codes = np.unique(table.configuration)
     rows_of = [np.flatnonzero(table.configuration == c) for c in codes]
-    chosen = [rows_of[k] for k in rng.integers(len(codes), size=n)]
-    rows = np.concatenate(chosen)
-    configuration = np.repeat(np.arange(n), [len(r) for r in chosen])
-    labels = tuple(str(c + 1) for c in range(n))
-    new = replace(table.take(rows), configuration=configuration, configuration_labels=labels)
-    place = np.concatenate([np.arange(len(r)) for r in chosen])
+    new, place = _repeated(table, [rows_of[k] for k in rng.integers(len(codes), size=n)])
+    configuration = new.configuration
     own = {name: getattr(new, name) for name in OF_JOINTS}
     donors = rng.integers(len(codes), size=(n, table.q.shape[1]))
     for j, of_joint in enumerate(donors.T):
@@ -342,15 +407,20 @@ def _recombined(
         for name, values in own.items():
             if values is not None:
                 values[:, j] = getattr(table, name)[source, j]
+    return _timed(new, table, rng), donors
+
+
+def _timed(new: Measurements, table: Measurements, rng: np.random.Generator) -> Measurements:
+    """`new` at times uniform over those of the table, as warm as it was then."""
     if table.time is None:
-        return new, donors
+        return new
     at = visits(new)
     time = rng.uniform(table.time.min(), table.time.max(), at.max() + 1)[at]
     warmth = None
     if table.temperature is not None:
         order = np.argsort(table.time)
         warmth = np.interp(time, table.time[order], table.temperature[order])
-    return replace(new, time=time, temperature=warmth), donors
+    return replace(new, time=time, temperature=warmth)
 
 
 # The nonlinear fit of the model with the found effects in it, weighted by the fitted noise.
@@ -384,8 +454,11 @@ def posteriors(
     wide = dict(zip(base.model.names, prior_deviations(base), strict=True))
     width = np.array([(prior or {}).get(name, wide[name]) for name in wide])
     B = at.B * width
-    residual = at.residual + B @ (from_centre(base) / width)
-    centre = base.x - from_centre(base)
+    away = from_centre(base)
+    # What no reading shows and nobody has sized, as friction that grows with a load where there is
+    # none, has no width: it stays.
+    residual = at.residual + B @ np.divide(away, width, out=np.zeros_like(away), where=width > 0)
+    centre = base.x - away
     if further is not None:
         k = further.shape[1]
         B, width = np.hstack([B, further]), np.append(width, np.ones(k))

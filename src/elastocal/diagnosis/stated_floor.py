@@ -188,49 +188,70 @@ def _within(group: IntArray, values: Array) -> tuple[float, int]:
     return float(((values - mean[group]) ** 2).sum() / dof), dof
 
 
-# Scatter of a joint that goes with an angle is no scatter.
+# Scatter of a joint that goes with pose or time is no scatter.
 #
 # The best estimate of joint j's deviation in configuration c is in proportion to
 # z = gᵀPr / √(gᵀPg), standard normal under the noise model and independent from configuration to
-# configuration.  In the order of an angle q_k, neighbours then have no correlation:
-# √n ρ̂ ~ N(0, 1).  Where they have, ρ̂ is the share of z that is a function of q_k (one less the
-# nugget of its semivariogram over the sill), and ρ̂ / (gᵀPg) the variance of the deviation that is.
+# configuration.  Neighbours in the order of an angle q_k, in the order of measuring, and nearest in
+# all joints then have no correlation: √n ρ̂ ~ N(0, 1).  Where they have, ρ̂ is the share of z that is
+# a function of what they are neighbours in (one less the nugget of its semivariogram over the
+# sill), or less where neighbours are far; and ρ̂ / (gᵀPg) the variance of the deviation that is.
 
 FEWEST_NEIGHBOURS = 30  # configurations, from which the normal approximation holds
 FALSE_SMOOTH = 0.01  # chance that any joint of an arm whose joints only scatter seems smooth
 
 
 def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Array:
-    """Variance (joints,) in rad² or m² of each joint's deviation that is a function of angles."""
+    """Variance (joints,) in rad² or m² of each joint's deviation that neighbours share.
+
+    Functions of several angles add up; what goes with all joints or with the order of measuring
+    holds them.
+    """
     of = data.counting
-    J, C = of.G.shape[2], len(of.G)
+    J = of.G.shape[2]
     out = np.zeros(J)
-    used = (~data.left_out).any(axis=1)
-    if used.sum() < FEWEST_NEIGHBOURS:
-        return out
-    q = dataset.table.q[dataset.lead[dataset.blocks.member[:, 0]]]
-    limit = float(stats.norm.isf(FALSE_SMOOTH / J**2))
+    first = dataset.lead[dataset.blocks.member[:, 0]]
+    q, moment = dataset.table.q[first], _order(dataset)[dataset.blocks.member[:, 0]]
+    limit = float(stats.norm.isf(FALSE_SMOOTH / (J * (J + 2))))
     h = np.einsum("cmj,cmj->cj", of.G, at.P @ of.G)
     a = np.einsum("cmj,cm->cj", of.G, at.u)
     for j in range(J):
-        known = np.flatnonzero(used & (h[:, j] > 1e-9 * h[:, j].max(initial=1e-300)))
+        known = np.flatnonzero(h[:, j] > 1e-9 * h[:, j].max(initial=1e-300))
         if len(known) < FEWEST_NEIGHBOURS:
             continue
         z = a[known, j] / np.sqrt(h[known, j])
-        # In no order but that of the angle: where angles are equal, neighbours are drawn.
-        drawn = np.random.default_rng(C).permutation(len(known))
-        share = 0.0
-        for k in range(J):
-            order = drawn[np.argsort(q[known[drawn], k], kind="stable")]
-            rho = float((z[order][1:] * z[order][:-1]).sum() / (z**2).sum())
-            if rho * np.sqrt(len(z) - 1) > limit:
-                share += rho
-        out[j] = min(share, 1.0) * float((z**2).mean()) / float(h[known, j].mean())
+        pairs = [*(_next_to(q[known, k]) for k in range(J)), _next_to(moment[known])]
+        rho = np.array([_correlation(z, *p, limit) for p in (*pairs, _nearest(q[known]))])
+        share = min(max(float(rho[:J].sum()), float(rho[J:].max())), 1.0)
+        out[j] = share * float((z**2).mean()) / float(h[known, j].mean())
     return out
 
 
-# The floor that is supported: by repeats where there are some, else by what does not go with
-# angles.  The rest of what the fit takes for noise is unexplained.
+def _next_to(x: Array) -> tuple[IntArray, IntArray]:
+    """Neighbours in the order of x (n,); among equal ones they are drawn."""
+    drawn = np.random.default_rng(len(x)).permutation(len(x))
+    order = drawn[np.argsort(x[drawn], kind="stable")]
+    return order[:-1], order[1:]
+
+
+def _nearest(q: Array) -> tuple[IntArray, IntArray]:
+    """Each pose of q (n, joints) and the one nearest to it, every joint by its own spread."""
+    scaled = q / np.maximum(q.std(axis=0), 1e-12)
+    near = cKDTree(scaled).query(scaled, k=2)[1]
+    every = np.arange(len(q))
+    pairs = np.column_stack([every, np.where(near[:, 0] == every, near[:, 1], near[:, 0])])
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _correlation(z: Array, one: IntArray, other: IntArray, limit: float) -> float:
+    """Correlation of z (n,) between neighbours; 0 below `limit` standard deviations of chance."""
+    rho = float((z[one] * z[other]).mean() / (z**2).mean())
+    return rho if rho * np.sqrt(len(one)) > limit else 0.0
+
+
+# The floor that is supported: by repeats where there are some, else by what neighbours do not
+# share.  The rest of what the fit takes for noise is unexplained.
 
 CONTRADICTED = 0.05  # chance of repeats that scatter so little if the fitted noise were noise
 
@@ -271,8 +292,8 @@ def supported_floor(
     fitted = min(noise_rms(data, noise), best)
     size = min(data.blocks.size, 3)
     smooth = np.minimum(smooth_scatter(dataset, data, at), noise.joint**2 * (1 + noise.shared**2))
-    going_with_angle = _per_reading(data, (data.G**2) @ smooth)
-    variance = max(fitted**2 - going_with_angle, 0.0)
+    shared = _per_reading(data, (data.G**2) @ smooth)
+    variance = max(fitted**2 - shared, 0.0)
     mean, dof = returned(dataset)
     total = mean * dof
     near = near_repeats(dataset, data, at)

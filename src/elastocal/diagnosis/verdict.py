@@ -17,11 +17,12 @@ from elastocal.diagnosis.diagnosis import (
     Untested,
     Verdict,
 )
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, OutlierScreening
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
+from elastocal.diagnosis.reading_faults import OutlierScreening
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 

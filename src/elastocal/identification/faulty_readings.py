@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -16,6 +16,8 @@ from elastocal.identification.outliers import FALSE_ALARM, blocks
 from elastocal.identification.robust_core import Design, design
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
+from elastocal.model.effects.placements import MarkerPosition
+from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray
 
 # Tests of single readings and of groups against the fit to the readings held to be good.
@@ -95,8 +97,9 @@ class CleanFit:
         p = special.fdtrc(size, np.maximum(dof, 1), drop / size * np.maximum(dof, 1) / rest)
         return np.where(alone | (dof < 1), 1.0, p)
 
-    def group_test(self, members: BoolArray) -> GroupTest | None:
-        """Test the observations `members` (n,) together, whether good ones or not.
+    def group_test(self, members: BoolArray, may_shift: bool = True) -> GroupTest | None:
+        """Test the observations `members` (n,) together, whether good ones or not; for a common
+        shift only where they `may_shift`.
 
         With A = Σ T_iᵀT_i over the good ones less or plus the members, the model is fitted with
         them (rss₁), without them (rss₀), and with them and a common shift (rss₁ − gain):
@@ -115,7 +118,7 @@ class CleanFit:
         solved = np.linalg.solve(G, np.column_stack([S.T, c]))
         M = n * np.eye(size) - S @ solved[:, :size]
         shift, gain, p_common = np.zeros(size), 0.0, 1.0
-        if dof_with > size and np.linalg.eigvalsh(M)[0] > ABSORBED * n:
+        if may_shift and dof_with > size and np.linalg.eigvalsh(M)[0] > ABSORBED * n:
             b = e - S @ solved[:, size]
             shift = np.linalg.solve(M, b)
             gain = float(b @ shift)
@@ -129,7 +132,8 @@ class CleanFit:
             excess = drop - n * size * s2
         if p_common == p_any == 1.0:
             return None
-        return GroupTest(shift, p_common, p_any, max(gain, excess), gain >= excess / 2)
+        common = may_shift and gain >= excess / 2
+        return GroupTest(shift, p_common, p_any, max(gain, excess), common)
 
     def _changed(self, members: BoolArray, sign: float) -> tuple[float, int, Array, Array]:
         """rss, dof, Σ TᵀT and Σ Tᵀe of the fit with `members` added (+1) or removed (−1)."""
@@ -166,11 +170,17 @@ WORTH_A_BLOCK = 1.1  # a run of lines must explain that much more than the best 
 
 @dataclass(frozen=True)
 class Group:
-    """Observations `members` (n,) that may share an error."""
+    """Observations `members` (n,) that may share an error, and whether that may be one shift,
+    common to all.
+
+    A marker whose position is fitted has none: what its readings then have in common is an error
+    of the arm, which they see as the others do.
+    """
 
     level: Level
     name: str
     members: BoolArray
+    may_shift: bool = True
 
 
 def groups_of(level: Level, labels: NDArray[Any]) -> list[Group]:
@@ -237,9 +247,9 @@ def _tested(
         if group.level == "block" and not whole:
             continue
         used = present if whole else present & fit.good
-        test = fit.group_test(used) if used.sum() > 1 else None
+        test = fit.group_test(used, group.may_shift) if used.sum() > 1 else None
         if test is not None:
-            yield Group(group.level, group.name, present), test
+            yield Group(group.level, group.name, present, group.may_shift), test
 
 
 def _weight(candidate: tuple[Group, GroupTest]) -> float:
@@ -333,12 +343,14 @@ def outlier_report(
     marker: ArrayLike | None = None,
     configuration: ArrayLike | None = None,
     line: ArrayLike | None = None,
+    fitted_markers: Collection[str] = (),
 ) -> OutlierReport:
     """What is wrong with the readings of y (n·size,) ≈ B (n·size, p) x, whitened.
 
     `good` (n,) says which observations to rely on; reported are the others, alone or as groups,
     and groups of good ones that err together.
 
+    Markers whose positions are among the parameters, `fitted_markers`, have no common shift.
     `marker` and `configuration` (n,) labels, `line` (n,) integer line of each observation (by
     default its number); a level without labels is not tested, and neither are groups of a single
     reading or of half the table.
@@ -351,7 +363,8 @@ def outlier_report(
     require(np.issubdtype(lines.dtype, np.integer), "line must hold integers")
     groups: list[Group] = []
     if marker is not None:
-        groups += groups_of("marker", _labels("marker", marker, n))
+        found = groups_of("marker", _labels("marker", marker, n))
+        groups += [replace(g, may_shift=g.name not in fitted_markers) for g in found]
     if configuration is not None:
         groups += groups_of("configuration", _labels("configuration", configuration, n))
     tests: dict[Level, int] = {"reading": n}
@@ -366,7 +379,9 @@ def outlier_report(
     active = np.ones(n, dtype=bool)
     for group, test, beyond in accepted:
         active &= ~group.members
-        final = fit.group_test(group.members) or test  # against the fit without any of the others
+        final = (
+            fit.group_test(group.members, group.may_shift) or test
+        )  # against the fit without any of the others
         p = min(1.0, test.p_value * adjust[group.level])
         findings.append(
             _finding(fit, group, lines, beyond, p, final.shift if final.common else None)
@@ -455,10 +470,17 @@ def report_faulty(
             configuration=None if shared else _reading_labels(
                 table.configuration_labels, table.configuration[observed.lead]
             ),
+            fitted_markers=_fitted_markers(problem.model, columns),
         )  # fmt: skip
     except (ElastocalError, np.linalg.LinAlgError):
         return None
     return replace(report, names=tuple(problem.model.names[c] for c in columns))
+
+
+def _fitted_markers(model: Model, columns: NDArray[np.int64]) -> set[str]:
+    """Names of the markers whose positions are among the fitted parameters."""
+    fitted = [model.parameters[c] for c in columns]
+    return {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name}
 
 
 def _reading_labels(names: tuple[str, ...], codes: np.ndarray) -> np.ndarray | None:

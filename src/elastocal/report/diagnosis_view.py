@@ -278,8 +278,8 @@ def _unexplained_lines(d: Diagnosis) -> list[str]:
         return []
     return [
         f"{length(d.gap.unexplained)} rms look like scatter of the arm and are no noise: readings "
-        "at the same or nearly the same pose do not show them, or they go with the joints' angles. "
-        "They are unexplained."
+        "at the same or nearly the same pose do not show them, or neighbours in pose or time share "
+        "them. They are unexplained."
     ]
 
 

@@ -27,12 +27,13 @@ def agreeing(B, y, tests, seed=0):
     return good
 
 
-def report(arm, noise, seed=0, B=None, unit=1.0):
+def report(arm, noise, seed=0, B=None, unit=1.0, fitted=()):
     """Lines 2 to 271, in the order of configuration, marker, repeat."""
     B, y = (arm.B if B is None else B), unit * arm.observed(noise)
     return outlier_report(
         B, y, agreeing(B, y, 4 * 270, seed), size=3, configuration=arm.configuration,
         marker=np.array(["M1", "M2", "M3"])[arm.marker], line=np.arange(270) + 2,
+        fitted_markers=fitted,
     )  # fmt: skip
 
 
@@ -78,6 +79,19 @@ def test_a_displaced_marker_is_one_finding(arm, shift):
     assert len(finding.readings) == 90
     assert finding.error == pytest.approx(shift, abs=0.7)
     assert (finding.beyond > 80) == (shift == 8.0)
+
+
+def test_a_marker_whose_position_is_fitted_has_no_shift_of_its_own(arm):
+    """What its readings have in common is an error of the arm; its scatter is still its own."""
+    noise = clean(arm)
+    noise[arm.marker == 1] += [0.0, 0.8, 0.0]
+    assert all(f.level != "marker" for f in report(arm, noise, fitted=("M2",)).findings)
+    (other,) = report(arm, noise, fitted=("M1",)).findings
+    assert (other.name, other.pattern) == ("M2", "common")
+    turned = Rotation.random(15, random_state=1).as_matrix() @ [0.0, 8.0, 0.0]
+    noise[arm.marker == 1] += turned[arm.configuration[arm.marker == 1]]
+    (finding,) = report(arm, noise, fitted=("M2",)).findings
+    assert (finding.name, finding.pattern) == ("M2", "scatter")
 
 
 def test_a_marker_displaced_on_a_turning_flange(arm):
