@@ -69,7 +69,10 @@ def summarise(
         faulty_report=None
         if is_exact(every)
         else report_faulty(
-            every, found.solution if set_apart or found.smooth else sound, found.noise, found.good,
+            every,
+            found.solution if set_apart or found.smooth else sound,
+            found.noise,
+            found.good,
             found.standard,
         ),
         active=found.active,

@@ -62,12 +62,15 @@ from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-STEPS, HALVINGS = 25, 8
+STEPS, FEW, HALVINGS = 25, 8, 8
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
 ROUGH = 1e-2  # the same, where rounding allows no better step
 ROUNDING = 1e-12
 CHOICES = 3  # of the ordinary parameters, each under the sizes found with the one before
 ROUNDS = 5
+# Two readings say the same where what the fit knows of them is that correlated, and their errors
+# differ by less than this share of themselves.
+SAME_POSE, ALIKE = 0.8, 0.5
 STILL = 0.02  # relative change of the noise at which the rounds end
 ALONE = 1e-9  # share of a direction that other configurations and the prior must see
 # Logarithms of the likelihood ratio: below the first the readings do not show a function at all,
@@ -153,18 +156,20 @@ class JointFit:
         """The ordinary parameters worth a column at another threshold."""
         return _chosen(self.problem, sizes, self.functions, self.free, self.scales, threshold)
 
-    def under(self, scales: Scales) -> JointFit:
-        """The minimum of the linear problem under other sizes; its residual is not that there."""
-        posterior = _shrunk(self.problem, self.functions, self.free, self.reduction.kept).posterior(
+    def linear(self, scales: Scales, reduction: Reduction) -> tuple[JointFit, Array]:
+        """The posterior of other sizes and ordinary parameters, the model linearised at this x,
+        and the step (parameters,) to its minimum."""
+        posterior = _shrunk(self.problem, self.functions, self.free, reduction.kept).posterior(
             scales
         )
-        x = _moved(self, posterior)[0]
-        return replace(self, x=x, scales=scales, posterior=posterior)
+        other = replace(self, scales=scales, posterior=posterior, reduction=reduction)
+        return other, _moved(other, posterior)[0] - self.x
 
 
 def joint_fit(
     problem: Problem, sizes: Array, functions: Functions, x: Array, reduction: Reduction,
     scales: Scales | None = None, *, choosing: bool = True, sizing: bool = True,
+    most: int = STEPS,
 ) -> JointFit:  # fmt: skip
     """Gauss–Newton on readings and prior from x.
 
@@ -203,7 +208,7 @@ def joint_fit(
             problem, parts, functions, reduction, x, residual, scales, posterior, free, False, steps
         )
         moved, gain = _moved(now, posterior)
-        if gain <= SETTLED or steps >= STEPS:
+        if gain <= SETTLED or steps >= most:
             return replace(now, converged=gain <= SETTLED)
         cost = _cost(now, x, r_factor)
         for _ in range(HALVINGS):
@@ -292,8 +297,12 @@ class Crossed(NamedTuple):
     standard: Array
 
 
-def crossed(fit: JointFit) -> Crossed:
-    """The configurations of the fit, left out one by one in closed form."""
+def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
+    """The configurations of the fit, left out one by one in closed form.
+
+    `step` (parameters,) leads from the fit's x to the minimum of the model linearised there,
+    where x itself is none.
+    """
     observed = fit.problem.observations
     found = Crossed(*(np.empty(len(observed.value)) for _ in range(3)))
     R, columns = fit.posterior.r_factor.R, fit.columns
@@ -302,7 +311,11 @@ def crossed(fit: JointFit) -> Crossed:
     def one(span: Span) -> None:
         part = fit.parts.part(span)
         at = regressor(fit.problem.model, part, fit.x, columns)
-        e, Q = part.weights.apply(at.residual), _triangular(R, part.weights.apply(at.B))
+        residual = at.residual
+        if step is not None:
+            by = np.flatnonzero(step)
+            residual = residual - regressor(fit.problem.model, part, fit.x, by).B @ step[by]
+        e, Q = part.weights.apply(residual), _triangular(R, part.weights.apply(at.B))
         standard, growth = np.empty(len(e)), np.empty(len(e))
         lost = np.zeros(len(e), dtype=bool)
         rows_of = np.repeat(part.observations.configuration, observed.size)
@@ -315,6 +328,7 @@ def crossed(fit: JointFit) -> Crossed:
             standard[rows] = (vectors @ (turned / np.sqrt(known))[..., None])[..., 0]
             growth[rows] = (vectors @ (turned / known)[..., None])[..., 0]
             lost[rows[values[:, 0] < ALONE]] = True
+        # In the fit to the others the whitened residual is (1 − H_c)⁻¹ e_c.
         held = _unwhitened(part.weights, growth)
         held[lost] = np.inf
         found.held_out[part.rows] = held
@@ -326,18 +340,20 @@ def crossed(fit: JointFit) -> Crossed:
     return found
 
 
-def left_out(fit: JointFit, observed: Observations, weights: Weights) -> Array:
+def left_out(fit: JointFit, observed: Observations, weights: Weights) -> tuple[Array, Array]:
     """Residuals (rows,) of observations that had no part in the fit, in m or rad, free of the
-    fit's uncertainty."""
+    fit's uncertainty; and Q (rows, columns), QQᵀ the covariance of their predictions over σ²."""
     columns, R = fit.columns, fit.posterior.r_factor.R
     parts = partition(observed, weights, len(columns))
-    standard = np.empty(len(observed.value))
+    standard, every = np.empty(len(observed.value)), np.empty((len(observed.value), len(columns)))
 
     def one(span: Span) -> None:
         part = parts.part(span)
         at = regressor(fit.problem.model, part, fit.x, columns)
         size = observed.size
-        Q = _triangular(R, part.weights.apply(at.B)).reshape(-1, size, len(columns))
+        Q = _triangular(R, part.weights.apply(at.B))
+        every[part.rows] = Q
+        Q = Q.reshape(-1, size, len(columns))
         e = part.weights.apply(at.residual).reshape(-1, size, 1)
         values, vectors = np.linalg.eigh(np.eye(size) + Q @ Q.transpose(0, 2, 1))
         turned = vectors.transpose(0, 2, 1) @ e
@@ -346,7 +362,7 @@ def left_out(fit: JointFit, observed: Observations, weights: Weights) -> Array:
 
     for _ in in_order(parts.spans, one):
         pass
-    return standard
+    return standard, every
 
 
 def _triangular(R: Array, B: Array) -> Array:
@@ -445,14 +461,16 @@ class _Course:
         noise: NoiseFit | None = None
         judged, fitted = good, good if self.set_aside(~good) else np.ones_like(good)
         x, reduction, scales = self.sound.fit.x, self.sound.reduction, None
+        level = np.inf
         for k in range(ROUNDS):
             problem = self.problem_of(fitted, self.weights(noise, fitted))
             fit = joint_fit(problem, self.every.sizes, self.functions, x, reduction, scales)
             x, reduction, scales = fit.x, fit.reduction, fit.scales
-            still = k > 0 and abs(scales.variance - 1) < STILL
+            still, level = abs(scales.variance - level) < STILL, scales.variance
             self.standard = self._standard(fit, noise, fitted)
             before, kind = judged, None if noise is None else noise.kind
             noise, judged = self.judged(noise, judged, first=k == 0)
+            judged = self.corroborated(fit, noise, judged)
             after = judged if self.set_aside(~judged) else np.ones_like(good)
             same = noise is None or (still and noise.kind == kind)
             if same and np.array_equal(after, fitted) and np.array_equal(before, judged):
@@ -469,7 +487,8 @@ class _Course:
         found[fitted] = crossed(fit).standard.reshape(shape)
         if not fitted.all():
             rest = subset(self.observed, ~fitted)
-            found[~fitted] = left_out(fit, rest, self.weights(noise, ~fitted)).reshape(shape)
+            apart = left_out(fit, rest, self.weights(noise, ~fitted))[0]
+            found[~fitted] = apart.reshape(shape)
         return found
 
     def judged(
@@ -494,6 +513,37 @@ class _Course:
             if noise.kind in tried and tried[noise.kind] - tried[found.kind] < 2.0:
                 found = estimate_noise(readings.take(good), noise.kind, noise)
         return found, good
+
+    def corroborated(self, fit: JointFit, noise: NoiseFit | None, good: BoolArray) -> BoolArray:
+        """The good readings (N,) and those of which another configuration says the same.
+
+        Two readings at nearly the same pose that err alike, beside a fit without them, are no
+        errors of reading: the model lacks something there, and what it has corrects part of it.
+        """
+        suspects = np.flatnonzero(~good)
+        if len(suspects) < 2 or not self.set_aside(~good):
+            return good
+        problem = self.problem_of(good, self.weights(noise, good))
+        scales = replace(fit.scales, variance=1.0) if noise is not None else fit.scales
+        try:
+            without = joint_fit(
+                problem, self.every.sizes, self.functions, fit.x, fit.reduction, scales,
+                choosing=False, sizing=False, most=FEW,
+            )  # fmt: skip
+        except (ElastocalError, np.linalg.LinAlgError):
+            return good
+        rest = subset(self.observed, ~good)
+        e, Q = left_out(without, rest, self.weights(noise, ~good))
+        e = e.reshape(len(suspects), -1)
+        Q = Q.reshape(len(suspects), -1)
+        Q = Q / np.linalg.norm(Q, axis=1, keepdims=True)
+        length = np.linalg.norm(e, axis=1)
+        apart = np.linalg.norm(e[:, None] - e[None], axis=2)
+        alike = (Q @ Q.T > SAME_POSE) & (apart < ALIKE * np.minimum.outer(length, length))
+        alike &= rest.configuration[:, None] != rest.configuration[None]
+        found = good.copy()
+        found[suspects[alike.any(axis=1)]] = True
+        return found
 
     def set_aside(self, faulty: BoolArray) -> bool:
         if self.options.faulty == "auto":
@@ -534,10 +584,13 @@ class _Course:
             wide = fit.chosen(self.every.sizes, threshold)
             if len(wide.kept) <= len(fit.reduction.kept):
                 continue
+            there = crossed(*fit.linear(fit.scales, wide))
+            if rms_3d(there.held_out, size) >= rms_3d(cross.held_out, size):
+                continue
             try:
                 other = joint_fit(
                     fit.problem, self.every.sizes, fit.functions, fit.x, wide, fit.scales,
-                    choosing=False, sizing=False,
+                    choosing=False, sizing=False, most=FEW,
                 )  # fmt: skip
                 there = crossed(other)
             except (ElastocalError, np.linalg.LinAlgError, ValueError):
@@ -555,14 +608,17 @@ class _Course:
                 continue
             scale = np.where(alive, fit.scales.scale, 0.0)
             scale[g] = 0.0
-            trial = fit.under(replace(fit.scales, scale=scale))
-            there = crossed(trial)
+            trial, step = fit.linear(replace(fit.scales, scale=scale), fit.reduction)
+            there = crossed(trial, step)
             shown = fit.scales.gain[g] > LEAST_GAIN
             if shown and rms_3d(there.held_out, size) > rms_3d(cross.held_out, size):
                 continue
             if shown:
                 self.harmful.append(self.functions.groups[g].name)
-            alive[g], fit, cross = False, trial, there
+            alive[g], cross = False, there
+            fit = replace(
+                fit, scales=replace(fit.scales, scale=np.where(alive, fit.scales.scale, 0.0))
+            )
         if (fit.scales.scale > 0).all():
             return fit, cross
         fit = joint_fit(
