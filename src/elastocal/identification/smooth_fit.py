@@ -37,7 +37,12 @@ from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.outliers import FALSE_ALARM
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.smooth_part import SmoothPart
-from elastocal.identification.smooth_prior import Scales, ShrunkPosterior, ShrunkProblem
+from elastocal.identification.smooth_prior import (
+    LinearRows,
+    Scales,
+    ShrunkPosterior,
+    ShrunkProblem,
+)
 from elastocal.identification.solve import (
     WIDER,
     WORTH_A_COLUMN,
@@ -62,7 +67,7 @@ from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-STEPS, FEW, HALVINGS = 25, 8, 8
+STEPS, FEW, HALVINGS = 25, 5, 8
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
 ROUGH = 1e-2  # the same, where rounding allows no better step
 ROUNDING = 1e-12
@@ -126,8 +131,7 @@ class JointFit:
     """The minimum of readings and prior together: values x (parameters,), residual (rows,) there.
 
     `columns` are the ordinary ones kept, then those of the functions that take part.  `free` is
-    the R factor of all free ordinary columns and the functions', the residual that of nominal
-    functions.
+    the linear problem with all free ordinary columns.
     """
 
     problem: Problem
@@ -138,7 +142,7 @@ class JointFit:
     residual: Array
     scales: Scales
     posterior: ShrunkPosterior
-    free: RFactor
+    free: LinearRows
     converged: bool
     steps: int
 
@@ -154,14 +158,12 @@ class JointFit:
 
     def chosen(self, sizes: Array, threshold: float) -> Reduction:
         """The ordinary parameters worth a column at another threshold."""
-        return _chosen(self.problem, sizes, self.functions, self.free, self.scales, threshold)
+        return _chosen(self.problem, sizes, self.free, self.scales, threshold)
 
     def linear(self, scales: Scales, reduction: Reduction) -> tuple[JointFit, Array]:
         """The posterior of other sizes and ordinary parameters, the model linearised at this x,
         and the step (parameters,) to its minimum."""
-        posterior = _shrunk(self.problem, self.functions, self.free, reduction.kept).posterior(
-            scales
-        )
+        posterior = _shrunk(self.problem, self.free, reduction.kept).posterior(scales)
         other = replace(self, scales=scales, posterior=posterior, reduction=reduction)
         return other, _moved(other, posterior)[0] - self.x
 
@@ -188,22 +190,23 @@ def joint_fit(
 
     x = _started(problem, functions, x, reduction)
     residual, r_factor = at(x)
-    rounds, steps = CHOICES if sizing else 0, 0
+    rounds = 0 if not sizing else CHOICES if scales is None else 1
+    steps = 0
     while True:
         free = _from_nominal(problem, functions, x, r_factor)
         while rounds > 0:
             rounds -= 1
-            scales = _shrunk(problem, functions, free, reduction.kept).scales(scales)
+            scales = _shrunk(problem, free, reduction.kept).scales(scales)
             if not choosing:
                 break
-            again = _chosen(problem, sizes, functions, free, scales)
+            again = _chosen(problem, sizes, free, scales)
             if np.array_equal(again.kept, reduction.kept):
                 break
             reduction, x = again, _started(problem, functions, x, again)
             residual, r_factor = at(x)
             free = _from_nominal(problem, functions, x, r_factor)
         assert scales is not None
-        posterior = _shrunk(problem, functions, free, reduction.kept).posterior(scales)
+        posterior = _shrunk(problem, free, reduction.kept).posterior(scales)
         now = JointFit(
             problem, parts, functions, reduction, x, residual, scales, posterior, free, False, steps
         )
@@ -226,28 +229,24 @@ def joint_fit(
 
 
 def _chosen(
-    problem: Problem, sizes: Array, functions: Functions, free: RFactor, scales: Scales,
+    problem: Problem, sizes: Array, free: LinearRows, scales: Scales,
     threshold: float = WORTH_A_COLUMN,
 ) -> Reduction:  # fmt: skip
     """The ordinary parameters that are worth a column beside the functions."""
-    whole = ShrunkProblem(free, len(problem.free), functions.std, functions.group)
-    sigma = float(np.sqrt(scales.variance))
-    return choose(problem, sizes, whole.marginal(scales), sigma, threshold)
+    marginal = free.only(np.arange(len(problem.free))).posterior(scales).marginal
+    return choose(problem, sizes, marginal, float(np.sqrt(scales.variance)), threshold)
 
 
-def _shrunk(problem: Problem, functions: Functions, free: RFactor, kept: IntArray) -> ShrunkProblem:
-    """The linear problem in the ordinary columns `kept` and those of the functions."""
-    last = len(problem.free) + np.arange(len(functions.columns))
-    chosen = np.concatenate([np.searchsorted(problem.free, kept), last])
-    return ShrunkProblem(free.of_columns(chosen), len(kept), functions.std, functions.group)
+def _shrunk(problem: Problem, free: LinearRows, kept: IntArray) -> ShrunkProblem:
+    return free.only(np.searchsorted(problem.free, kept))
 
 
-def _from_nominal(problem: Problem, functions: Functions, x: Array, r_factor: RFactor) -> RFactor:
-    """The R factor with the residual of nominal functions in the place of that at x."""
-    at = r_factor.augmented.copy()
-    shrunk = slice(len(problem.free), r_factor.columns)
-    at[:-1, -1] += r_factor.R[:, shrunk] @ (x[functions.columns] - functions.nominal)
-    return RFactor(at, r_factor.rows)
+def _from_nominal(
+    problem: Problem, functions: Functions, x: Array, r_factor: RFactor
+) -> LinearRows:
+    """The linear problem whose residual is that of nominal functions."""
+    away = x[functions.columns] - functions.nominal
+    return LinearRows.of(r_factor, len(problem.free), away, functions.std, functions.group)
 
 
 def _started(problem: Problem, functions: Functions, x: Array, reduction: Reduction) -> Array:
@@ -273,7 +272,7 @@ def _moved(now: JointFit, posterior: ShrunkPosterior) -> tuple[Array, float]:
     x[now.reduction.kept] += posterior.step[:k]
     x[f.columns] = f.nominal + after
     change = np.concatenate([posterior.step[:k], (after - before)[posterior.own]])
-    way = posterior.r_factor.R @ change
+    way = posterior.R @ change
     return x, float(way @ way) / posterior.variance
 
 
@@ -305,7 +304,7 @@ def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
     """
     observed = fit.problem.observations
     found = Crossed(*(np.empty(len(observed.value)) for _ in range(3)))
-    R, columns = fit.posterior.r_factor.R, fit.columns
+    R, columns = fit.posterior.R, fit.columns
     spans = [(group[0][0], group[-1][1]) for group in fit.parts.groups]
 
     def one(span: Span) -> None:
@@ -343,7 +342,7 @@ def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
 def left_out(fit: JointFit, observed: Observations, weights: Weights) -> tuple[Array, Array]:
     """Residuals (rows,) of observations that had no part in the fit, in m or rad, free of the
     fit's uncertainty; and Q (rows, columns), QQᵀ the covariance of their predictions over σ²."""
-    columns, R = fit.columns, fit.posterior.r_factor.R
+    columns, R = fit.columns, fit.posterior.R
     parts = partition(observed, weights, len(columns))
     standard, every = np.empty(len(observed.value)), np.empty((len(observed.value), len(columns)))
 
@@ -580,10 +579,12 @@ class _Course:
             return fit, cross
         self.progress("comparing with wider sets")
         size = self.observed.size
+        tried = len(fit.reduction.kept)
         for threshold in WIDER:
             wide = fit.chosen(self.every.sizes, threshold)
-            if len(wide.kept) <= len(fit.reduction.kept):
+            if len(wide.kept) <= tried:
                 continue
+            tried = len(wide.kept)
             there = crossed(*fit.linear(fit.scales, wide))
             if rms_3d(there.held_out, size) >= rms_3d(cross.held_out, size):
                 continue
@@ -634,11 +635,8 @@ class _Course:
         posterior, k = fit.posterior, fit.posterior.ordinary
         columns, effective = fit.columns, round(posterior.effective)
         whitened = fit.problem.weights.apply(fit.residual)
-        every = np.arange(k)
-        turned = posterior.r_factor.of_columns(np.r_[k : len(columns), every]).augmented
-        ordinary = RFactor(turned[len(columns) - k :, len(columns) - k :], fit.free.rows)
         found = Fit(
-            fit.x, fit.residual, whitened, ordinary, fit.converged,
+            fit.x, fit.residual, whitened, posterior.marginal, fit.converged,
             "the sum of squares no longer fell" if fit.converged
             else "the step limit was reached; the start may be far off", fit.steps,
             fit.problem.fit_of(columns, fit.x, self.every.sizes),

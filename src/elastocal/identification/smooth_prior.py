@@ -5,7 +5,8 @@
 with whitened rows; α are the ordinary parameters, b the shrunk ones as deviations from nominal, s
 their standard deviations as declared and λ_g one scale for each group.  With [B_f B_s e] = QR the
 rows are needed no more: R_ss, below what the ordinary parameters take, holds all that decides σ²
-and λ (Patterson and Thompson 1971; Harville 1977).
+and λ (Patterson and Thompson 1971; Harville 1977).  Of the shrunk columns the products R_ssᵀR_ss
+suffice: their prior keeps every matrix well conditioned.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ PRICE = 1.5
 # Noise as shares of the variance that ordinary parameters leave, from which the search starts.
 SHARES = (1.0, 0.1, 0.01, 0.001)
 STEPS = 60
-TOLERANCE = 1e-8  # relative, of the likelihood
+TOLERANCE = 1e-3  # of the log-likelihood per row, relative
 
 
 @dataclass(frozen=True)
@@ -52,17 +53,67 @@ class _Terms(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ShrunkProblem:
-    """The R factor of [B_f B_s e], the first `ordinary` columns those without a prior.
+class LinearRows:
+    """Rows linearised: [B_f B_s e] with all free ordinary columns and e at nominal functions.
 
-    e is the residual where the shrunk parameters are nominal.  `std` (shrunk,) are their standard
-    deviations s, `group` (shrunk,) the numbers of their groups.
+    B_f = Q R, `across` QᵀB_s and `z` Qᵀe; `gram` (shrunk, shrunk), `right` (shrunk,) and `total`
+    are the products of B_s and e with Q projected out.  `std` (shrunk,) are the prior's standard
+    deviations as declared, `group` (shrunk,) the numbers of the groups.
     """
 
-    r_factor: RFactor
-    ordinary: int
+    R: Array
+    across: Array
+    z: Array
+    gram: Array
+    right: Array
+    total: float
+    rows: int
     std: Array
     group: IntArray
+
+    @classmethod
+    def of(
+        cls, r_factor: RFactor, ordinary: int, away: Array, std: Array, group: IntArray
+    ) -> LinearRows:
+        """From the R factor of [B_f B_s e], the functions `away` (shrunk,) from nominal."""
+        R, k = r_factor.R, ordinary
+        z = r_factor.projected + R[:, k:] @ away
+        lower = R[k:, k:]
+        total = float(z[k:] @ z[k:]) + r_factor.rest**2
+        return cls(
+            R[:k, :k], R[:k, k:], z[:k], lower.T @ lower, lower.T @ z[k:], total, r_factor.rows,
+            std, group,
+        )  # fmt: skip
+
+    def only(self, kept: IntArray) -> ShrunkProblem:
+        """With the ordinary columns `kept` alone: what the others took is the functions' again."""
+        k = len(kept)
+        Q, R = linalg.qr(self.R[:, kept])
+        across, z = Q.T @ self.across, Q.T @ self.z
+        free, left = across[k:], z[k:]
+        return ShrunkProblem(
+            R[:k], across[:k], z[:k], self.gram + free.T @ free, self.right + free.T @ left,
+            self.total + float(left @ left), self.rows, self.std, self.group,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ShrunkProblem:
+    """`LinearRows` of the ordinary columns that are fitted."""
+
+    R: Array
+    across: Array
+    z: Array
+    gram: Array
+    right: Array
+    total: float
+    rows: int
+    std: Array
+    group: IntArray
+
+    @property
+    def ordinary(self) -> int:
+        return len(self.R)
 
     @property
     def n_groups(self) -> int:
@@ -71,15 +122,12 @@ class ShrunkProblem:
     @property
     def spare(self) -> int:
         """Rows less ordinary parameters."""
-        return max(self.r_factor.rows - self.ordinary, 1)
+        return max(self.rows - self.ordinary, 1)
 
     @cached_property
-    def _reduced(self) -> tuple[Array, Array, float]:
+    def _scaled(self) -> tuple[Array, Array, float]:
         """s BᵀB s and s Bᵀe of the shrunk columns, the ordinary ones projected out, and |e|²."""
-        k = self.ordinary
-        R = self.r_factor.R[k:, k:] * self.std
-        z = self.r_factor.projected[k:]
-        return R.T @ R, R.T @ z, float(z @ z) + self.r_factor.rest**2
+        return self.std[:, None] * self.gram * self.std, self.std * self.right, self.total
 
     def scales(self, start: Scales | None = None) -> Scales:
         """λ and σ² of the largest restricted likelihood, where λ above 1 has its PRICE; what is 0
@@ -90,7 +138,7 @@ class ShrunkProblem:
         """
         G = self.n_groups
         alive = np.ones(G, dtype=bool) if start is None else start.scale > 0
-        whole = max(self._reduced[2] / self.spare, 1e-300)
+        whole = max(self.total / self.spare, 1e-300)
         limits = np.log(LEAST / whole), np.log(MOST / whole) - np.log(SHARES[-1])
 
         def criterion(free: Array) -> tuple[float, Array]:
@@ -103,19 +151,20 @@ class ShrunkProblem:
         def least(free: Array) -> tuple[float, Array]:
             found = optimize.minimize(
                 criterion, free, jac=True, method="L-BFGS-B", bounds=[limits] * len(free),
-                options={"maxiter": STEPS, "ftol": TOLERANCE, "maxls": 30},
+                options={"maxiter": STEPS, "ftol": TOLERANCE / self.rows, "maxls": 30},
             )  # fmt: skip
             return float(found.fun), np.asarray(found.x)
 
         ratio = np.zeros(G)
         if alive.any():
             none = np.zeros(int(alive.sum()))
-            guesses = [none - np.log(whole * share) for share in SHARES]
-            if start is not None:
+            if start is None:
+                guesses = [np.clip(none - np.log(whole * share), *limits) for share in SHARES]
+                begin = min(guesses, key=lambda guess: criterion(guess)[0])
+            else:
                 known = np.maximum(start.scale[alive], LEAST)
-                guesses.append(np.log(known / start.variance))
-            guesses = [np.clip(guess, *limits) for guess in guesses]
-            value, free = least(min(guesses, key=lambda guess: criterion(guess)[0]))
+                begin = np.clip(np.log(known / start.variance), *limits)
+            value, free = least(begin)
             # From nothing the likelihood shows no way back: those there start once more.
             variance = self._terms(np.exp(self._spread(free, alive))).q / self.spare
             small = free < np.log(SMALL / variance)
@@ -140,7 +189,7 @@ class ShrunkProblem:
 
     def _terms(self, ratio: Array, slopes: bool = False) -> _Terms:
         """−2ℓ at T (groups,), with its slope in log T where that is asked for."""
-        M, y, total = self._reduced
+        M, y, total = self._scaled
         root = np.sqrt(ratio)[self.group]
         own = np.flatnonzero(root > 0)
         root, zero = root[own], np.zeros(self.n_groups)
@@ -165,68 +214,68 @@ class ShrunkProblem:
 
     def posterior(self, scales: Scales) -> ShrunkPosterior:
         """The estimate and its covariance under these scales."""
-        k = self.ordinary
-        std = np.sqrt(scales.scale / scales.variance)[self.group] * self.std
-        own = np.flatnonzero(std > 0)
-        chosen = np.concatenate([np.arange(k), k + own])
-        # Prior rows weigh as readings do: their deviations in units of σ.
-        rows = np.zeros((len(own), len(chosen) + 1))
-        rows[np.arange(len(own)), k + np.arange(len(own))] = 1 / std[own]
-        short = RFactor(
-            np.vstack([self.r_factor.augmented[:, [*chosen, self.r_factor.columns]], rows]),
-            self.r_factor.rows,
+        root = np.sqrt(scales.scale / scales.variance)[self.group] * self.std
+        own = np.flatnonzero(root > 0)
+        root, across = root[own], self.across[:, own]
+        A = root[:, None] * self.gram[np.ix_(own, own)] * root
+        A[np.diag_indices_from(A)] += 1.0
+        # UᵀU = B_sᵀB_s + σ²/Λ, ordinary columns projected out.
+        U = linalg.cholesky(A, overwrite_a=True, check_finite=False) / root
+        b = linalg.solve_triangular(
+            U, linalg.solve_triangular(U, self.right[own], trans="T"), check_finite=False
         )
-        whole = short.of_columns(np.arange(len(chosen)))
-        return ShrunkPosterior(whole, k, own, 1 / std[own], scales.variance)
-
-    def marginal(self, scales: Scales) -> RFactor:
-        """The R factor of the ordinary columns with the shrunk ones taken for noise:
-        RᵀR/σ² = B_fᵀ(σ² + B_sΛB_sᵀ)⁻¹B_f."""
-        after = self.posterior(scales)
-        k, p = after.ordinary, after.r_factor.columns
-        turned = after.r_factor.of_columns(np.r_[k:p, 0:k]).augmented
-        return RFactor(turned[p - k :, p - k :], self.r_factor.rows)
+        alpha = linalg.solve_triangular(self.R, self.z - across @ b)
+        R = np.block([[self.R, across], [np.zeros((len(own), self.ordinary)), U]])
+        return ShrunkPosterior(
+            R, np.concatenate([alpha, b]), self.ordinary, own, 1 / root, scales.variance, self.rows
+        )
 
 
 @dataclass(frozen=True)
 class ShrunkPosterior:
-    """The R factor of readings and prior together, ordinary columns first, in units of σ.
+    """The estimate under a prior: ordinary columns first, then the shrunk ones that take part.
 
-    `own` index the shrunk parameters that take part, `prior` (own,) are the rows that the prior
-    added: σ over their standard deviations.
+    `R` (columns, columns) is upper triangular, RᵀR the normal matrix of readings and prior in
+    units of σ; `step` (columns,) are α, and b from nominal.  `own` index the shrunk parameters
+    that take part, `prior` (own,) is σ over their standard deviations.
     """
 
-    r_factor: RFactor
+    R: Array
+    step: Array
     ordinary: int
     own: IntArray
     prior: Array
     variance: float
+    rows: int
 
     @cached_property
-    def step(self) -> Array:
-        """α, then b of those that take part."""
-        return np.asarray(linalg.solve_triangular(self.r_factor.R, self.r_factor.projected))
-
-    @cached_property
-    def _half(self) -> Array:
-        """R⁻¹, upper triangular."""
-        return np.asarray(linalg.lapack.dtrtri(self.r_factor.R)[0])
+    def marginal(self) -> RFactor:
+        """R of the ordinary columns with the shrunk ones taken for noise,
+        RᵀR/σ² = B_fᵀ(σ² + B_sΛB_sᵀ)⁻¹B_f; without a residual."""
+        k = self.ordinary
+        Y = linalg.solve_triangular(self.R[k:, k:], self.R[:k, k:].T, trans="T")
+        L = linalg.cholesky(np.eye(k) + Y.T @ Y, lower=True)
+        own = linalg.solve_triangular(L, self.R[:k, :k], lower=True)
+        augmented = np.zeros((k + 1, k + 1))
+        augmented[:k, :k] = linalg.qr(own, mode="r")[0]
+        return RFactor(augmented, self.rows)
 
     @cached_property
     def cofactor(self) -> Array:
         """Covariance over σ²."""
-        return self._half @ self._half.T
+        half, _ = linalg.lapack.dtrtri(self.R)
+        return np.asarray(half @ half.T)
 
     @cached_property
     def prior_share(self) -> Array:
         """Share of each estimate's information that is the prior's, 0 to 1."""
         passed = self.cofactor[self.ordinary :] * self.prior[:, None]
-        return (passed**2).sum(axis=0) / np.diag(self.cofactor)
+        return np.asarray((passed**2).sum(axis=0) / np.diag(self.cofactor))
 
     @cached_property
     def effective_of(self) -> Array:
         """How many parameters' worth of each shrunk one the readings determine, 0 to 1."""
-        return 1 - self.prior**2 * np.diag(self.cofactor)[self.ordinary :]
+        return np.asarray(1 - self.prior**2 * np.diag(self.cofactor)[self.ordinary :])
 
     @property
     def effective(self) -> float:
