@@ -18,9 +18,10 @@ from elastocal.identification.residuals import ResidualSummary, rms_3d, summaris
 from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.model.manipulator import Model
-from elastocal.units import Array
+from elastocal.units import Array, BoolArray
 
 CORRELATED = 0.9
+NOT_SHOWN = "held: the readings do not show the smooth function that it is part of"
 
 
 def summarise(
@@ -35,7 +36,8 @@ def summarise(
     kept = solution.reduction.kept
     spent = len(kept) if found.effective is None else found.effective
     sigma = residual_sigma(final, spent)
-    estimates, combinations = _estimates(model, solution, found.intervals)
+    left_out = {int(c) for s in found.smooth if not s.scale for c in s.group.columns.ravel()}
+    estimates, combinations = _estimates(model, solution, found.intervals, left_out)
     determined = tuple(model.names[c] for c in kept)
     observed = solution.problem.observations
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
@@ -49,7 +51,7 @@ def summarise(
         x=final.x,
         determined=determined,
         covariance=covariance,
-        correlations=_correlations(covariance, determined),
+        correlations=_correlations(covariance, determined, ~model.shrunk[kept]),
         observations=observed,
         residual=final.residual,
         held_out=solution.heldout,
@@ -66,9 +68,16 @@ def summarise(
         residual_summary=_residual_summary(solution, found.leverage),
         faulty_report=None
         if is_exact(every)
-        else report_faulty(every, found.solution if set_apart else sound, found.noise, found.good),
+        else report_faulty(
+            every,
+            found.solution if set_apart or found.smooth else sound,
+            found.noise,
+            found.good,
+            found.standard,
+        ),
         active=found.active,
         prior_share=found.prior_share,
+        smooth=found.smooth,
     )
     result = judged(result, of_solution(result, solution))
     return replace(result, warnings=found.warnings + warning_sentences(result))
@@ -91,7 +100,7 @@ def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSum
 
 
 def _estimates(
-    model: Model, solution: Solution, intervals: Intervals
+    model: Model, solution: Solution, intervals: Intervals, left_out: set[int]
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     reduction, x = solution.reduction, solution.fit.x
     std, dof = intervals.covariance.std, intervals.covariance.dof
@@ -128,12 +137,17 @@ def _estimates(
         found[int(c)] = estimate(c, note=f"held at its bound {x[c]:g}: the data want it beyond")
     for i in range(len(model.parameters)):
         if i not in found:
-            found[i] = estimate(i, note="fixed by the user")
+            zero = i in left_out
+            found[i] = estimate(i, note=NOT_SHOWN if zero else "fixed by the user")
     return tuple(found[i] for i in range(len(model.parameters))), tuple(combinations)
 
 
-def _correlations(covariance: Array, names: tuple[str, ...]) -> tuple[tuple[str, str, float], ...]:
-    """Pairs with |ρ| over 0.9, strongest first."""
+def _correlations(
+    covariance: Array, names: tuple[str, ...], told: BoolArray
+) -> tuple[tuple[str, str, float], ...]:
+    """Pairs with |ρ| over 0.9 of those that are `told`, strongest first."""
+    covariance = covariance[np.ix_(told, told)]
+    names = tuple(name for name, own in zip(names, told, strict=True) if own)
     std = np.sqrt(np.diag(covariance))
     known = np.outer(std, std)
     # A value that equalities fix varies with nothing.

@@ -433,7 +433,11 @@ def _labels(name: str, given: ArrayLike, n: int) -> NDArray[Any]:
 
 
 def report_faulty(
-    whole: Solution, clean: Solution, noise: NoiseFit | None, good: BoolArray
+    whole: Solution,
+    clean: Solution,
+    noise: NoiseFit | None,
+    good: BoolArray,
+    residual: Array | None = None,
 ) -> OutlierReport | None:
     """The report of the readings that are not `good` (N,), under the `noise` of the method.
 
@@ -442,13 +446,20 @@ def report_faulty(
     looked at is D V⁻¹ e, the residual less that deviation's best prediction, and configurations are
     not tested: that they deviate is part of the noise.
 
+    Where smooth functions were fitted, `residual` (N, size) is free of their part in it, and the
+    ordinary parameters alone may follow a group's error.
+
     None for a table too large for B, and where the good readings do not determine the fit.
     """
     problem, columns = whole.problem, clean.fit.columns
+    if residual is not None:
+        columns = columns[~problem.model.shrunk[columns]]
     if problem.large:
         return None
     observed, table = problem.observations, problem.observations.table
     readings = linearised(problem.model, observed, clean.fit.x, columns)
+    if residual is not None:
+        readings = readings.moved(residual)
     size = clean.sizes[columns]
     B, e = readings.B.reshape(len(observed.value), -1) * size, readings.e.ravel()
     shared = False

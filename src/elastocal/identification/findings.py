@@ -22,7 +22,7 @@ from elastocal.units import Array
 
 # Where the error of the nominal arm goes, step by step, as an identification can tell it.
 
-STAGES = ("nominal_arm", "geometry", "compliance")
+STAGES = ("nominal_arm", "geometry", "compliance", "smooth functions")
 MOST_NUMBERS = 30_000_000  # of a regressor held at once; larger tables get no budget
 STEPS, SETTLED = 4, 1e-3  # Gauss-Newton steps, and the relative gain that ends them
 DRAWS = 1000
@@ -48,7 +48,8 @@ class ErrorBudget:
 
 
 def gap_budget(result: Calibration) -> ErrorBudget | None:
-    """Held-out 3-D errors as the model gains base and markers, geometry, compliance.
+    """Held-out 3-D errors as the model gains base and markers, geometry, compliance, smooth
+    functions.
 
     Each step fits the parameters of its stages that the whole fit determined, the later ones held
     at nominal, by a few Gauss-Newton steps from the whole fit; each configuration is predicted by
@@ -63,6 +64,7 @@ def gap_budget(result: Calibration) -> ErrorBudget | None:
     if not np.isfinite(result.held_out).all():
         return None
     stage = np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
+    stage[model.shrunk] = len(STAGES) - 1
     determined = np.isin(model.names, result.determined)
     last = int(stage[determined].max(initial=0))
     rng = np.random.default_rng(0)
@@ -248,7 +250,7 @@ def _spoilt(result: Calibration) -> Iterator[Finding]:
 
 
 def _few_poses(result: Calibration) -> Iterator[Finding]:
-    n = len(result.determined)
+    n = len(result.observations.value) - result.dof
     if result.dof < FEW_DOF_PER_PARAMETER * n:
         yield Finding(
             "few_degrees_of_freedom", "note", {"dof": result.dof, "parameters": n},
@@ -342,7 +344,8 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
 
 
 def _undetermined(result: Calibration) -> Iterator[Finding]:
-    found = list(standings(result).values())
+    all_of_them = standings(result)
+    found = [all_of_them[e.name] for e in result.ordinary]
     if n := found.count(INVISIBLE) + found.count(ABSORBED):
         yield Finding(
             "undetermined", "note", {"parameters": n},
@@ -435,7 +438,7 @@ def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
     # Unit columns: what is judged is how far they are from parallel, not their units.
     scaled = solution.fit.r_factor.R
     scaled = scaled / np.linalg.norm(scaled, axis=0)
-    _, singular, Vt = linalg.svd(scaled[: len(kept)])
+    _, singular, Vt = linalg.svd(scaled[: min(len(kept), scaled.shape[1])])
     if singular[0] <= ILL_CONDITIONED * singular[-1]:
         return
     worst = np.argsort(-np.abs(Vt[-1]))[:3]

@@ -9,13 +9,19 @@ from numpy.typing import NDArray
 
 from elastocal.identification.estimates import summarise
 from elastocal.identification.findings import judged
-from elastocal.identification.methods import is_exact, run_method
+from elastocal.identification.methods import is_exact, run_method, with_smooth
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.result import Calibration, TestErrors
 from elastocal.identification.solve import Problem, Solution, solve
-from elastocal.identification.start import check_rows, check_table, fixed_and_free, start_values
+from elastocal.identification.start import (
+    check_rows,
+    check_table,
+    fixed_and_free,
+    ordinary,
+    start_values,
+)
 from elastocal.identification.weighted_problem import (
     Weights,
     partition,
@@ -55,7 +61,8 @@ def identify(
     progress("finding the start")
     free = fixed_and_free(model, options.fixed)
     x0 = start_values(model, table, options.seed, free)
-    every = _solution(model, observed, x0, free, options, progress)
+    smooth = bool(model.shrunk[free].any())
+    every = _solution(model, observed, x0, ordinary(model, free), options, progress, not smooth)
 
     def refit(good: NDArray[np.bool_], final: bool = False) -> Solution:
         chosen = options
@@ -63,7 +70,9 @@ def identify(
             rows = np.repeat(good, observed.size)
             chosen = replace(options, covariance=options.covariance[np.ix_(rows, rows)])
         silent = progress if final else _silent
-        return _solution(model, subset(observed, good), x0, free, chosen, silent, final)
+        own = ordinary(model, free)
+        wider = final and not smooth
+        return _solution(model, subset(observed, good), x0, own, chosen, silent, wider)
 
     progress("looking for faulty readings")
     faulty, sound = np.zeros(len(observed.lead), dtype=bool), every
@@ -71,7 +80,10 @@ def identify(
         faulty, sound = find_faulty(every, refit)
     if 0 < faulty.mean() < 1:
         sound = refit(~faulty, final=True)
-    found = run_method(every, sound, faulty, refit, options, progress)
+    if smooth:
+        found = with_smooth(every, sound, faulty, free, options, progress)
+    else:
+        found = run_method(every, sound, faulty, refit, options, progress)
     progress("intervals and held-out residuals")
     outliers = describe(every, found.solution, ~found.good)
     result = summarise(model, every, sound, found, outliers)

@@ -174,7 +174,7 @@ class FitProblem:
     def parts(self) -> Partition:
         if self.cut is not None:
             return self.cut
-        return partition(self.observations, self.weights, len(self.model.parameters))
+        return partition(self.observations, self.weights, int((~self.model.shrunk).sum()))
 
     @property
     def tied_to(self) -> Array:
@@ -200,7 +200,7 @@ class FitProblem:
     @property
     def large(self) -> bool:
         """Whether B is reduced part by part instead of being formed."""
-        return is_large(self.observations, len(self.model.parameters))
+        return is_large(self.observations, int((~self.model.shrunk).sum()))
 
 
 @dataclass(frozen=True)

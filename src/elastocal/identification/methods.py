@@ -25,10 +25,12 @@ from elastocal.identification.noise_choice import (
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_fit
+from elastocal.identification.smooth_fit import fit_smooth
+from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.solve import Problem, Solution, fit_kept, held_at_bounds, heldout_of
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.observations import subset
-from elastocal.units import Array, BoolArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # The default method: noise estimated from the residuals, faulty readings judged by that noise.
 
@@ -128,7 +130,8 @@ class MethodResult:
     fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
     many parameters the readings paid for (`effective`), `leverage` (rows,), and `warnings` where
     the readings contradict them; in a fit to readings alone effective and leverage follow from
-    the solution.
+    the solution.  `smooth` are the smooth functions, with which `standard` (N, size) are the
+    residuals of all readings free of the fit's part in them.
     """
 
     method: str
@@ -141,6 +144,8 @@ class MethodResult:
     effective: int | None = None
     leverage: Array | None = None
     warnings: tuple[str, ...] = ()
+    smooth: tuple[SmoothPart, ...] = ()
+    standard: Array | None = None
 
 
 def run_method(
@@ -174,6 +179,26 @@ def run_method(
     intervals = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
     warnings = (COMPUTED,) if exact else ()
     return MethodResult(kind, solution, intervals, None, good, warnings=warnings)
+
+
+def with_smooth(
+    every: Solution,
+    sound: Solution,
+    faulty: BoolArray,
+    free: IntArray,
+    options: Options,
+    progress: Progress,
+) -> MethodResult:
+    """Carry out `options.method` where smooth functions are among the parameters `free`.
+
+    `every` and `sound` are fits of the ordinary ones alone.
+    """
+    found = fit_smooth(every, sound, faulty, free, options, progress)
+    return MethodResult(
+        found.method, found.solution, found.intervals, found.noise, found.good,
+        effective=found.effective, leverage=found.leverage, warnings=found.warnings,
+        smooth=found.parts, standard=found.standard,
+    )  # fmt: skip
 
 
 def _with_knowledge(found: MethodResult, options: Options, progress: Progress) -> MethodResult:

@@ -212,7 +212,13 @@ def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
     if not stated.absolute:
         return None
     e = stated.apply(solution.fit.residual)
-    return float(np.sqrt(e @ e / max(len(e) - len(solution.fit.columns), 1)))
+    return float(np.sqrt(e @ e / max(len(e) - _spent(found), 1)))
+
+
+def _spent(found: MethodResult) -> int:
+    """How many parameters the readings paid for."""
+    spent = found.effective if found.smooth else None
+    return len(found.solution.fit.columns) if spent is None else spent
 
 
 def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
@@ -221,8 +227,9 @@ def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
     problem, fit = solution.problem, solution.fit
     weights = problem.weights
     if found.noise is not None and any(found.noise.fit.common > 0):
-        readings = linearised(problem.model, problem.observations, fit.x, fit.columns)
+        few = fit.columns[~problem.model.shrunk[fit.columns]]
+        readings = linearised(problem.model, problem.observations, fit.x, few)
         own = block_diagonal(own_noise(found.noise.fit, readings)[0])
         weights = Weights("own", whitener(own), True, "")
     whitened = weights.apply(fit.residual)
-    return lack_of_fit(problem.observations, whitened, len(fit.columns))
+    return lack_of_fit(problem.observations, whitened, _spent(found))

@@ -17,6 +17,7 @@ from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.residuals import ResidualSummary
+from elastocal.identification.smooth_part import SmoothPart
 from elastocal.model.calibrated import CalibratedArm, nominal_flange_rows
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
@@ -173,6 +174,8 @@ class Calibration(Result):
         converged: Whether the fit converged; `reason` says how it ended.
         outliers: Readings beyond the noise that had a part in the fit.
         excluded: Readings beyond the noise that were set apart.
+        smooth: The smooth functions of the model (`SmoothPart`), whose parameters are many and
+            have a prior.
         findings: The judgements about all this, each with its numbers and what to do.
         warnings: What to know before one relies on the result, in sentences.
         test: Errors on the readings given as `test`, None without.
@@ -221,6 +224,13 @@ class Calibration(Result):
     active: tuple[ActiveConstraint, ...] = ()
     prior_share: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    smooth: tuple[SmoothPart, ...] = ()
+
+    @cached_property
+    def ordinary(self) -> tuple[Estimate, ...]:
+        """The estimates of all parameters but those of smooth functions."""
+        both = zip(self.estimates, self.model.shrunk, strict=True)
+        return tuple(e for e, shrunk in both if not shrunk)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
@@ -256,9 +266,13 @@ class Calibration(Result):
         return {e.name: e for e in self.estimates}
 
     def __repr__(self) -> str:
-        known = sum(e.identifiable for e in self.estimates)
+        known = sum(e.identifiable for e in self.ordinary)
         held = f", held-out {self.heldout_rms * 1e6:.3g} µm" if self.heldout_rms < np.inf else ""
-        return f"<Calibration {self.model.chain.name}: {known} of {len(self)} parameters{held}>"
+        functions = f", {len(self.smooth)} smooth functions" if self.smooth else ""
+        return (
+            f"<Calibration {self.model.chain.name}: {known} of {len(self.ordinary)} parameters"
+            f"{functions}{held}>"
+        )
 
     @property
     def B(self) -> Array:
@@ -354,6 +368,7 @@ class Calibration(Result):
                 for a in self.active
             ],
             "prior_share": self.prior_share,
+            "smooth": [entry for part in self.smooth for entry in part.to_json()],
             "faulty_report": (
                 None if self.faulty_report is None else self.faulty_report.to_json()
             ),

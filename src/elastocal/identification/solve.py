@@ -143,11 +143,11 @@ class Problem:
     @cached_property
     def parts(self) -> Partition:
         """The table cut into parts that can be worked on alone: one, unless it is large."""
-        return partition(self.observations, self.weights, len(self.model.parameters))
+        return partition(self.observations, self.weights, int((~self.model.shrunk).sum()))
 
     @property
     def large(self) -> bool:
-        return is_large(self.observations, len(self.model.parameters))
+        return is_large(self.observations, int((~self.model.shrunk).sum()))
 
     def fit_of(self, columns: NDArray[np.int64], x: Array, sizes: Array) -> FitProblem:
         """The fit of `columns` from x, the other parameters held."""
@@ -391,16 +391,19 @@ def is_placed(model: Model) -> NDArray[np.bool_]:
 def sizes_and_check(problem: Problem) -> Array:
     """Typical sizes (parameters,) at the start; refuses where the equations are too few."""
     model, observed, free = problem.model, problem.observations, problem.free
-    every = np.arange(len(model.parameters))
+    # What is shrunk has its size from its prior.
+    every = np.flatnonzero(~model.shrunk | np.isin(np.arange(len(model.shrunk)), free))
     few = len(observed.value) <= len(free)  # more equations than unknowns need no rank
 
     def of_part(part: Part) -> tuple[Array, RFactor | None]:
         at = regressor(model, part, problem.x0, every)
-        r_factor = RFactor.of(at.B[:, free], at.residual) if few else None
+        r_factor = RFactor.of(at.B[:, np.searchsorted(every, free)], at.residual) if few else None
         return np.abs(at.B).max(axis=0, initial=0.0), r_factor
 
     largest, factors = zip(*each(problem.parts, of_part), strict=True)
-    sizes = model.sizes(np.stack(largest))
+    moved = np.zeros((len(largest), len(model.parameters)))
+    moved[:, every] = np.stack(largest)
+    sizes = model.sizes(moved)
     sizes[is_placed(model)] = PLACED
     if few:
         check_enough(model, observed, merge(t for t in factors if t is not None).R * sizes[free])

@@ -157,6 +157,20 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
     return free
 
 
+def ordinary(model: Model, free: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Those of the parameters `free` that no smooth function consists of.
+
+    Raises InputError where there are none.
+    """
+    found = free[~model.shrunk[free]]
+    if not len(found):
+        raise InputError(
+            "nothing but smooth functions is left to identify; add base_frame and "
+            "marker_position to [model] effects, or free some parameters"
+        )
+    return found
+
+
 def check_enough(model: Model, observed: Observations, scaled: Array) -> None:
     """Refuse when the equations are too few for the minimal set; `scaled`: B
     (rows, free) in typical sizes, or its R."""

@@ -247,6 +247,12 @@ class Model:
     def names(self) -> tuple[str, ...]:
         return tuple(p.name for p in self.parameters)
 
+    @cached_property
+    def shrunk(self) -> NDArray[np.bool_]:
+        """Which parameters (parameters,) are those of smooth functions, with a prior of their
+        own."""
+        return np.array([p.shrunk for p in self.parameters], dtype=bool)
+
     def meant_by(self, name: str) -> list[int]:
         """Indices of the parameters that a parameter's, place's or effect's name stands for."""
         return [i for i, p in enumerate(self.parameters) if name in (p.name, p.where, p.effect)]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import casadi as ca
@@ -42,6 +43,26 @@ RECORD_TORQUES = (
     "and a gear error does not"
 )
 WEIGH_LOAD = "weigh the load and measure its hook"
+
+
+@dataclass(frozen=True)
+class SmoothFunction:
+    """What shrunk parameters of an effect make up: a smooth function of one quantity of a row.
+
+    `follows` is a joint, "joint2", or "time"; `keys` (components, waves) are its parameters and
+    `units` (components,) those of its values.  `size` and `length` are the standard deviation and
+    the correlation length of its prior; between `low` and `high` it was measured (rad or s).
+    `basis` gives the waves (n, waves) at values (n,) of what it follows.
+    """
+
+    follows: str
+    keys: tuple[tuple[str, ...], ...]
+    units: tuple[str, ...]
+    size: float
+    length: float
+    low: float
+    high: float
+    basis: Callable[[Array], Array]
 
 
 class Effect:
@@ -122,6 +143,14 @@ class Effect:
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         """Constants of the expression at one place that are set or searched, not fitted."""
         return ()
+
+    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
+        """The smooth functions that its shrunk parameters at one place make up, if they do."""
+        return ()
+
+    def lasting(self, cell: Cell) -> Cell:
+        """The cell without what of this effect belongs to one campaign and not to the arm."""
+        return cell
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
         """`needs` for this cell: what shows an effect may depend on the model around it."""

@@ -11,6 +11,9 @@ A joint that turns all the way is periodic, P = 2π; else P is longer than the r
 its ends do not know of each other.  Such parameters are `shrunk`: what the readings do not show
 stays at zero, so that the function takes as many parameters as the data pay for.
 
+Beyond its range a function that is not periodic goes to zero as the process does that knows nothing
+there, and stays so: half-way between the ends of the period x stands still.
+
 A smooth function corrects the arm and explains nothing.
 """
 
@@ -18,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -26,7 +29,14 @@ import numpy as np
 from elastocal.cell.work_cell import Cell
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import Symbols, index, joints, links, turning_joints
+from elastocal.model.effects.base import (
+    SmoothFunction,
+    Symbols,
+    index,
+    joints,
+    links,
+    turning_joints,
+)
 from elastocal.model.effects.driven import (
     BaseMotion,
     DrivenEffect,
@@ -46,10 +56,16 @@ MARGIN, LENGTHS = 0.25, 3.0  # of the range, or in lengths, that the ends are ap
 
 @dataclass(frozen=True)
 class Waves:
-    """The waves of a smooth function: `frequency` ω (K,) in 1/x, of x − `low`."""
+    """The waves of a smooth function: `frequency` ω (K,) in 1/x, of x − `low`.
+
+    x goes no further than `reach` to either side of the range, `span` long; infinite where the
+    function is periodic.
+    """
 
     low: float
     frequency: Array
+    span: float = math.inf
+    reach: float = math.inf
 
     @classmethod
     def over(cls, low: float, high: float, length: float, turns: bool) -> Waves:
@@ -57,11 +73,13 @@ class Waves:
         an angle, and the function periodic where it goes all the way round."""
         span = max(high - low, 1e-9)
         period = span + max(MARGIN * span, LENGTHS * length)
+        reach = (period - span) / 2
         if turns and span >= FULL_TURN * 2 * math.pi:
-            period = 2 * math.pi
+            period, reach = 2 * math.pi, math.inf
         count = math.ceil(HIGHEST / length * period / (2 * math.pi))
         order = np.arange(1, min(max(count, 1), MOST_WAVES) + 1)
-        return cls(low, np.asarray(2 * np.pi / period * order, dtype=np.float64))
+        frequency = np.asarray(2 * np.pi / period * order, dtype=np.float64)
+        return cls(low, frequency, span, reach)
 
     def variances(self, size: float, length: float) -> Array:
         """Prior variances (2K,) of the coefficients, cosines first."""
@@ -70,8 +88,17 @@ class Waves:
 
     def values(self, x: ca.SX) -> list[ca.SX]:
         """cos ω_k(x − low), then sin ω_k(x − low): 2K expressions."""
-        phases = [float(w) * (x - self.low) for w in self.frequency]
+        x = x - self.low
+        if math.isfinite(self.reach):
+            x = ca.fmin(ca.fmax(x, -self.reach), self.span + self.reach)
+        phases = [float(w) * x for w in self.frequency]
         return [*(ca.cos(phase) for phase in phases), *(ca.sin(phase) for phase in phases)]
+
+    def at(self, x: Array) -> Array:
+        """The same numbers (n, 2K) at x (n,)."""
+        x = np.clip(x - self.low, -self.reach, self.span + self.reach)
+        phases = x[:, None] * self.frequency
+        return np.hstack([np.cos(phases), np.sin(phases)])
 
 
 @dataclass(frozen=True)
@@ -92,6 +119,12 @@ class Course:
     @property
     def waves(self) -> Waves:
         return Waves.over(self.low, self.high, self.length, self.turns)
+
+    def function(self, keys: tuple[tuple[str, ...], ...], units: tuple[str, ...]) -> SmoothFunction:
+        """What follows it, with the parameters `keys` of each component."""
+        return SmoothFunction(
+            self.name, keys, units, self.size, self.length, self.low, self.high, self.waves.at
+        )
 
     def of(self, arm: Arm) -> ca.SX:
         """The quantity of the row."""
@@ -143,6 +176,11 @@ class JointCurve(DrivenEffect):
             ParameterSpec(f"curve_{k + 1}", "rad", 0.0, float(s), shrunk=True)
             for k, s in enumerate(sd)
         )
+
+    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
+        course = self.course(place, chain, cell)
+        keys = tuple(f"curve_{k + 1}" for k in range(2 * len(course.waves.frequency)))
+        return (course.function((keys,), ("rad",)),)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         course = self.course(place, arm.chain, arm.cell)
@@ -217,6 +255,30 @@ class ResidualField(DrivenEffect):
                 for k, s in enumerate(sd)
             ]
         return tuple(specs)
+
+    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
+        units = self.entry_at(place).units
+        return tuple(
+            course.function(
+                tuple(
+                    tuple(
+                        f"field_{course.name}_{c + 1}_{k + 1}"
+                        for k in range(2 * len(course.waves.frequency))
+                    )
+                    for c in range(len(units))
+                ),
+                units,
+            )
+            for course in self.courses(place, chain, cell)
+        )
+
+    def lasting(self, cell: Cell) -> Cell:
+        settings = {
+            place: {key: value for key, value in given.items() if not key.startswith("field_time_")}
+            for place, given in cell.model.nominal.settings.items()
+        }
+        nominal = replace(cell.model.nominal, settings=settings)
+        return replace(cell, model=replace(cell.model, nominal=nominal))
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         size = self.entry_at(place).size

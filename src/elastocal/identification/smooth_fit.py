@@ -1,0 +1,708 @@
+"""The fit of a model with smooth functions: all parameters together, noise judged beside them.
+
+What a model without them leaves is no noise where they are there, so that everything which noise
+decides is decided beside them: the size of each function (`smooth_prior`), which ordinary
+parameters are worth a column, the noise model, and which readings are faulty.  The last two see
+the residual of each configuration in units of what it varies by: with whitened rows, H the hat
+matrix of readings and prior, and H_c its block of a configuration,
+
+    cov(e_c) = σ² (1 − H_c)   in the fit,      σ² (1 + H_c)   of one left out,
+
+exactly under the model, the smooth functions as random as their prior says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import linalg, sparse, stats
+
+from elastocal.errors import ElastocalError, InputError, option
+from elastocal.identification.covariance import Covariance
+from elastocal.identification.intervals import LEVEL, Intervals
+from elastocal.identification.least_squares import Fit
+from elastocal.identification.noise_choice import (
+    NoiseFit,
+    estimate_noise,
+    linearised,
+    outlier_screening,
+    settle,
+    weights_of,
+)
+from elastocal.identification.noise_structure import Readings
+from elastocal.identification.options import ROBUST, Options
+from elastocal.identification.outliers import FALSE_ALARM
+from elastocal.identification.residuals import rms_3d
+from elastocal.identification.smooth_part import SmoothPart
+from elastocal.identification.smooth_prior import (
+    LinearRows,
+    Scales,
+    ShrunkPosterior,
+    ShrunkProblem,
+)
+from elastocal.identification.solve import (
+    WIDER,
+    WORTH_A_COLUMN,
+    Problem,
+    Reduction,
+    Solution,
+    choose,
+)
+from elastocal.identification.weighted_problem import (
+    Partition,
+    RFactor,
+    Span,
+    Weights,
+    evaluate,
+    in_order,
+    partition,
+    regressor,
+)
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations, subset
+from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
+from elastocal.text import listed
+from elastocal.units import Array, BoolArray, IntArray, Progress
+
+STEPS, FEW, HALVINGS = 25, 5, 8
+SETTLED = 1e-4  # of a χ²: what the last step may still gain
+ROUGH = 1e-2  # the same, where rounding allows no better step
+ROUNDING = 1e-12
+CHOICES = 3  # of the ordinary parameters, each under the sizes found with the one before
+ROUNDS = 5
+# Two readings say the same where what the fit knows of them is that correlated, and their errors
+# differ by less than this share of themselves.
+SAME_POSE, ALIKE = 0.8, 0.5
+STILL = 0.02  # relative change of the noise at which the rounds end
+ALONE = 1e-9  # share of a direction that other configurations and the prior must see
+# Logarithms of the likelihood ratio: below the first the readings do not show a function at all,
+# above the second no doubt is left that it is there.
+LEAST_GAIN, CERTAIN = 0.01, 50.0
+MOST_SET_ASIDE = 0.1
+
+
+class SmoothFit(NamedTuple):
+    """What `fit_smooth` found; `good` (N,) are the readings that the noise explains.
+
+    `parts` are the functions; `effective` says how many parameters the readings paid for,
+    `leverage` (rows,) how much each row drew the fit to itself.
+    `standard` (N, size) are the residuals of all readings as they would be without the fit's part
+    in them.
+    """
+
+    method: str
+    solution: Solution
+    intervals: Intervals
+    noise: NoiseFit | None
+    good: BoolArray
+    parts: tuple[SmoothPart, ...]
+    effective: int
+    leverage: Array
+    standard: Array
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Functions:
+    """The smooth functions that are fitted: their columns (shrunk,), in groups (shrunk,)."""
+
+    groups: tuple[SmoothGroup, ...]
+    columns: IntArray
+    group: IntArray
+    std: Array
+    nominal: Array
+
+    @classmethod
+    def of(cls, model: Model, free: IntArray) -> Functions:
+        """Those of the parameters `free`."""
+        own = [g for g in smooth_groups(model) if np.isin(g.columns, free).any()]
+        columns = [c[np.isin(c, free)] for c in (g.columns.ravel() for g in own)]
+        group = np.repeat(np.arange(len(own)), [len(c) for c in columns])
+        every = np.concatenate(columns)
+        std = np.array([model.parameters[c].typical for c in every], dtype=float)
+        return cls(tuple(own), every, group, std, model.nominal[every])
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """The minimum of readings and prior together: values x (parameters,), residual (rows,) there.
+
+    `columns` are the ordinary ones kept, then those of the functions that take part.  `free` is
+    the linear problem with all free ordinary columns.
+    """
+
+    problem: Problem
+    parts: Partition
+    functions: Functions
+    reduction: Reduction
+    x: Array
+    residual: Array
+    scales: Scales
+    posterior: ShrunkPosterior
+    free: LinearRows
+    converged: bool
+    steps: int
+
+    @property
+    def columns(self) -> IntArray:
+        own = self.functions.columns[self.posterior.own]
+        return np.concatenate([self.reduction.kept, own])
+
+    @property
+    def sigma(self) -> float:
+        """Of a whitened row."""
+        return float(np.sqrt(self.scales.variance))
+
+    def chosen(self, sizes: Array, threshold: float) -> Reduction:
+        """The ordinary parameters worth a column at another threshold."""
+        return _chosen(self.problem, sizes, self.free, self.scales, threshold)
+
+    def linear(self, scales: Scales, reduction: Reduction) -> tuple[JointFit, Array]:
+        """The posterior of other sizes and ordinary parameters, the model linearised at this x,
+        and the step (parameters,) to its minimum."""
+        posterior = _shrunk(self.problem, self.free, reduction.kept).posterior(scales)
+        other = replace(self, scales=scales, posterior=posterior, reduction=reduction)
+        return other, _moved(other, posterior)[0] - self.x
+
+
+def joint_fit(
+    problem: Problem, sizes: Array, functions: Functions, x: Array, reduction: Reduction,
+    scales: Scales | None = None, *, choosing: bool = True, sizing: bool = True,
+    most: int = STEPS,
+) -> JointFit:  # fmt: skip
+    """Gauss–Newton on readings and prior from x.
+
+    The sizes of the functions are estimated on the way, from `scales` on, unless `sizing` is
+    False; which ordinary parameters are fitted is chosen anew beside them, from `reduction` on,
+    unless `choosing` is.
+
+    Raises ElastocalError where the start has poses without equilibrium.
+    """
+    columns = np.concatenate([problem.free, functions.columns])
+    parts = partition(problem.observations, problem.weights, len(columns))
+
+    def at(x: Array) -> tuple[Array, RFactor]:
+        found = evaluate(problem.model, parts, x, columns)
+        return found.residual, found.r_factor
+
+    x = _started(problem, functions, x, reduction)
+    residual, r_factor = at(x)
+    rounds = 0 if not sizing else CHOICES if scales is None else 1
+    steps = 0
+    while True:
+        free = _from_nominal(problem, functions, x, r_factor)
+        while rounds > 0:
+            rounds -= 1
+            scales = _shrunk(problem, free, reduction.kept).scales(scales)
+            if not choosing:
+                break
+            again = _chosen(problem, sizes, free, scales)
+            if np.array_equal(again.kept, reduction.kept):
+                break
+            reduction, x = again, _started(problem, functions, x, again)
+            residual, r_factor = at(x)
+            free = _from_nominal(problem, functions, x, r_factor)
+        assert scales is not None
+        posterior = _shrunk(problem, free, reduction.kept).posterior(scales)
+        now = JointFit(
+            problem, parts, functions, reduction, x, residual, scales, posterior, free, False, steps
+        )
+        moved, gain = _moved(now, posterior)
+        if gain <= SETTLED or steps >= most:
+            return replace(now, converged=gain <= SETTLED)
+        cost = _cost(now, x, r_factor)
+        for _ in range(HALVINGS):
+            steps += 1
+            try:
+                there = at(moved)
+                if _cost(now, moved, there[1]) <= cost * (1 + ROUNDING):
+                    break
+            except ElastocalError:
+                pass  # a soft arm may have no equilibrium so far out
+            moved = (x + moved) / 2
+        else:
+            return replace(now, converged=gain <= ROUGH)
+        x, (residual, r_factor) = moved, there
+
+
+def _chosen(
+    problem: Problem, sizes: Array, free: LinearRows, scales: Scales,
+    threshold: float = WORTH_A_COLUMN,
+) -> Reduction:  # fmt: skip
+    """The ordinary parameters that are worth a column beside the functions."""
+    marginal = free.only(np.arange(len(problem.free))).posterior(scales).marginal
+    return choose(problem, sizes, marginal, float(np.sqrt(scales.variance)), threshold)
+
+
+def _shrunk(problem: Problem, free: LinearRows, kept: IntArray) -> ShrunkProblem:
+    return free.only(np.searchsorted(problem.free, kept))
+
+
+def _from_nominal(
+    problem: Problem, functions: Functions, x: Array, r_factor: RFactor
+) -> LinearRows:
+    """The linear problem whose residual is that of nominal functions."""
+    away = x[functions.columns] - functions.nominal
+    return LinearRows.of(r_factor, len(problem.free), away, functions.std, functions.group)
+
+
+def _started(problem: Problem, functions: Functions, x: Array, reduction: Reduction) -> Array:
+    """x with what is not fitted at its start, and its share moved over; other functions nominal."""
+    kept, dropped = reduction.kept, reduction.dropped
+    moved = x.copy()
+    moved[kept] += reduction.mixing @ (x[dropped] - problem.x0[dropped])
+    moved[dropped] = problem.x0[dropped]
+    out = problem.model.shrunk.copy()
+    out[functions.columns] = False
+    moved[out] = problem.x0[out]
+    return moved
+
+
+def _moved(now: JointFit, posterior: ShrunkPosterior) -> tuple[Array, float]:
+    """x at the minimum of the linear problem, and what going there gains, as a χ²."""
+    k, f = posterior.ordinary, now.functions
+    before = now.x[f.columns] - f.nominal
+    # α is a step; b counts from nominal.
+    after = np.zeros(len(f.columns))
+    after[posterior.own] = posterior.step[k:]
+    x = now.x.copy()
+    x[now.reduction.kept] += posterior.step[:k]
+    x[f.columns] = f.nominal + after
+    change = np.concatenate([posterior.step[:k], (after - before)[posterior.own]])
+    way = posterior.R @ change
+    return x, float(way @ way) / posterior.variance
+
+
+def _cost(now: JointFit, x: Array, r_factor: RFactor) -> float:
+    """Sum of squares of readings and prior at x."""
+    f, posterior = now.functions, now.posterior
+    b = (x[f.columns] - f.nominal)[posterior.own]
+    return r_factor.rss + float(np.sum((posterior.prior * b) ** 2))
+
+
+# What each configuration says beside the others: one pass over the table.
+
+
+class Crossed(NamedTuple):
+    """Of every row: the residual under a fit to the other configurations, in m or rad (infinite
+    where there is none), its leverage, and the residual free of the fit's part in it, in m or rad.
+    """
+
+    held_out: Array
+    leverage: Array
+    standard: Array
+
+
+def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
+    """The configurations of the fit, left out one by one in closed form.
+
+    `step` (parameters,) leads from the fit's x to the minimum of the model linearised there,
+    where x itself is none.
+    """
+    observed = fit.problem.observations
+    found = Crossed(*(np.empty(len(observed.value)) for _ in range(3)))
+    R, columns = fit.posterior.R, fit.columns
+    spans = [(group[0][0], group[-1][1]) for group in fit.parts.groups]
+
+    def one(span: Span) -> None:
+        part = fit.parts.part(span)
+        at = regressor(fit.problem.model, part, fit.x, columns)
+        residual = at.residual
+        if step is not None:
+            by = np.flatnonzero(step)
+            residual = residual - regressor(fit.problem.model, part, fit.x, by).B @ step[by]
+        e, Q = part.weights.apply(residual), _triangular(R, part.weights.apply(at.B))
+        standard, growth = np.empty(len(e)), np.empty(len(e))
+        lost = np.zeros(len(e), dtype=bool)
+        rows_of = np.repeat(part.observations.configuration, observed.size)
+        for rows in _same_size(rows_of):
+            Qc, ec = Q[rows], e[rows]
+            gap = np.eye(rows.shape[1]) - Qc @ Qc.transpose(0, 2, 1)
+            values, vectors = np.linalg.eigh(gap)
+            known = np.maximum(values, ALONE)
+            turned = (vectors.transpose(0, 2, 1) @ ec[..., None])[..., 0]
+            standard[rows] = (vectors @ (turned / np.sqrt(known))[..., None])[..., 0]
+            growth[rows] = (vectors @ (turned / known)[..., None])[..., 0]
+            lost[rows[values[:, 0] < ALONE]] = True
+        # In the fit to the others the whitened residual is (1 − H_c)⁻¹ e_c.
+        held = _unwhitened(part.weights, growth)
+        held[lost] = np.inf
+        found.held_out[part.rows] = held
+        found.leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
+        found.standard[part.rows] = _unwhitened(part.weights, standard)
+
+    for _ in in_order(spans, one):
+        pass
+    return found
+
+
+def left_out(fit: JointFit, observed: Observations, weights: Weights) -> tuple[Array, Array]:
+    """Residuals (rows,) of observations that had no part in the fit, in m or rad, free of the
+    fit's uncertainty; and Q (rows, columns), QQᵀ the covariance of their predictions over σ²."""
+    columns, R = fit.columns, fit.posterior.R
+    parts = partition(observed, weights, len(columns))
+    standard, every = np.empty(len(observed.value)), np.empty((len(observed.value), len(columns)))
+
+    def one(span: Span) -> None:
+        part = parts.part(span)
+        at = regressor(fit.problem.model, part, fit.x, columns)
+        size = observed.size
+        Q = _triangular(R, part.weights.apply(at.B))
+        every[part.rows] = Q
+        Q = Q.reshape(-1, size, len(columns))
+        e = part.weights.apply(at.residual).reshape(-1, size, 1)
+        values, vectors = np.linalg.eigh(np.eye(size) + Q @ Q.transpose(0, 2, 1))
+        turned = vectors.transpose(0, 2, 1) @ e
+        own = vectors @ (turned / np.sqrt(values)[..., None])
+        standard[part.rows] = _unwhitened(part.weights, own.ravel())
+
+    for _ in in_order(parts.spans, one):
+        pass
+    return standard, every
+
+
+def _triangular(R: Array, B: Array) -> Array:
+    """B R⁻¹."""
+    solved = linalg.solve_triangular(R, B.T, trans="T", check_finite=False)
+    return np.ascontiguousarray(solved.T)
+
+
+def _unwhitened(weights: Weights, e: Array) -> Array:
+    if weights.whiten is None:
+        return e
+    return np.asarray(sparse.linalg.spsolve(weights.whiten.tocsc(), e))
+
+
+def _same_size(codes: IntArray) -> Iterator[IntArray]:
+    """Rows (groups, k) of groups with the same code, by their number k of rows."""
+    order = np.argsort(codes, kind="stable")
+    _, starts, counts = np.unique(codes[order], return_index=True, return_counts=True)
+    for count in np.unique(counts):
+        yield order[starts[counts == count][:, None] + np.arange(count)]
+
+
+# The course: fit, noise and faulty readings in turn, then what else may change.
+
+
+def fit_smooth(
+    every: Solution, sound: Solution, faulty: BoolArray, free: IntArray, options: Options,
+    progress: Progress,
+) -> SmoothFit:  # fmt: skip
+    """All free parameters fitted together, from fits of the ordinary ones alone.
+
+    `every` holds all observations, `sound` the fit to those that are not `faulty` (N,); both know
+    nothing of the smooth functions, whose parameters are among `free`.
+
+    Raises InputError for methods and intervals that take no prior.
+    """
+    _check_options(options)
+    functions = Functions.of(every.problem.model, free)
+    progress("fitting smooth functions")
+    search = _Course(every, sound, functions, options, progress)
+    fit, noise, good = search.settled(~faulty)
+    fit = search.bounded(fit)
+    fit, cross = search.wider(fit)
+    fit, cross = search.without_those_that_harm(fit, cross)
+    return search.result(fit, cross, noise, good)
+
+
+def _check_options(options: Options) -> None:
+    if options.resolved in ROBUST or options.resolved.startswith("eq14"):
+        raise InputError(
+            f"the method {options.resolved} takes no prior, which smooth functions have; use the "
+            "default method, which sets faulty readings apart"
+        )
+    if options.intervals not in ("auto", "classical"):
+        raise InputError(
+            f"{option('intervals', options.intervals)} knows of no prior, which smooth functions "
+            "have; leave it away"
+        )
+
+
+class _Course:
+    """The fits of one identification, and what they have in common."""
+
+    def __init__(
+        self, every: Solution, sound: Solution, functions: Functions, options: Options,
+        progress: Progress,
+    ) -> None:  # fmt: skip
+        self.every, self.sound, self.options = every, sound, options
+        self.functions, self.progress = functions, progress
+        self.model, self.observed = every.problem.model, every.problem.observations
+        self.harmful: list[str] = []
+        self.estimating = options.resolved == "reml" and not every.problem.large
+        # Labels of each reading, and one column that no residual follows: they have paid for the
+        # parameters already.
+        bare = linearised(self.model, self.observed, every.fit.x, np.zeros(0, dtype=np.int64))
+        column = np.random.default_rng(0).normal(size=(*bare.e.shape, 1))
+        self.readings: Readings = replace(bare, B=column)
+        self.standard = np.zeros(bare.e.shape)
+
+    def problem_of(self, good: BoolArray, weights: Weights) -> Problem:
+        observed = self.observed if good.all() else subset(self.observed, good)
+        return replace(self.sound.problem, observations=observed, weights=weights)
+
+    def weights(self, noise: NoiseFit | None, good: BoolArray) -> Weights:
+        """Of the good readings; without an estimated noise those that the problem has."""
+        if noise is not None:
+            return weights_of(noise, self.readings.take(good))
+        whiten = self.every.problem.weights
+        if whiten.whiten is None or good.all():
+            return whiten
+        rows = np.flatnonzero(np.repeat(good, self.observed.size))
+        return replace(whiten, whiten=sparse.csr_array(whiten.whiten[rows][:, rows]))
+
+    def settled(self, good: BoolArray) -> tuple[JointFit, NoiseFit | None, BoolArray]:
+        """Fit, noise and good readings that agree with each other."""
+        noise: NoiseFit | None = None
+        judged, fitted = good, good if self.set_aside(~good) else np.ones_like(good)
+        x, reduction, scales = self.sound.fit.x, self.sound.reduction, None
+        level = np.inf
+        for k in range(ROUNDS):
+            problem = self.problem_of(fitted, self.weights(noise, fitted))
+            fit = joint_fit(problem, self.every.sizes, self.functions, x, reduction, scales)
+            x, reduction, scales = fit.x, fit.reduction, fit.scales
+            still, level = abs(scales.variance - level) < STILL, scales.variance
+            self.standard = self._standard(fit, noise, fitted)
+            before, kind = judged, None if noise is None else noise.kind
+            noise, judged = self.judged(noise, judged, first=k == 0)
+            judged = self.corroborated(fit, noise, judged)
+            after = judged if self.set_aside(~judged) else np.ones_like(good)
+            same = noise is None or (still and noise.kind == kind)
+            if same and np.array_equal(after, fitted) and np.array_equal(before, judged):
+                break
+            fitted = after
+            if noise is not None:
+                self.progress(f"fitting with the noise found ({noise.kind})")
+        return fit, noise, judged
+
+    def _standard(self, fit: JointFit, noise: NoiseFit | None, fitted: BoolArray) -> Array:
+        """Residuals (N, size) of all readings, free of the fit's part in them."""
+        found = np.empty(self.standard.shape)
+        shape = (-1, self.observed.size)
+        found[fitted] = crossed(fit).standard.reshape(shape)
+        if not fitted.all():
+            rest = subset(self.observed, ~fitted)
+            apart = left_out(fit, rest, self.weights(noise, ~fitted))[0]
+            found[~fitted] = apart.reshape(shape)
+        return found
+
+    def judged(
+        self, noise: NoiseFit | None, good: BoolArray, first: bool
+    ) -> tuple[NoiseFit | None, BoolArray]:
+        """The noise of the standardised residuals, and which readings it explains."""
+        if not self.estimating:
+            e = self.every.problem.weights.apply(self.standard.ravel())
+            squared = (e.reshape(self.standard.shape) ** 2).sum(axis=1)
+            n, size = self.standard.shape
+            s2 = squared[good].mean() / size
+            dof = max(int(good.sum()) * size, 1)
+            return None, squared <= size * s2 * stats.f.isf(FALSE_ALARM / n, size, dof)
+        readings = self.readings.moved(self.standard)
+        if first:
+            good = outlier_screening(readings, readings.e, good)
+        kind = self.options.noise
+        found, good = settle(readings, kind, good)
+        if noise is not None and found.kind != noise.kind and kind == "auto":
+            # Two models that take turns are alike: the first one stays.
+            tried = {t.kind: t.criterion for t in found.trials}
+            if noise.kind in tried and tried[noise.kind] - tried[found.kind] < 2.0:
+                found = estimate_noise(readings.take(good), noise.kind, noise)
+        return found, good
+
+    def corroborated(self, fit: JointFit, noise: NoiseFit | None, good: BoolArray) -> BoolArray:
+        """The good readings (N,) and those of which another configuration says the same.
+
+        Two readings at nearly the same pose that err alike, beside a fit without them, are no
+        errors of reading: the model lacks something there, and what it has corrects part of it.
+        """
+        suspects = np.flatnonzero(~good)
+        if len(suspects) < 2 or not self.set_aside(~good):
+            return good
+        problem = self.problem_of(good, self.weights(noise, good))
+        scales = replace(fit.scales, variance=1.0) if noise is not None else fit.scales
+        try:
+            without = joint_fit(
+                problem, self.every.sizes, self.functions, fit.x, fit.reduction, scales,
+                choosing=False, sizing=False, most=FEW,
+            )  # fmt: skip
+        except (ElastocalError, np.linalg.LinAlgError):
+            return good
+        rest = subset(self.observed, ~good)
+        e, Q = left_out(without, rest, self.weights(noise, ~good))
+        e = e.reshape(len(suspects), -1)
+        Q = Q.reshape(len(suspects), -1)
+        Q = Q / np.linalg.norm(Q, axis=1, keepdims=True)
+        length = np.linalg.norm(e, axis=1)
+        apart = np.linalg.norm(e[:, None] - e[None], axis=2)
+        alike = (Q @ Q.T > SAME_POSE) & (apart < ALIKE * np.minimum.outer(length, length))
+        alike &= rest.configuration[:, None] != rest.configuration[None]
+        found = good.copy()
+        found[suspects[alike.any(axis=1)]] = True
+        return found
+
+    def set_aside(self, faulty: BoolArray) -> bool:
+        if self.options.faulty == "auto":
+            return bool(0 < faulty.mean() <= MOST_SET_ASIDE)
+        return self.options.faulty == "drop" and bool(faulty.any())
+
+    def bounded(self, fit: JointFit) -> JointFit:
+        """With ordinary parameters beyond a bound held there, where bounds are asked for."""
+        if not self.options.bounded:
+            return fit
+        for _ in range(3):
+            kept = fit.reduction.kept
+            own = [self.model.parameters[c] for c in kept]
+            low, high = (np.array([getattr(p, s) for p in own]) for s in ("lower", "upper"))
+            at = (fit.x[kept] < low) | (fit.x[kept] > high)
+            if not at.any():
+                break
+            x = fit.x.copy()
+            x[kept] = np.clip(x[kept], low, high)
+            r = fit.reduction
+            inner = replace(
+                r, kept=kept[~at], mixing=r.mixing[~at],
+                at_bound=np.concatenate([r.at_bound, kept[at]]),
+            )  # fmt: skip
+            fit = joint_fit(
+                fit.problem, self.every.sizes, fit.functions, x, inner, fit.scales, held=True
+            )
+        return fit
+
+    def wider(self, fit: JointFit) -> tuple[JointFit, Crossed]:
+        """A wider set of ordinary parameters where it predicts held-out configurations better."""
+        cross = crossed(fit)
+        if fit.reduction.at_bound.size:
+            return fit, cross
+        self.progress("comparing with wider sets")
+        size = self.observed.size
+        tried = len(fit.reduction.kept)
+        for threshold in WIDER:
+            wide = fit.chosen(self.every.sizes, threshold)
+            if len(wide.kept) <= tried:
+                continue
+            tried = len(wide.kept)
+            there = crossed(*fit.linear(fit.scales, wide))
+            if rms_3d(there.held_out, size) >= rms_3d(cross.held_out, size):
+                continue
+            try:
+                other = joint_fit(
+                    fit.problem, self.every.sizes, fit.functions, fit.x, wide, fit.scales,
+                    choosing=False, sizing=False, most=FEW,
+                )  # fmt: skip
+                there = crossed(other)
+            except (ElastocalError, np.linalg.LinAlgError, ValueError):
+                continue  # along an undetermined direction it may leave every valid arm
+            if other.converged and rms_3d(there.held_out, size) < rms_3d(cross.held_out, size):
+                fit, cross = other, there
+        return fit, cross
+
+    def without_those_that_harm(self, fit: JointFit, cross: Crossed) -> tuple[JointFit, Crossed]:
+        """Without the functions that the readings do not show, or that predict held-out
+        configurations worse than none; the least supported is tried first."""
+        size, alive = self.observed.size, fit.scales.scale > 0
+        for g in np.argsort(fit.scales.gain):
+            if not alive[g] or fit.scales.gain[g] > CERTAIN:
+                continue
+            scale = np.where(alive, fit.scales.scale, 0.0)
+            scale[g] = 0.0
+            trial, step = fit.linear(replace(fit.scales, scale=scale), fit.reduction)
+            there = crossed(trial, step)
+            shown = fit.scales.gain[g] > LEAST_GAIN
+            if shown and rms_3d(there.held_out, size) > rms_3d(cross.held_out, size):
+                continue
+            if shown:
+                self.harmful.append(self.functions.groups[g].name)
+            alive[g], cross = False, there
+            fit = replace(
+                fit, scales=replace(fit.scales, scale=np.where(alive, fit.scales.scale, 0.0))
+            )
+        if (fit.scales.scale > 0).all():
+            return fit, cross
+        fit = joint_fit(
+            fit.problem, self.every.sizes, self.functions, fit.x, fit.reduction,
+            fit.scales, choosing=False,
+        )  # fmt: skip
+        return fit, crossed(fit)
+
+    def result(
+        self, fit: JointFit, cross: Crossed, noise: NoiseFit | None, good: BoolArray
+    ) -> SmoothFit:
+        """The parts of a solution."""
+        posterior, k = fit.posterior, fit.posterior.ordinary
+        columns, effective = fit.columns, round(posterior.effective)
+        whitened = fit.problem.weights.apply(fit.residual)
+        found = Fit(
+            fit.x, fit.residual, whitened, posterior.marginal, fit.converged,
+            "the sum of squares no longer fell" if fit.converged
+            else "the step limit was reached; the start may be far off", fit.steps,
+            fit.problem.fit_of(columns, fit.x, self.every.sizes),
+        )  # fmt: skip
+        r = fit.reduction
+        mixing = np.zeros((len(columns), len(r.dropped)))
+        mixing[:k] = r.mixing
+        solution = replace(
+            self.sound, problem=fit.problem, fit=found, heldout=cross.held_out,
+            reduction=replace(r, kept=columns, mixing=mixing),
+            nominal_rms=self.every.nominal_rms,
+        )  # fmt: skip
+        rows = len(whitened)
+        spare = max(rows - posterior.effective, 1.0)
+        # The noise's variance is known as well as the readings that the fit has left over say.
+        dof = spare / np.maximum(1 - posterior.prior_share, 1e-3) ** 2
+        dof[:k] = spare
+        matrix = posterior.variance * posterior.cofactor
+        text = (
+            "of readings and smooth functions together, the functions as random as their sizes "
+            "say; assumes the noise model and normal noise"
+        )
+        covariance = Covariance("posterior", (matrix + matrix.T) / 2, dof, text)
+        intervals = Intervals(covariance, covariance.interval(fit.x[columns], LEVEL))
+        method = self.options.resolved
+        if not self.estimating:
+            method = "ols" if fit.problem.weights.kind == "none" else "wls"
+        return SmoothFit(
+            method, solution, intervals, noise, good, self._parts(fit, covariance.matrix),
+            effective, cross.leverage, self.standard, self._warnings(fit),
+        )  # fmt: skip
+
+    def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
+        f, k = fit.functions, fit.posterior.ordinary
+        whole = np.zeros((len(f.columns), len(f.columns)))
+        own = fit.posterior.own
+        whole[np.ix_(own, own)] = covariance[k:, k:]
+        paid = np.zeros(len(f.columns))
+        paid[own] = fit.posterior.effective_of
+        found = []
+        for g, group in enumerate(f.groups):
+            mine = np.flatnonzero(f.group == g)
+            value = np.where(np.isin(group.columns, f.columns), fit.x[group.columns], 0.0)
+            at = np.full(group.columns.size, -1)
+            at[np.isin(group.columns.ravel(), f.columns)] = mine
+            matrix = np.zeros((at.size, at.size))
+            there = np.flatnonzero(at >= 0)
+            matrix[np.ix_(there, there)] = whole[np.ix_(mine, mine)]
+            scale = float(fit.scales.scale[g])
+            found.append(SmoothPart(group, scale, float(paid[mine].sum()), value, matrix))
+        return tuple(found)
+
+    def _warnings(self, fit: JointFit) -> tuple[str, ...]:
+        told = []
+        gone = [
+            g.name for g, s in zip(self.functions.groups, fit.scales.scale, strict=True) if s == 0
+        ]
+        unseen = [name for name in gone if name not in self.harmful]
+        if unseen:
+            told.append(
+                f"The readings show nothing of the {listed(unseen, 6)}: held at zero. Leave "
+                f"{'it' if len(unseen) == 1 else 'them'} out of [model] effects."
+            )
+        if self.harmful:
+            told.append(
+                f"Poses that were not fitted are predicted better without the "
+                f"{listed(self.harmful, 6)}: held at zero."
+            )
+        return tuple(told)

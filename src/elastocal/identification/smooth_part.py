@@ -1,0 +1,119 @@
+"""What an identification says of a smooth function: its size, how sure, and its course."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from elastocal.identification.covariance import t_quantile
+from elastocal.model.smooth_groups import SmoothGroup
+from elastocal.units import Array
+
+GRID = 200
+DRAWS = 400
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class SmoothPart:
+    """A smooth function as it was fitted.
+
+    Attributes:
+        group: Its parameters and what it follows.
+        scale: By how much the variance of its coefficients is larger than the prior that the cell
+            states; 0 where it was left out.
+        effective: How many coefficients' worth of it the readings determine.
+        value: Coefficients (components, waves).
+        covariance: Theirs, (components · waves, components · waves).
+    """
+
+    group: SmoothGroup
+    scale: float
+    effective: float
+    value: Array
+    covariance: Array
+
+    @property
+    def coefficients(self) -> int:
+        """How many parameters it has."""
+        return int(self.value.size)
+
+    def course(self, x: Array) -> tuple[Array, Array]:
+        """Values and half widths of their 95 % band (components, n) at x (n,); NaN where the
+        parameters are no function of one quantity."""
+        if self.group.basis is None:
+            nothing = np.full((len(self.value), len(x)), np.nan)
+            return nothing, nothing
+        return self._course(self.group.basis(x))
+
+    def shape(self, x: Array) -> tuple[Array, Array]:
+        """The same of what is left of the function without its mean over x, which offsets and
+        lengths of the arm can stand for."""
+        if self.group.basis is None:
+            return self.course(x)
+        waves = self.group.basis(x)
+        return self._course(waves - waves.mean(axis=0))
+
+    def _course(self, waves: Array) -> tuple[Array, Array]:
+        k = self.value.shape[1]
+        half = float(t_quantile(LEVEL, np.array(np.inf)))
+        width = [
+            np.sqrt(np.maximum(((waves @ self._block(c, k)) * waves).sum(axis=1), 0.0))
+            for c in range(len(self.value))
+        ]
+        return self.value @ waves.T, half * np.array(width)
+
+    def _block(self, c: int, k: int) -> Array:
+        return self.covariance[c * k : (c + 1) * k, c * k : (c + 1) * k]
+
+    @cached_property
+    def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
+        """By unit: rms of the function less its mean, over all components and its range, the 95 %
+        interval of that, and the rms half width of the 95 % band."""
+        basis = self.group.basis
+        found = {}
+        for unit in dict.fromkeys(self.group.units):
+            own = [c for c, u in enumerate(self.group.units) if u == unit]
+            if basis is None:
+                waves = np.eye(self.value.shape[1]) * np.sqrt(self.value.shape[1])
+            else:
+                waves = basis(self.group.grid(GRID))
+                waves = waves - waves.mean(axis=0)
+            mean = self.value[own] @ waves.T
+            rng = np.random.default_rng(0)
+            k = waves.shape[1]
+            total, spread = np.zeros(DRAWS), 0.0
+            for c, m in zip(own, mean, strict=True):
+                drawn = rng.normal(size=(DRAWS, k)) @ _root(self._block(c, k)).T @ waves.T
+                total += ((m + drawn) ** 2).mean(axis=1) * (len(m) if basis is None else 1)
+                spread += float(((waves @ self._block(c, k)) * waves).sum(axis=1).mean())
+            rms = np.sqrt(total / (1 if basis is None else len(own)))
+            low, high = np.quantile(rms, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+            half = float(t_quantile(LEVEL, np.array(np.inf))) * np.sqrt(spread / len(own))
+            found[unit] = (float(np.median(rms)), (float(low), float(high)), float(half))
+        return found
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """An entry for each unit that the function has, in SI."""
+        g = self.group
+        return [
+            {
+                "effect": g.effect, "where": g.where, "follows": g.follows or None, "unit": unit,
+                "size": g.size, "length": _finite(g.length), "low": _finite(g.low),
+                "high": _finite(g.high), "scale": self.scale, "coefficients": self.coefficients,
+                "effective": self.effective, "rms": rms, "rms_ci95": list(ci95), "band95": half,
+            }
+            for unit, (rms, ci95, half) in self.sizes.items()
+        ]  # fmt: skip
+
+
+def _root(covariance: Array) -> Array:
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
