@@ -14,17 +14,19 @@ import argparse
 import json
 import shutil
 import tempfile
+import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from diagnose_many import run
 from whole_draw import WholeRecipe
-from whole_oracle import Sights, gap_of, oracle_error
-from whole_score import score_parts
+from whole_world import judged, over_oracle
 from world_files import write_world
 
 HEAD = (
-    f"{'world':>5} {'arm':<10} {'noise':>5} {'told':<5} {'geometry':>8} {'tool':>7} {'oracle':>7} "
+    f"{'world':>5} {'arm':<10} {'noise':>5} {'told':<5} {'geometry':>8} {'tool':>8} {'oracle':>8} "
     f"{'ratio':>6} {'geo/or':>6} {'s':>6}  verdict; shares held, wrong names, missed; named"
 )
 
@@ -59,46 +61,38 @@ def one_world(recipe: WholeRecipe, folder: Path) -> tuple[str, float]:
     world = recipe.draw()
     observed, sealed = folder / "seen", folder / "sealed"
     write_world(world, observed, sealed)
-    sights = Sights.of(world)
-    oracle = 1e3 * oracle_error(sights)
-    options = ["-o", "diagnosis.json", "--cell-out", "extended.toml"]
-    done = run(str(observed), ["diagnose", "cell.toml", "data.csv", *options])
-    shutil.copyfile(sealed / "fresh.csv", observed / "new.csv")
-    geometry = test_error(observed, "cell.toml")
-    tool, answer = float("nan"), None
-    if done["exit"] == 0:
+
+    def command(*arguments: str) -> int:
+        done = run(str(observed), list(arguments))
+        if done["exit"] != 0:
+            print(f"      {arguments[0]}: {str(done['message']).strip()[-300:]}", flush=True)
+        return int(str(done["exit"]))
+
+    start, answer = time.perf_counter(), None
+    options = ("-o", "diagnosis.json", "--cell-out", "extended.toml")
+    if command("diagnose", "cell.toml", "data.csv", *options) == 0:
         answer = json.loads((observed / "diagnosis.json").read_text(encoding="utf-8"))
-        tool = test_error(observed, "extended.toml")
+    seconds = time.perf_counter() - start
+    whole = judged(world, observed, sealed / "fresh.csv", command, answer, "extended.toml")
+    (folder / "judged.json").write_text(json.dumps(whole, indent=2), encoding="utf-8")
+    errors = [whole[key] or np.nan for key in ("geometry_mm", "tool_mm", "oracle_mm")]
     told = "came" if world.told.approach else "-"
-    line = (
-        f"{world.spec.name:<10} {1e6 * world.noise.level:5.0f} {told:<5} "
-        f"{geometry:8.4f} {tool:7.4f} {oracle:7.4f} {tool / oracle:6.2f} "
-        f"{geometry / oracle:6.1f} {done['seconds']:6.1f}  "
+    line = f"{world.spec.name:<10} {1e6 * world.noise.level:5.0f} {told:<5} " + " ".join(
+        f"{e:8.4f}" for e in errors
     )
-    return line + said(answer, str(done["message"]), sights), tool / oracle
+    ratio = over_oracle(whole)
+    line += f" {ratio:6.2f} {over_oracle(whole, 'geometry_mm'):6.1f} {seconds:6.1f}"
+    return f"{line}  {said(answer, whole)}", ratio
 
 
-def said(answer: dict | None, message: str, sights: Sights) -> str:
+def said(answer: Mapping[str, Any] | None, whole: Mapping[str, Any]) -> str:
     """What is claimed, and how right that is."""
     if answer is None:
-        return "failed: " + message.strip().splitlines()[-1][:120]
-    scored = score_parts(gap_of(sights), answer)
+        return "failed"
     names = ", ".join(f"{e['effect']}:{e['where']}" for e in answer["effects"])
-    held = f"{sum(p.held for p in scored.shares)}/{len(scored.shares)}"
-    wrong = f"{sum(not right for _, right in scored.names)}/{len(scored.names)}"
-    return f"{answer['verdict']}; {held}, {wrong}, {len(scored.missed)}; {names or 'nothing'}"
-
-
-def test_error(folder: Path, cell: str) -> float:
-    """Rms error in mm of `identify CELL data.csv --test new.csv`; nan where it fails."""
-    done = run(
-        str(folder), ["identify", cell, "data.csv", "--test", "new.csv", "-o", "result.json"]
-    )
-    if done["exit"] != 0:
-        print(f"      identify {cell}: {str(done['message']).strip()[-300:]}", flush=True)
-        return float("nan")
-    result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    return float(result["test"]["rms_um"]) / 1e3
+    held = f"{sum(s['held'] for s in whole['shares'])}/{len(whole['shares'])}"
+    wrong = f"{sum(not n['right'] for n in whole['names'])}/{len(whole['names'])}"
+    return f"{answer['verdict']}; {held}, {wrong}, {len(whole['missed'])}; {names or 'nothing'}"
 
 
 if __name__ == "__main__":

@@ -82,15 +82,14 @@ def draw_whole(
     arm: str | None = None,
 ) -> World:
     """A whole arm measured unloaded and loaded at `poses` poses, in the order of its times; joints
-    come from the pose before.  `approach`: whether the readings state from which side."""
+    come from the pose before.  `approach`: whether the readings state from which side.  The same
+    arm for any number of poses."""
     rng = np.random.default_rng((*seed, 0))
     drawn = list(ARMS)[rng.integers(len(ARMS))]
     spec = ARMS[drawn if arm is None else arm]
     specimen = draw_specimen(spec, rng)
     true = specimen.true
     J = spec.skeleton.n_joints
-    plan: Plan = "interleaved" if rng.random() < 0.5 else "blocks"
-    visits = draw_visits(spec, draw_poses(spec, poses, rng), plan, True, rng)
     distance = float(np.linalg.norm(specimen.base_position))
     noise = draw_noise("as_modelled", J, distance, rng, log_uniform(RANGES.noise, rng))
     scatter = np.array([log_uniform(RANGES.scatter, rng) for _ in range(J)]) * spec.gear
@@ -100,6 +99,8 @@ def draw_whole(
         _weights(spec, rng),
         _creep(rng),
     ]
+    plan: Plan = "interleaved" if rng.random() < 0.5 else "blocks"
+    visits = draw_visits(spec, draw_poses(spec, poses, rng), plan, True, rng)
     bare = replace(true, skeleton=_weightless(true.skeleton))
     return World(
         name, tuple(seed), spec, replace(specimen, true=bare), tuple(effects), np.zeros(0),

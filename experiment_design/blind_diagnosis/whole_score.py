@@ -53,12 +53,26 @@ class Share:
 
 
 @dataclass(frozen=True)
+class Name:
+    """What is claimed to be there, "name:where", the true share of its kind at that place, and
+    whether an arm of this kind has such a thing at all."""
+
+    name: str
+    true: float
+    known: bool
+
+    @property
+    def right(self) -> bool:
+        return self.known and self.true >= ABSENT_BELOW
+
+
+@dataclass(frozen=True)
 class Scored:
-    """shares: of every part that is stated with one; names: what is claimed to be there, and
-    whether it is; missed: parts above SMALL of the gap that no component stands for."""
+    """shares: of every part that is stated with one; names: what is claimed to be there; missed:
+    parts above SMALL of the gap that no component stands for."""
 
     shares: tuple[Share, ...]
-    names: tuple[tuple[str, bool], ...]
+    names: tuple[Name, ...]
     missed: tuple[str, ...]
 
 
@@ -69,7 +83,10 @@ def score_parts(gap: Gap, answer: Json) -> Scored:
         own = [c for c in found if "share_ci90" in c and c.get("share") is not None]
         if own:
             shares.append(_share(kind, where, own, true_share(gap, (kind, where))))
-    names = [(name, _is_there(gap, name, part)) for name, part in named_parts(answer, stated)]
+    names = [
+        Name(name, true_share(gap, part), name.partition(":")[0] not in ABSENT)
+        for name, part in named_parts(answer, stated)
+    ]
     covered = [p for key in stated for p in matching(gap, key)]
     missed = [
         f"{family}:{where}"
@@ -102,10 +119,6 @@ def named_parts(answer: Json, stated: Mapping[Part, Sequence[Json]]) -> list[tup
         if e["effect"] not in NAMELESS and name not in [n for n, _ in out]:
             out.append((name, part))
     return out
-
-
-def _is_there(gap: Gap, name: str, part: Part) -> bool:
-    return name.partition(":")[0] not in ABSENT and true_share(gap, part) >= ABSENT_BELOW
 
 
 def kind_of(family: str) -> str:
