@@ -5,7 +5,8 @@
 Rms errors at 200 new poses and loads, in mm: of the cell's own model, of what `diagnose --cell-out`
 added, both by `identify --test`; of the oracle; their ratio, what is claimed and how long it took.
 With `--keep FOLDER` cell, readings and answers stay there, with the truth; `--first K` begins with
-world K.  Blindness is the study's matter: here all runs in one process.
+world K; `--search` also shows an oracle who has to search for the orders (`whole_search.py`).
+Blindness is the study's matter: here all runs in one process.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from typing import Any
 import numpy as np
 from diagnose_many import run
 from whole_draw import WholeRecipe
+from whole_oracle import Sights, oracle_error
+from whole_search import searched, true_orders
 from whole_world import judged, over_oracle
 from world_files import write_world
 
@@ -38,6 +41,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--poses", type=int, default=60)
     parser.add_argument("--keep", type=Path)
+    parser.add_argument("--search", action="store_true")
     asked = parser.parse_args()
     print(HEAD, flush=True)
     ratios = []
@@ -46,6 +50,8 @@ def main() -> None:
         folder = Path(tempfile.mkdtemp()) if asked.keep is None else asked.keep / recipe.name
         try:
             line, ratio = one_world(recipe, folder)
+            if asked.search:
+                line += f"\n      {search_line(recipe)}"
         finally:
             if asked.keep is None:
                 shutil.rmtree(folder)
@@ -83,6 +89,15 @@ def one_world(recipe: WholeRecipe, folder: Path) -> tuple[str, float]:
     ratio = over_oracle(whole)
     line += f" {ratio:6.2f} {over_oracle(whole, 'geometry_mm'):6.1f} {seconds:6.1f}"
     return f"{line}  {said(answer, whole)}", ratio
+
+
+def search_line(recipe: WholeRecipe) -> str:
+    """What is left of the oracle where it has to search for orders, and which it finds."""
+    sights = Sights.of(recipe.draw())
+    error, found = searched(sights)
+    true = true_orders(sights)
+    orders = ", ".join(f"{j + 1}: {found.get(j, 0):.2f} ({true[j]:.2f})" for j in sorted(true))
+    return f"searching for orders: {error / oracle_error(sights):.2f} of the oracle's; {orders}"
 
 
 def said(answer: Mapping[str, Any] | None, whole: Mapping[str, Any]) -> str:

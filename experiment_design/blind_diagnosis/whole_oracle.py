@@ -32,12 +32,14 @@ SMALLEST = 1e-10  # of the creep's largest variance: what is below is left out
 @dataclass(frozen=True)
 class Block:
     """Parameters of one kind: columns at the campaign and elsewhere, (n, K, p) each; standard
-    deviation (p,) of the prior, and how far the truth (p,) is from its mean."""
+    deviation (p,) of the prior, and how far the truth (p,) is from its mean.  `line` is the name
+    of a gear's line."""
 
     here: Array
     there: Array
     deviation: Array
     away: Array
+    line: str = ""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def second_moment(bounds: tuple[float, float]) -> float:
 
 def oracle_error(sights: Sights) -> float:
     """Rms length (m) of the oracle's errors at the other poses."""
-    blocks = [*geometry(sights), *_effects(sights)]
+    blocks = [*geometry(sights), *effects(sights)]
     X, other = (
         np.concatenate([getattr(b, side) * b.deviation for b in blocks], axis=2)
         for side in ("here", "there")
@@ -74,21 +76,21 @@ def oracle_error(sights: Sights) -> float:
     world = sights.world
     truth = world.noise_free(world.visits)
     r = (world.readings() - truth).reshape(len(truth), -1)
-    white = _whitening(sights, truth)
+    white = whitening(sights, truth)
     X, r = white @ X, np.einsum("nij,nj->ni", white, r)
     X = X.reshape(-1, X.shape[2])
     # In units of the priors: |r − X u|² + |u + away|².
     gram = X.T @ X + np.eye(X.shape[1])
     u = np.linalg.solve(gram, X.T @ r.ravel() - away)
-    return _length(other @ u)
+    return rms_length(other @ u)
 
 
-def _length(error: Array) -> float:
+def rms_length(error: Array) -> float:
     """Rms length of the markers' errors (…,) whose last 3 M coordinates are those of a visit."""
     return float(np.sqrt((error.reshape(-1, 3) ** 2).sum(axis=1).mean()))
 
 
-def _whitening(sights: Sights, points: Array) -> Array:
+def whitening(sights: Sights, points: Array) -> Array:
     """W (n, K, K) with Wᵀ W the inverse covariance of a visit's K coordinates."""
     noise, joint = sights.world.noise, sights.at_here.joint
     K = joint.shape[1]
@@ -125,7 +127,8 @@ def geometry(sights: Sights) -> Iterator[Block]:
     yield Block(*columns, COMPLIANCE_SPREAD / np.sqrt(3) * k, true.compliance - k)
 
 
-def _effects(sights: Sights) -> Iterator[Block]:
+def effects(sights: Sights) -> Iterator[Block]:
+    """What is wrong beside geometry and compliances, by the laws that it has."""
     world = sights.world
     spec, true = world.spec, world.specimen.true
     sides = ((sights.here, sights.at_here), (sights.there, sights.at_there))
@@ -140,9 +143,9 @@ def _effects(sights: Sights) -> Iterator[Block]:
                     at.joint[:, :, e.index, None] * wave[:, None]
                     for (_, at), wave in zip(sides, waves, strict=True)
                 ]
-                size = spec.gear * _line_deviation(line)
+                size = spec.gear * line_deviation(line)
                 truth = e.vector(f"{line}_sin", f"{line}_cos")
-                yield Block(*columns, np.full(2, size), truth)
+                yield Block(*columns, np.full(2, size), truth, line)
         elif e.name == LAST_MOVE:
             columns = [at.joint[:, :, [e.index]] * v.approach[:, None, [e.index]]
                        for v, at in sides]  # fmt: skip
@@ -158,7 +161,7 @@ def _effects(sights: Sights) -> Iterator[Block]:
             yield _creep(sights, e)
 
 
-def _line_deviation(line: str) -> float:
+def line_deviation(line: str) -> float:
     """Standard deviation of the sine of a heavy arm's line: half of the mean squared amplitude."""
     if line == "eccentricity":
         return float(np.sqrt(second_moment(RANGES.eccentricity) / 2))
@@ -230,7 +233,7 @@ def geometry_error(sights: Sights) -> float:
     there = world.noise_free(sights.there) - bare.noise_free(sights.there)
     X, other = _fitted(sights)
     beta = np.linalg.lstsq(X, moved.ravel(), rcond=1e-10)[0]
-    return _length(there.ravel() - other @ beta)
+    return rms_length(there.ravel() - other @ beta)
 
 
 def _fitted(sights: Sights) -> tuple[Array, Array]:

@@ -26,6 +26,7 @@ from whole_draw import RANGES, draw_whole
 from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error
 from whole_oracle import Gap, Sights, gap_of, geometry_error, oracle_error
 from whole_score import Name, score_parts
+from whole_search import Search, true_orders
 from world_files import write_world
 
 
@@ -110,6 +111,17 @@ def test_the_oracle_knows_what_geometry_does_not(sights):
 def test_more_poses_tell_the_oracle_more():
     few, many = (oracle_error(Sights.of(draw_whole((8, 4), "w", n))) for n in (60, 200))
     assert many < 0.8 * few
+
+
+def test_an_oracle_who_searches_for_the_orders_stands_between_knowing_and_leaving_them_out():
+    search = Search(Sights.of(draw_whole((8, 6), "w", 60, arm="medium")))
+    true = true_orders(search.sights)
+    oracle, known, none = oracle_error(search.sights), search.error(true), search.error({})
+    assert 0.9 * oracle < known < 1.2 * oracle < none
+    for j in (0, 1):
+        others = {i: p for i, p in true.items() if i != j}
+        gains = search.gains(others, j, np.array([true[j], true[j] + 3.0]))
+        assert gains[0] > 10.0 > gains[1]
 
 
 def test_shares_of_the_gap_sum_to_about_one(sights):
