@@ -19,6 +19,7 @@ from arm_data import ANGLE, BASE_ANGLE, BASE_POSITION, COMPLIANCE_SPREAD, LENGTH
 from draw import World
 from instrument import polar
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from whole_columns import Scene, components, moments, scene_of
 from whole_draw import RANGES
@@ -65,8 +66,9 @@ def second_moment(bounds: tuple[float, float]) -> float:
     return (high**2 - low**2) / (2 * np.log(high / low))
 
 
-def oracle_error(sights: Sights) -> float:
-    """Rms length (m) of the oracle's errors at the other poses."""
+def oracle_errors(sights: Sights) -> tuple[float, float]:
+    """Rms length (m) of the oracle's errors at the other poses, and that which its posterior
+    covariance lets expect."""
     blocks = [*geometry(sights), *effects(sights)]
     X, other = (
         np.concatenate([getattr(b, side) * b.deviation for b in blocks], axis=2)
@@ -78,11 +80,17 @@ def oracle_error(sights: Sights) -> float:
     r = (world.readings() - truth).reshape(len(truth), -1)
     white = whitening(sights, truth)
     X, r = white @ X, np.einsum("nij,nj->ni", white, r)
-    X = X.reshape(-1, X.shape[2])
+    X, other = (x.reshape(-1, x.shape[2]) for x in (X, other))
     # In units of the priors: |r − X u|² + |u + away|².
-    gram = X.T @ X + np.eye(X.shape[1])
-    u = np.linalg.solve(gram, X.T @ r.ravel() - away)
-    return rms_length(other @ u)
+    factor = cho_factor(X.T @ X + np.eye(X.shape[1]))
+    error = other @ cho_solve(factor, X.T @ r.ravel() - away)
+    variance = (other.T * cho_solve(factor, other.T)).sum() / len(other)
+    return rms_length(error), float(np.sqrt(3 * variance))
+
+
+def oracle_error(sights: Sights) -> float:
+    """Rms length (m) of the oracle's errors at the other poses."""
+    return oracle_errors(sights)[0]
 
 
 def rms_length(error: Array) -> float:

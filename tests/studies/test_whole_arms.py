@@ -24,7 +24,7 @@ from arm_data import ARMS
 from whole_columns import components, moments, scene_of
 from whole_draw import RANGES, draw_whole
 from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error
-from whole_oracle import Gap, Sights, gap_of, geometry_error, oracle_error
+from whole_oracle import Gap, Sights, gap_of, geometry_error, oracle_error, oracle_errors
 from whole_score import Name, score_parts
 from whole_search import Search, true_orders
 from world_files import write_world
@@ -106,6 +106,13 @@ def test_the_oracle_knows_what_geometry_does_not(sights):
     oracle = oracle_error(sights)
     assert 1e-6 < oracle < 0.15 * geometry_error(sights)
     assert oracle < 2.5 * sights.world.noise.level
+
+
+def test_the_oracle_errs_as_its_covariance_says():
+    """Mean square of 12 arms, each with some hundred degrees of freedom of its own."""
+    every = [oracle_errors(Sights.of(draw_whole((8, 7, k), "w", 40))) for k in range(12)]
+    ratios = np.array([error / expected for error, expected in every])
+    assert np.mean(ratios**2) == pytest.approx(1.0, abs=0.2)
 
 
 def test_more_poses_tell_the_oracle_more():
