@@ -78,8 +78,8 @@ def oracle_errors(sights: Sights) -> tuple[float, float]:
     world = sights.world
     truth = world.noise_free(world.visits)
     r = (world.readings() - truth).reshape(len(truth), -1)
-    white = whitening(sights, truth)
-    X, r = white @ X, np.einsum("nij,nj->ni", white, r)
+    root = np.linalg.cholesky(covariance(sights, truth))
+    X, r = np.linalg.solve(root, X), np.linalg.solve(root, r[:, :, None])
     X, other = (x.reshape(-1, x.shape[2]) for x in (X, other))
     # In units of the priors: |r − X u|² + |u + away|².
     factor = cho_factor(X.T @ X + np.eye(X.shape[1]))
@@ -98,8 +98,8 @@ def rms_length(error: Array) -> float:
     return float(np.sqrt((error.reshape(-1, 3) ** 2).sum(axis=1).mean()))
 
 
-def whitening(sights: Sights, points: Array) -> Array:
-    """W (n, K, K) with Wᵀ W the inverse covariance of a visit's K coordinates."""
+def covariance(sights: Sights, points: Array) -> Array:
+    """That of a visit's K coordinates, (n, K, K): the tracker's noise and the joints' scatter."""
     noise, joint = sights.world.noise, sights.at_here.joint
     K = joint.shape[1]
     scatter = joint * noise.repeatability
@@ -108,7 +108,7 @@ def whitening(sights: Sights, points: Array) -> Array:
     each = np.einsum("nmka,nmk,nmkb->nmab", along, sigma**2, along)
     for m in range(K // 3):
         V[:, 3 * m : 3 * m + 3, 3 * m : 3 * m + 3] += each[:, m]
-    return np.linalg.inv(np.linalg.cholesky(V))
+    return V
 
 
 def geometry(sights: Sights) -> Iterator[Block]:

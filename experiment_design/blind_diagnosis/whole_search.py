@@ -11,14 +11,14 @@ orders, to one who knows noise, scatter, sizes and all else: `whole_arms.py --se
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from whole_draw import RANGES
 from whole_laws import LINES
-from whole_oracle import Sights, effects, geometry, line_deviation, rms_length, whitening
+from whole_oracle import Sights, covariance, effects, geometry, line_deviation, rms_length
 
 Array = NDArray[np.float64]
 STEP = 0.25  # of the resolution: one over the range of the joint's angle
@@ -26,103 +26,119 @@ FINE, FINE_STEPS = 0.05, 20  # about the best, in the same unit
 MULTIPLES = 3
 
 
-class Search:
-    """The readings of a world, whitened, beside what is known but the families of lines.
+@dataclass(frozen=True)
+class Fit:
+    """Known columns and families fitted beside joints that scatter from pose to pose.
 
-    Readings are those about the truth: noise, and what the families do.
+    Readings and columns are whitened: left (P, 2K) what remains of the readings of P poses, X
+    (P, 2K, p), estimate u (p,), the factor of its information, the Cholesky factors of the poses'
+    covariances (P, 2K, 2K), and the log evidence but for a constant.
+    """
+
+    root: Array
+    X: Array
+    left: Array
+    u: Array
+    factor: tuple
+    evidence: float
+
+
+class Search:
+    """The readings of a world beside what is known but the families of lines.
+
+    Readings are those about the truth: noise, and what the families do.  Every pose has two
+    visits, whose rows stand together here.
     """
 
     def __init__(self, sights: Sights) -> None:
         self.sights = sights
-        world = sights.world
-        self.joints = range(sights.at_here.load.shape[1])
+        world, at = sights.world, sights.at_here
+        self.joints = range(at.load.shape[1])
+        self._rows = np.argsort(sights.here.pose, kind="stable").reshape(-1, 2)
         blocks = [*geometry(sights), *effects(sights)]
         known = [b for b in blocks if b.line in ("", "eccentricity")]
         families = [b for b in blocks if b.line not in ("", "eccentricity")]
-        truth = world.noise_free(sights.here)
-        self._white = whitening(sights, truth)
+        self._noise = covariance(sights, world.noise_free(sights.here))
+        r = world.readings() - world.noise_free(sights.here)
         moved = sum(b.here @ b.away for b in families)
-        r = (world.readings() - truth).reshape(len(truth), -1) + moved
-        self.t = np.einsum("nij,nj->ni", self._white, r)
-        self.hidden = sum(b.there @ b.away for b in families)
+        self._readings = self._by_pose(r.reshape(len(r), -1) + moved)
+        self._hidden = sum(b.there @ b.away for b in families)
         here = np.concatenate([b.here * b.deviation for b in known], axis=2)
-        self.there = np.concatenate([b.there * b.deviation for b in known], axis=2)
-        self.away = np.concatenate([b.away / b.deviation for b in known])
-        self.known = self._white @ here
+        self._known = self._by_pose(here)
+        self._there = np.concatenate([b.there * b.deviation for b in known], axis=2)
+        self._away = np.concatenate([b.away / b.deviation for b in known])
+        self._joint = self._by_pose(at.joint) * world.spec.gear
+        self._angles = sights.here.q[self._rows[:, 0]]
+        self._sizes = np.array([line_deviation(f"line{m + 1}") for m in range(MULTIPLES)])
 
-    @cached_property
-    def joint(self) -> Array:
-        """Whitened motion (n, K, J) per rad of a joint, times the size of a first line."""
-        return self._white @ self.sights.at_here.joint * self.sights.world.spec.gear
+    def _by_pose(self, rows: Array) -> Array:
+        """(n, K, …) of visits → (P, 2K, …) of poses."""
+        both = rows[self._rows]
+        return both.reshape(len(both), -1, *rows.shape[2:])
 
-    @cached_property
-    def sizes(self) -> Array:
-        """Prior deviations of the lines of a family, heavy arm, rad."""
-        return np.array([line_deviation(f"line{m + 1}") for m in range(MULTIPLES)])
-
-    def scattered(self, j: int) -> Array:
-        """Columns (n, K, poses) of a joint that errs at each pose by as much as its lines do."""
-        pose = self.sights.here.pose
-        each = np.eye(pose.max() + 1)[pose] * np.sqrt(2 * (self.sizes[:2] ** 2).sum())
-        return self.joint[:, :, j, None] * each[:, None]
-
-    def waves(self, q: Array, order: Array) -> Array:
+    def waves(self, q: Array, orders: Array) -> Array:
         """(n, orders, 2 MULTIPLES) in units of their priors; lines above the highest are zero."""
-        multiple = np.arange(1, MULTIPLES + 1)
-        orders = order[:, None] * multiple
-        phase = q[:, None, None] * orders
-        size = self.sizes * (orders <= RANGES.highest_order)
+        each = orders[:, None] * np.arange(1, MULTIPLES + 1)
+        phase, size = q[:, None, None] * each, self._sizes * (each <= RANGES.highest_order)
         return np.concatenate([np.sin(phase) * size, np.cos(phase) * size], axis=2)
 
-    def family(self, j: int, order: float) -> tuple[Array, Array]:
-        """Columns here, whitened, and there, of a joint's family."""
-        s = self.sights
-        here, there = (self.waves(v.q[:, j], np.array([order]))[:, 0] for v in (s.here, s.there))
-        other = s.at_there.joint[:, :, j] * s.world.spec.gear
-        return self.joint[:, :, j, None] * here[:, None], other[:, :, None] * there[:, None]
-
-    def columns(self, found: Mapping[int, float], scattering: list[int]) -> Array:
-        parts = [self.known, *(self.family(j, p)[0] for j, p in found.items())]
-        parts += [self.scattered(j) for j in scattering]
-        X = np.concatenate(parts, axis=2)
-        return X.reshape(-1, X.shape[2])
-
-    def solved(self, X: Array) -> tuple[Array, tuple]:
-        """Estimate in units of the priors, and the factor of its information."""
-        factor = cho_factor(X.T @ X + np.eye(X.shape[1]))
-        mean = np.zeros(X.shape[1])
-        mean[: len(self.away)] = self.away
-        return cho_solve(factor, X.T @ self.t.ravel() - mean), factor
+    def fit(self, found: Mapping[int, float], apart: int | None = None) -> Fit:
+        """With these families; joints without one scatter, but `apart`."""
+        scattering = [j for j in self.joints if j not in found and j != apart]
+        size = np.sqrt(2 * (self._sizes[:2] ** 2).sum())
+        moved = self._joint[:, :, scattering] * size
+        V = moved @ moved.transpose(0, 2, 1)
+        K = self._noise.shape[1]
+        for visit in range(2):
+            rows = slice(visit * K, (visit + 1) * K)
+            V[:, rows, rows] += self._noise[self._rows[:, visit]]
+        root = np.linalg.cholesky(V)
+        own = [
+            self._joint[:, :, j, None]
+            * self.waves(self._angles[:, j], np.array([p]))[:, 0][:, None]
+            for j, p in found.items()
+        ]
+        X = np.linalg.solve(root, np.concatenate([self._known, *own], axis=2))
+        t = np.linalg.solve(root, self._readings[:, :, None])[:, :, 0]
+        flat = X.reshape(-1, X.shape[2])
+        away = np.zeros(X.shape[2])
+        away[: len(self._away)] = self._away
+        factor = cho_factor(flat.T @ flat + np.eye(X.shape[2]))
+        u = cho_solve(factor, flat.T @ t.ravel() - away)
+        left = t - X @ u
+        misfit = (left**2).sum() + ((u + away) ** 2).sum()
+        size = np.log(np.diagonal(root, axis1=1, axis2=2)).sum()
+        evidence = -misfit / 2 - size - np.log(np.diagonal(factor[0])).sum()
+        return Fit(root, X, left, u, factor, float(evidence))
 
     def gains(self, found: Mapping[int, float], j: int, orders: Array) -> Array:
         """Log likelihood ratio (orders,) of a family at joint j to scatter of as much there."""
-        rest = [i for i in self.joints if i not in found and i != j]
-        X = self.columns({i: p for i, p in found.items() if i != j}, rest)
-        u, factor = self.solved(X)
-        left = (self.t.ravel() - X @ u).reshape(self.t.shape)
-        n, K = self.t.shape
-        own = self.joint[:, :, j]
-        crossed = np.einsum("nk,nkp->np", own, X.reshape(n, K, -1))
-        weight, pull = (own**2).sum(axis=1), (own * left).sum(axis=1)
-
-        def gain(w: Array) -> float:
-            b, c = w.T @ pull, crossed.T @ w
-            A = w.T @ (weight[:, None] * w) - c.T @ cho_solve(factor, c) + np.eye(w.shape[1])
-            return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1]) / 2
-
-        pose = self.sights.here.pose
-        size = np.sqrt(2 * (self.sizes[:2] ** 2).sum())
-        scatter = gain(np.eye(pose.max() + 1)[pose] * size)
-        waves = self.waves(self.sights.here.q[:, j], orders)
-        return np.array([gain(waves[:, k]) for k in range(len(orders))]) - scatter
+        others = {i: p for i, p in found.items() if i != j}
+        fit = self.fit(others, apart=j)
+        own = np.linalg.solve(fit.root, self._joint[:, :, j, None])[:, :, 0]
+        waves = self.waves(self._angles[:, j], orders)
+        w = waves.transpose(1, 0, 2)
+        crossed = np.einsum("nk,nkp->np", own, fit.X)
+        c = np.einsum("np,ona->opa", crossed, w, optimize=True)
+        A = np.einsum("ona,n,onb->oab", w, (own**2).sum(axis=1), w, optimize=True)
+        flat = c.transpose(1, 0, 2).reshape(c.shape[1], -1)
+        solved = cho_solve(fit.factor, flat).reshape(c.shape[1], *c.shape[::2])
+        A += np.eye(A.shape[1]) - np.einsum("opa,pob->oab", c, solved, optimize=True)
+        b = np.einsum("ona,n->oa", w, (own * fit.left).sum(axis=1))
+        best = np.linalg.solve(A, b[:, :, None])[:, :, 0]
+        gain = ((b * best).sum(axis=1) - np.linalg.slogdet(A)[1]) / 2
+        return gain + fit.evidence - self.fit(others).evidence
 
     def error(self, found: Mapping[int, float]) -> float:
         """Rms length (m) at the other poses."""
-        rest = [j for j in self.joints if j not in found]
-        u, _ = self.solved(self.columns(found, rest))
-        other = [self.there, *(self.family(j, p)[1] for j, p in found.items())]
-        X = np.concatenate(other, axis=2)
-        return rms_length(X @ u[: X.shape[2]] - self.hidden)
+        there, at = self.sights.there, self.sights.at_there
+        gear = self.sights.world.spec.gear
+        own = [
+            gear * at.joint[:, :, j, None] * self.waves(there.q[:, j], np.array([p]))[:, 0][:, None]
+            for j, p in found.items()
+        ]
+        X = np.concatenate([self._there, *own], axis=2)
+        return rms_length(X @ self.fit(found).u - self._hidden)
 
 
 def searched(sights: Sights) -> tuple[float, dict[int, float]]:
