@@ -26,7 +26,9 @@ from score import (
     told_apart,
     weaker_distance,
 )
-from suites import FEW_POSES, MANY_POSES
+from suites import FEW_POSES, MANY_POSES, WHOLE_SUITES
+from whole_score import SMALL
+from whole_world import over_oracle
 
 Records = Mapping[str, Sequence[Record]]
 
@@ -89,6 +91,8 @@ def bar_rows(every: Records) -> list[Row]:
         *_shrinkage("300 poses", every["catalogue300"]),
         *_plan("60 poses", every["plan"]),
         *_plan("20 poses", every["plan20"]),
+        *_whole("60 poses", every["whole"], 1.25, 1.6),
+        *_whole("300 poses", every["whole300"], 1.1, 1.3),
         *_runs(every),
     ]
 
@@ -133,6 +137,10 @@ def _clean(every: Records) -> Iterator[Row]:
         hits = [claimed(r["answer"]) for r in every[f"clean-{variant}"]]
         worlds = f"no effect, {variant.replace('_', ' ')}"
         yield share(worlds, "an effect claimed", hits, at_most=most)
+        hits = [claimed(r["answer"]) for r in every[f"timeless-{variant}"]]
+        yield share(
+            f"… {variant.replace('_', ' ')}, no times", "an effect claimed", hits, at_most=most
+        )
 
 
 def _pairs(found: Sequence[Record]) -> Iterator[Row]:
@@ -210,9 +218,43 @@ def _told_apart(found: Sequence[Record], campaign: str) -> list[bool]:
     return [told_apart(r["truth"], r["answer"]["extra_plan"], r["extra"][campaign]) for r in found]
 
 
+def _whole(poses: str, found: Sequence[Record], median: float, most: float) -> Iterator[Row]:
+    """Errors at new poses over those of the oracle; shares; names."""
+    name, scored = f"whole arms, {poses}", [r["whole"] for r in found]
+    ratios = np.array([over_oracle(w) for w in scored])
+    plain = np.array([over_oracle(w, "geometry_mm") for w in scored])
+    yield _quantile(name, "error over the oracle's: median", ratios, 0.5, median)
+    yield _quantile(name, "… in 90 % of the arms", ratios, 0.9, most)
+    yield _quantile(name, "error of geometry alone over the oracle's: median", plain, 0.5)
+    yield share(name, "no worse than geometry alone", (ratios <= plain).tolist())
+    held = [s["held"] for w in scored for s in w["shares"]]
+    yield share(name, "90 % interval of a share holds the truth", held, 0.85, 0.95)
+    names = [n for w in scored for n in w["names"]]
+    yield share(name, "wrong among what is named", [not n["right"] for n in names], at_most=0.05)
+    small = [not n["right"] or n["true"] < SMALL for n in names]
+    yield share(name, "… or below a hundredth of the mean square", small)
+    parts = [p for w in scored for p in w["parts"] if w["parts"][p] >= SMALL]
+    missed = [p for w in scored for p in w["missed"]]
+    yield share(name, "parts above that which nothing stands for",
+                [True] * len(missed) + [False] * (len(parts) - len(missed)))  # fmt: skip
+    yield _time(name, found, 0.0)
+
+
+def _quantile(
+    worlds: str, measure: str, values: np.ndarray, at: float, at_most: float | None = None
+) -> Row:
+    bar = "" if at_most is None else f"≤ {at_most:g}"
+    if not len(values):
+        return Row(worlds, measure, bar)
+    value = float(np.quantile(values, at, method="higher"))
+    met = at_most is not None and value <= at_most
+    return Row(worlds, measure, bar, f"{value:.2f}", len(values), met)
+
+
 def _runs(every: Records) -> Iterator[Row]:
     done = [r for found in every.values() for r in found]
     yield share("all", "no answer", [r["answer"] is None for r in done], at_most=0.0)
+    done = [r for suite, found in every.items() if suite not in WHOLE_SUITES for r in found]
     for poses, at_least in ((FEW_POSES, 0.95), (MANY_POSES, 0.0)):
         found = [r for r in done if r["truth"]["plan"]["poses"] == poses]
         yield _time(f"{poses} poses", found, at_least)

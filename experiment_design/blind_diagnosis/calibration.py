@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from records import Record
 from score import named
+from suites import WHOLE_SUITES
 
 BINS = 10
 Points = list[tuple[float, float, int]]
@@ -15,7 +16,8 @@ Points = list[tuple[float, float, int]]
 
 def answerable(every: Mapping[str, Sequence[Record]]) -> list[Record]:
     """The worlds whose effects the catalogue has, or which have none."""
-    return [r for suite, f in every.items() if suite not in ("outside", "left_out") for r in f]
+    apart = ("outside", "left_out", *WHOLE_SUITES)
+    return [r for suite, f in every.items() if suite not in apart for r in f]
 
 
 def all_named(found: Sequence[Record]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """Diagnoses one visible folder after another; knows nothing else of the study.
 
-Every line of stdin is {"folder": …, "arguments": […]}: `elastocal diagnose cell.toml data.csv` with
-these arguments, in that folder.  Every line of stdout is {"exit": …, "seconds": …, "message": …},
-with the last of what the command wrote to stderr.
+Every line of stdin is {"folder": …, "arguments": […]}: `elastocal` with these arguments (a command,
+its files and options), in that folder.  Every line of stdout is {"exit": …, "seconds": …,
+"message": …}, with the last of what the command wrote to stderr.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from elastocal.cli.app import app
 MESSAGE = 2000  # characters
 
 
-def diagnose(folder: str, arguments: list[str]) -> dict[str, object]:
+def run(folder: str, arguments: list[str]) -> dict[str, object]:
     """Exit code, wall-clock seconds and message of one run."""
     os.chdir(folder)
     out, err, start = io.StringIO(), io.StringIO(), time.perf_counter()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            app(["diagnose", "cell.toml", "data.csv", "--quiet", *arguments])
+            app([*arguments, "--quiet"])
             code: object = 0
         except SystemExit as end:
             code = end.code or 0
@@ -43,4 +43,4 @@ if __name__ == "__main__":
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     for line in sys.stdin:
         asked = json.loads(line)
-        print(json.dumps(diagnose(asked["folder"], asked["arguments"])), file=answers, flush=True)
+        print(json.dumps(run(asked["folder"], asked["arguments"])), file=answers, flush=True)

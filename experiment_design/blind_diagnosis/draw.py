@@ -22,12 +22,13 @@ from outside import OUTSIDE, draw_outside
 from places import Site
 from sizes import KINDS, ORDERS, draw_effect, possible
 from visits import Plan, draw_poses, draw_visits
+from whole_laws import WHOLE
 from world import Effect, Physics, Visits
 
 Array = NDArray[np.float64]
 CATALOGUE: tuple[str, ...] = tuple(KINDS)
 OUTSIDE_EFFECTS: tuple[str, ...] = tuple(OUTSIDE)
-HOOKS = INSIDE | {name: kind.hooks for name, kind in OUTSIDE.items()}
+HOOKS = INSIDE | {name: kind.hooks for name, kind in OUTSIDE.items()} | WHOLE
 # Effects that another one imitates at any poses, and that other; joint 1 is vertical.
 ALIKE = {
     "gear_eccentricity:joint2": "link_mass_error:link2",
@@ -36,6 +37,16 @@ ALIKE = {
     "encoder_jump:joint1": "frame_jump:tracker",
 }
 FRESH_POSES = 100
+
+
+@dataclass(frozen=True)
+class Told:
+    """What cell and readings tell of the arm: its links' weights, the times of the readings, and
+    from which side each joint came."""
+
+    weights: bool = True
+    time: bool = True
+    approach: bool = True
 
 
 @dataclass(frozen=True)
@@ -52,6 +63,7 @@ class World:
     plan: Plan
     approach_by_motion: bool
     noise: Noise
+    told: Told = Told()
 
     @property
     def physics(self) -> Physics:
@@ -88,6 +100,7 @@ def draw_world(
     arm: str | None = None,
     level: float | None = None,
     variant: Variant = "as_modelled",
+    told: Told = Told(),
 ) -> World:
     """A world with the named effects, in the catalogue or outside it, at random places.
 
@@ -114,7 +127,9 @@ def draw_world(
         (draw_effect if name in KINDS else draw_outside)(effect, site, rng, factor)
         for name, effect in zip(names, effects, strict=True)
     )
-    return World(name, tuple(seed), spec, specimen, found, orders, visits, plan, by_motion, noise)
+    return World(
+        name, tuple(seed), spec, specimen, found, orders, visits, plan, by_motion, noise, told
+    )
 
 
 @dataclass(frozen=True)
@@ -127,6 +142,7 @@ class Recipe:
     factor: float | None = None
     poses: int = 60
     variant: Variant = "as_modelled"
+    told: Told = Told()
 
     def draw(self) -> World:
         return draw_world(
@@ -136,6 +152,7 @@ class Recipe:
             factor=self.factor,
             poses=self.poses,
             variant=self.variant,
+            told=self.told,
         )
 
 
@@ -165,12 +182,17 @@ def outside_recipes(
 
 
 def clean_recipes(
-    seed: int, count: int, variant: Variant = "as_modelled", *, poses: int = 60
+    seed: int,
+    count: int,
+    variant: Variant = "as_modelled",
+    *,
+    poses: int = 60,
+    told: Told = Told(),
 ) -> Iterator[Recipe]:
     """Worlds with no effect, under one variant of the noise."""
     for k in range(count):
         name = f"clean-{variant}-{poses}-{k:03d}"
-        yield Recipe(name, (seed, 3, k), poses=poses, variant=variant)
+        yield Recipe(name, (seed, 3, k), poses=poses, variant=variant, told=told)
 
 
 def pair_recipes(

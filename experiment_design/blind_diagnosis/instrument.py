@@ -62,7 +62,7 @@ class Noise:
         if self.variant == "heavy_tails":
             # Student's t with 4 degrees of freedom has variance 2.
             error = rng.standard_t(4, size=points.shape) / np.sqrt(2)
-        read = points + np.einsum("...k,...ki->...i", error * self.sigma(points), _polar(points))
+        read = points + np.einsum("...k,...ki->...i", error * self.sigma(points), polar(points))
         hit = rng.random(points.shape[:2]) < self.outlier_share
         away = rng.normal(size=(int(hit.sum()), 3))
         away /= np.linalg.norm(away, axis=1, keepdims=True)
@@ -94,7 +94,7 @@ def draw_noise(
     )
 
 
-def _polar(points: Array) -> Array:
+def polar(points: Array) -> Array:
     """Unit vectors along range, azimuth and elevation, (..., 3 directions, 3)."""
     along = points / np.linalg.norm(points, axis=-1, keepdims=True)
     x, y, z = np.moveaxis(along, -1, 0)

@@ -17,6 +17,7 @@ from draw import World
 from extra_poses import with_extra_poses
 from score import claims, truths
 from suites import Task
+from whole_world import judged
 from worker import Run, Worker
 from world_files import write_world
 
@@ -52,6 +53,11 @@ def diagnose_world(task: Task, worker: Worker, origin: dict[str, Any]) -> record
             "answer": answer,
         }
         record |= _afterwards(task, world, record, visible, sealed)
+        if task.whole:
+            fresh = sealed / "fresh.csv"
+            record["whole"] = judged(
+                world, visible, fresh, lambda *a: worker.run(visible, *a).exit, answer, CELL
+            )
         if task.plan and answer is not None:
             record["extra"] = with_extra_poses(world, visible, PLAN, worker)
         return record

@@ -16,5 +16,6 @@ KEPT = (
 def shortened(diagnosis: Mapping[str, Any]) -> Record:
     """The part of a diagnosis that is kept: without curves, tests and hopeless candidates."""
     kept = {key: diagnosis[key] for key in KEPT}
+    kept["components"] = diagnosis.get("components")
     kept["candidates"] = diagnosis["candidates"][:CANDIDATES]
     return kept

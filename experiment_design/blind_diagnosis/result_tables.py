@@ -24,7 +24,8 @@ from power import observed
 from records import Record
 from scipy.stats import norm
 from score import claims, is_unknown, location_right, one_effect, outright, sure
-from suites import FACTORS, SUITES
+from suites import FACTORS, SUITES, WHOLE_SUITES
+from whole_world import over_oracle
 
 from elastocal.studies.study_results import read_results
 
@@ -67,6 +68,10 @@ def report(done: Sequence[Record]) -> str:
     for suite, title in (("outside", "outside the catalogue"), ("left_out", "taken out of it")):
         if every[suite]:
             sections.append(f"## Effects {title}, twice the size\n\n" + unknown(every[suite]))
+    for suite in WHOLE_SUITES:
+        if every[suite]:
+            poses = every[suite][0]["truth"]["plan"]["poses"]
+            sections.append(f"## Whole arms, {poses} poses\n\n" + whole_arms(every[suite]))
     points = reliability(answerable(every))
     sections.append("## Reliability, all but outside and taken out\n\n" + _reliability(points))
     return "\n\n".join(sections) + "\n"
@@ -156,6 +161,36 @@ def unknown(found: Sequence[Record]) -> str:
         told = ", ".join(f"{n} × {label}" for label, n in instead.most_common(5))
         rows.append((name, len(group), len(missed), located, len(over), told))
     return _table(("true", "n", "unknown", "located", "claimed with > 90 %", "as"), rows)
+
+
+def whole_arms(found: Sequence[Record]) -> str:
+    """Errors by arm and by whether the approach is recorded; shares by what they are errors
+    against."""
+    rows = []
+    for (arm, told), group in _grouped(found, _arm).items():
+        ratios = [np.array([over_oracle(r["whole"], f"{k}_mm") for r in group])
+                  for k in ("tool", "geometry")]  # fmt: skip
+        oracle = np.median([r["whole"]["oracle_mm"] for r in group])
+        each = [f"{np.quantile(x, q, method='higher'):.2f}" for x in ratios for q in (0.5, 0.9)]
+        rows.append((arm, told, len(group), f"{oracle:.4f}", *each))
+    head = ("arm", "approach", "n", "oracle mm", "tool over it", "90 %", "geometry over it", "90 %")
+    errors = _table(head, rows)
+    kinds = _grouped([s for r in found for s in r["whole"]["shares"]], lambda s: s["kind"])
+    if not kinds:
+        return errors
+    each_kind = [
+        (kind, len(group), f"{np.mean([s['held'] for s in group]):.3f}",
+         f"{np.median([s['stated'] - s['true'] for s in group]):+.3f}",
+         f"{np.median([s['high'] - s['low'] for s in group]):.3f}")
+        for kind, group in kinds.items()
+    ]  # fmt: skip
+    head = ("share of", "n", "interval holds it", "median bias", "median width")
+    return f"{errors}\n\n{_table(head, each_kind)}"
+
+
+def _arm(r: Record) -> tuple[str, str]:
+    told = r["truth"]["plan"]["told"]["approach"]
+    return r["truth"]["arm"], "recorded" if told else "order of rows"
 
 
 def _reliability(points: Sequence[tuple[float, float, int]]) -> str:

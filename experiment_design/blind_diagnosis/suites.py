@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from draw import (
     Recipe,
+    Told,
     alike_recipes,
     catalogue_recipes,
     clean_recipes,
@@ -16,6 +17,7 @@ from draw import (
     pair_recipes,
 )
 from instrument import VARIANTS
+from whole_draw import WholeRecipe
 
 FACTORS = (0.1, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0)
 FEW_POSES, MANY_POSES = 60, 300
@@ -41,15 +43,17 @@ class Task:
     """One world to diagnose.
 
     without: effects taken out of the catalogue.  Also wanted: distance d of the truth from its
-    rivals, the true shrinkage, and extra poses, measured and diagnosed with the rest.
+    rivals, the true shrinkage, extra poses, measured and diagnosed with the rest, and what is
+    known of a whole arm.
     """
 
     suite: str
-    recipe: Recipe
+    recipe: Recipe | WholeRecipe
     without: tuple[str, ...] = ()
     distance: bool = False
     shrinkage: bool = False
     plan: bool = False
+    whole: bool = False
 
 
 def tasks(suite: str, seed: int, per_effect: int) -> Iterator[Task]:
@@ -76,6 +80,13 @@ def _alike(suite: str, seed: int, n: int) -> Iterator[Task]:
 def _clean(suite: str, seed: int, n: int) -> Iterator[Task]:
     variant = next(v for v in VARIANTS if suite == f"clean-{v}")
     for recipe in clean_recipes(seed, CLEAN * n, variant):
+        yield Task(suite, recipe)
+
+
+def _timeless(suite: str, seed: int, n: int) -> Iterator[Task]:
+    """No effect, and a table that does not say when its readings were taken."""
+    variant = next(v for v in VARIANTS if suite == f"timeless-{v}")
+    for recipe in clean_recipes(seed, CLEAN * n, variant, told=Told(time=False)):
         yield Task(suite, recipe)
 
 
@@ -113,6 +124,12 @@ def _plan_early(suite: str, seed: int, n: int) -> Iterator[Task]:
         yield Task(suite, recipe, plan=True)
 
 
+def _whole(poses: int, suite: str, seed: int, n: int) -> Iterator[Task]:
+    for k in range(n):
+        recipe = WholeRecipe(f"whole-{poses}-{k:03d}", (seed, 9, k), poses)
+        yield Task(suite, recipe, whole=True)
+
+
 SUITES: dict[str, Callable[[str, int, int], Iterator[Task]]] = {
     "catalogue": partial(_catalogue, FEW_POSES),
     "catalogue300": partial(_catalogue, MANY_POSES),
@@ -124,4 +141,9 @@ SUITES: dict[str, Callable[[str, int, int], Iterator[Task]]] = {
     "sizes": _sizes,
     "plan": _plan,
     "plan20": _plan_early,
+    # A suite's place in this list is part of its seed.
+    "whole": partial(_whole, FEW_POSES),
+    "whole300": partial(_whole, MANY_POSES),
+    **{f"timeless-{variant}": _timeless for variant in VARIANTS},
 }
+WHOLE_SUITES = ("whole", "whole300")

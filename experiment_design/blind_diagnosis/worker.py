@@ -42,6 +42,10 @@ class Worker:
 
     def diagnose(self, folder: Path, *arguments: str) -> Run:
         """Run `elastocal diagnose cell.toml data.csv ARGUMENTS` in the visible folder."""
+        return self.run(folder, "diagnose", "cell.toml", "data.csv", *arguments)
+
+    def run(self, folder: Path, *arguments: str) -> Run:
+        """Run `elastocal ARGUMENTS` in the visible folder."""
         if self._process is None or self._served >= RENEWED_AFTER:
             self.close()
             self._process = _started()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,10 @@ def write_world(world: World, visible: Path, sealed: Path) -> None:
         raise ValueError(f"{sealed} would hold the truth within the tool's reach: {visible}")
     for folder in (visible, sealed):
         folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(world.spec.urdf, visible / "arm.urdf")
+    if world.told.weights:
+        shutil.copyfile(world.spec.urdf, visible / "arm.urdf")
+    else:
+        (visible / "arm.urdf").write_text(without_weights(world.spec.urdf), encoding="utf-8")
     (visible / "cell.toml").write_text(cell_text(world), encoding="utf-8")
     write_table(world, world.visits, world.readings(), visible / "data.csv")
     fresh = world.fresh()
@@ -35,12 +39,22 @@ def write_world(world: World, visible: Path, sealed: Path) -> None:
     (sealed / "truth.json").write_text(truth, encoding="utf-8")
 
 
+def without_weights(urdf: Path) -> str:
+    """The arm's URDF with no mass in it."""
+    root = ElementTree.parse(urdf).getroot()
+    for link in root.iter("link"):
+        for inertial in link.findall("inertial"):
+            link.remove(inertial)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
 def cell_text(world: World) -> str:
     """The cell as its owner would write it: nominal data, nothing of the truth."""
     spec, specimen = world.spec, world.specimen
     markers = "\n".join(
         f"{name} = {list(p)}" for name, p in zip(spec.marker_names, spec.markers, strict=True)
     )
+    orders = f"gear_ripple_orders = {world.orders.tolist()}\n" if world.orders.size else ""
     return f"""name = "simulated campaign"
 
 [robot]
@@ -59,10 +73,9 @@ position_m = [0.0, 0.0, 0.0]
 
 [model]
 observe = "position"
-link_gravity = true
+link_gravity = {json.dumps(world.told.weights)}
 effects = {json.dumps(FITTED)}
-gear_ripple_orders = {world.orders.tolist()}
-
+{orders}
 [model.nominal]
 base_position_m = {specimen.base_position.tolist()}
 base_rpy_deg = [0.0, 0.0, {specimen.base_yaw_deg}]
@@ -76,15 +89,18 @@ def write_table(world: World, visits: Visits, readings: Array, path: Path) -> No
     header = [
         "configuration", "repeat", "marker", *[f"q{j + 1}_rad" for j in range(J)],
         "force_x_N", "force_y_N", "force_z_N", "x_m", "y_m", "z_m",
-        "sigma_range_um", "sigma_azimuth_um", "sigma_elevation_um", "time_min",
-        *[f"approach_{j + 1}" for j in range(J)],
+        "sigma_range_um", "sigma_azimuth_um", "sigma_elevation_um",
     ]  # fmt: skip
+    told = world.told
+    header += ["time_min"] if told.time else []
+    header += [f"approach_{j + 1}" for j in range(J)] if told.approach else []
     sigma = 1e6 * world.noise.stated * world.noise.sigma(readings)
     lines = [",".join(header)]
     for i, pose in enumerate(visits.pose):
         joints = [f"{v:.9f}" for v in visits.q[i]]
         force = [f"{v + 0.0:.3f}" for v in visits.force[i]]
-        late = [f"{visits.time[i] / 60:.3f}", *[f"{int(a):d}" for a in visits.approach[i]]]
+        late = [f"{visits.time[i] / 60:.3f}"] if told.time else []
+        late += [f"{int(a):d}" for a in visits.approach[i]] if told.approach else []
         for k, name in enumerate(world.spec.marker_names):
             observed = [f"{v:.9f}" for v in readings[i, k]] + [f"{v:.2f}" for v in sigma[i, k]]
             lines.append(",".join([str(pose), "0", name, *joints, *force, *observed, *late]))
@@ -103,6 +119,7 @@ def truth_of(world: World) -> dict[str, object]:
             "poses": int(world.visits.pose.max()) + 1,
             "order": world.plan,
             "approach_by_motion": world.approach_by_motion,
+            "told": vars(world.told),
         },
         "noise": {
             "variant": noise.variant,

@@ -31,7 +31,8 @@ from elastocal.model import Model
 
 WORLD_MODULES = {
     "arm_data", "chance", "draw", "inside", "instrument", "mechanics", "mjcf", "outside", "places",
-    "sizes", "skeleton", "visits", "world", "world_files",
+    "sizes", "skeleton", "visits", "whole_columns", "whole_draw", "whole_laws", "whole_oracle",
+    "whole_score", "world", "world_files",
 }  # fmt: skip
 CASES = [
     pytest.param(name, arm, marks=() if k % len(ARMS) == i else pytest.mark.long)

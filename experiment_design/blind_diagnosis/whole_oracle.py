@@ -1,0 +1,257 @@
+"""What can be known of a whole arm: by one who knows its structure, and of what its gap consists.
+
+The oracle fits, by penalised least squares about the truth, exactly the columns that the arm has:
+geometry, lines at their true orders, sag by unknown moments, compliances, half widths with the
+true directions, the creep as a Gaussian process of its true length.  Every parameter has the
+prior it was drawn from (mean and standard deviation), readings the tracker's true noise and the
+joints' true scatter.  With r the noise of the readings, X the columns, D the prior deviations and
+β* the truth, its error at other poses is X' (β̂ − β*), where β̂ minimises
+|r − X (β − β*)|²_V⁻¹ + |D⁻¹ (β − β₀)|².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from arm_data import ANGLE, BASE_ANGLE, BASE_POSITION, COMPLIANCE_SPREAD, LENGTH, MARKER, OFFSET
+from draw import World
+from instrument import polar
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+from whole_columns import Scene, components, moments, scene_of
+from whole_draw import RANGES
+from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep
+from world import Effect, Visits
+
+Array = NDArray[np.float64]
+SMALLEST = 1e-10  # of the creep's largest variance: what is below is left out
+
+
+@dataclass(frozen=True)
+class Block:
+    """Parameters of one kind: columns at the campaign and elsewhere, (n, K, p) each; standard
+    deviation (p,) of the prior, and how far the truth (p,) is from its mean.  `line` is the name
+    of a gear's line."""
+
+    here: Array
+    there: Array
+    deviation: Array
+    away: Array
+    line: str = ""
+
+
+@dataclass(frozen=True)
+class Sights:
+    """A world's campaign and its other poses, each with the columns of the true arm."""
+
+    world: World
+    here: Visits
+    there: Visits
+    at_here: Scene
+    at_there: Scene
+
+    @classmethod
+    def of(cls, world: World) -> Sights:
+        there = world.fresh()
+        at_here, at_there = (scene_of(world, v) for v in (world.visits, there))
+        return cls(world, world.visits, there, at_here, at_there)
+
+
+def second_moment(bounds: tuple[float, float]) -> float:
+    """E x² of a log-uniform x."""
+    low, high = bounds
+    return (high**2 - low**2) / (2 * np.log(high / low))
+
+
+def oracle_errors(sights: Sights) -> tuple[float, float]:
+    """Rms length (m) of the oracle's errors at the other poses, and that which its posterior
+    covariance lets expect."""
+    blocks = [*geometry(sights), *effects(sights)]
+    X, other = (
+        np.concatenate([getattr(b, side) * b.deviation for b in blocks], axis=2)
+        for side in ("here", "there")
+    )
+    away = np.concatenate([b.away / b.deviation for b in blocks])
+    world = sights.world
+    truth = world.noise_free(world.visits)
+    r = (world.readings() - truth).reshape(len(truth), -1)
+    root = np.linalg.cholesky(covariance(sights, truth))
+    X, r = np.linalg.solve(root, X), np.linalg.solve(root, r[:, :, None])
+    X, other = (x.reshape(-1, x.shape[2]) for x in (X, other))
+    # In units of the priors: |r − X u|² + |u + away|².
+    factor = cho_factor(X.T @ X + np.eye(X.shape[1]))
+    error = other @ cho_solve(factor, X.T @ r.ravel() - away)
+    variance = (other.T * cho_solve(factor, other.T)).sum() / len(other)
+    return rms_length(error), float(np.sqrt(3 * variance))
+
+
+def oracle_error(sights: Sights) -> float:
+    """Rms length (m) of the oracle's errors at the other poses."""
+    return oracle_errors(sights)[0]
+
+
+def rms_length(error: Array) -> float:
+    """Rms length of the markers' errors (…,) whose last 3 M coordinates are those of a visit."""
+    return float(np.sqrt((error.reshape(-1, 3) ** 2).sum(axis=1).mean()))
+
+
+def covariance(sights: Sights, points: Array) -> Array:
+    """That of a visit's K coordinates, (n, K, K): the tracker's noise and the joints' scatter."""
+    noise, joint = sights.world.noise, sights.at_here.joint
+    K = joint.shape[1]
+    scatter = joint * noise.repeatability
+    V = scatter @ scatter.transpose(0, 2, 1)
+    along, sigma = polar(points), noise.sigma(points)
+    each = np.einsum("nmka,nmk,nmkb->nmab", along, sigma**2, along)
+    for m in range(K // 3):
+        V[:, 3 * m : 3 * m + 3, 3 * m : 3 * m + 3] += each[:, m]
+    return V
+
+
+def geometry(sights: Sights) -> Iterator[Block]:
+    """Base, offsets, links, markers and compliances, about what their owner believes."""
+    world, here, there = sights.world, sights.at_here, sights.at_there
+    true, spec, believed = world.specimen.true, world.spec, world.specimen
+    J = spec.skeleton.n_joints
+    yaw = Rotation.from_euler("z", believed.base_yaw_deg, degrees=True)
+    turn = (Rotation.from_matrix(true.base_rotation) * yaw.inv()).as_rotvec()
+    away = np.concatenate([true.base_position - believed.base_position, turn])
+    yield Block(here.base, there.base, np.repeat([BASE_POSITION, BASE_ANGLE], 3), away)
+    yield Block(here.joint, there.joint, np.full(J, OFFSET), true.offset)
+    moved = []
+    for j in range(J):
+        R = spec.skeleton.rotation[j + 1].T
+        turned = Rotation.from_matrix(R @ true.skeleton.rotation[j + 1]).as_rotvec()
+        moved += [R @ (true.skeleton.position[j + 1] - spec.skeleton.position[j + 1]), turned]
+    sizes = np.tile(np.repeat([LENGTH, ANGLE], 3), J)
+    yield Block(here.links, there.links, sizes, np.concatenate(moved))
+    off = (true.markers - np.array(spec.markers)).ravel()
+    yield Block(here.markers, there.markers, np.full(len(off), MARKER), off)
+    k = believed.compliance
+    columns = (at.joint * at.load[:, None] for at in (here, there))
+    yield Block(*columns, COMPLIANCE_SPREAD / np.sqrt(3) * k, true.compliance - k)
+
+
+def effects(sights: Sights) -> Iterator[Block]:
+    """What is wrong beside geometry and compliances, by the laws that it has."""
+    world = sights.world
+    spec, true = world.spec, world.specimen.true
+    sides = ((sights.here, sights.at_here), (sights.there, sights.at_there))
+    for e in world.effects:
+        if e.name == LINES:
+            for line, order in e.settings.items():
+                waves = [
+                    np.stack([np.sin(order * v.q[:, e.index]), np.cos(order * v.q[:, e.index])], 1)
+                    for v, _ in sides
+                ]
+                columns = [
+                    at.joint[:, :, e.index, None] * wave[:, None]
+                    for (_, at), wave in zip(sides, waves, strict=True)
+                ]
+                size = spec.gear * line_deviation(line)
+                truth = e.vector(f"{line}_sin", f"{line}_cos")
+                yield Block(*columns, np.full(2, size), truth, line)
+        elif e.name == LAST_MOVE:
+            columns = [at.joint[:, :, [e.index]] * v.approach[:, None, [e.index]]
+                       for v, at in sides]  # fmt: skip
+            size = spec.gear * np.sqrt(second_moment(RANGES.half_width))
+            yield Block(*columns, np.array([size]), e.vector("half_width"))
+        elif e.name == WEIGHTS:
+            columns = [
+                np.einsum("nkj,j,njp->nkp", at.joint, true.compliance, at.weighing)
+                for _, at in sides
+            ]
+            yield Block(*columns, _moment_deviations(world), moments(e))
+        elif e.name == CREEP:
+            yield _creep(sights, e)
+
+
+def line_deviation(line: str) -> float:
+    """Standard deviation of the sine of a heavy arm's line: half of the mean squared amplitude."""
+    if line == "eccentricity":
+        return float(np.sqrt(second_moment(RANGES.eccentricity) / 2))
+    low, high = RANGES.next_line
+    shrinks = (low**2 + low * high + high**2) / 3
+    power = second_moment(RANGES.line) * shrinks ** (int(line.removeprefix("line")) - 1)
+    return float(np.sqrt(power / 2))
+
+
+def _moment_deviations(world: World) -> Array:
+    """About zero: nobody has told the masses.  (4 J,) kg, kg·m."""
+    skeleton = world.spec.skeleton
+    scale = np.sqrt(second_moment(RANGES.mass))
+    away = np.sqrt((skeleton.com**2).mean(axis=1) + (RANGES.centre * world.spec.reach) ** 2)
+    mass = scale * skeleton.mass
+    return np.column_stack([mass, *[mass * away] * 3]).ravel()
+
+
+def _creep(sights: Sights, e: Effect) -> Block:
+    """The base's motion at all times of both tables, in the axes of its prior covariance."""
+    time, n = np.concatenate([sights.here.time, sights.there.time]), len(sights.here.time)
+    apart = (time[:, None] - time) / e.settings["length_s"]
+    value, axes = np.linalg.eigh(np.exp(-0.5 * apart**2))
+    kept = value > SMALLEST * value.max()
+    basis = axes[:, kept]
+    sizes = [np.sqrt(second_moment(b)) for b in (RANGES.shift, RANGES.turn)]
+    deviation = np.repeat(sizes, 3)[:, None] * np.sqrt(value[kept])
+    columns = [
+        np.einsum("nkb,np->nkbp", at.base, part).reshape(*at.base.shape[:2], -1)
+        for at, part in ((sights.at_here, basis[:n]), (sights.at_there, basis[n:]))
+    ]
+    return Block(*columns, deviation.ravel(), (creep(e, time).T @ basis).ravel())
+
+
+@dataclass(frozen=True)
+class Gap:
+    """What geometry leaves of the effects at the campaign's readings: family and place of each
+    part, mean products (C, C) m² of what they move, and the rms of a coordinate
+    of the whole in m."""
+
+    parts: tuple[tuple[str, str], ...]
+    products: Array
+    rms: float
+
+    def share(self, parts: Sequence[tuple[str, str]]) -> float:
+        """Mean square of these parts together over that of the whole."""
+        at = [self.parts.index(p) for p in parts]
+        return float(self.products[np.ix_(at, at)].sum() / self.rms**2)
+
+
+def gap_of(sights: Sights) -> Gap:
+    """Each part's motion without what the fitted geometry takes on of it, by least squares."""
+    world, scene = sights.world, sights.at_here
+    parts = components(world, sights.here, scene)
+    moved = np.stack([p.moved.ravel() for p in parts], axis=1)
+    X = _fitted(sights)[0]
+    left = moved - X @ np.linalg.lstsq(X, moved, rcond=1e-10)[0]
+    products = left.T @ left / len(left)
+    names = tuple((p.family, p.where) for p in parts)
+    return Gap(names, products, float(np.sqrt(products.sum())))
+
+
+def geometry_error(sights: Sights) -> float:
+    """Rms length (m) of the errors at the other poses where geometry alone is fitted, by plain
+    least squares, to what the effects do and to the noise."""
+    world = sights.world
+    bare = replace(world, effects=())
+    moved = world.readings() - bare.noise_free(sights.here)
+    there = world.noise_free(sights.there) - bare.noise_free(sights.there)
+    X, other = _fitted(sights)
+    beta = np.linalg.lstsq(X, moved.ravel(), rcond=1e-10)[0]
+    return rms_length(there.ravel() - other @ beta)
+
+
+def _fitted(sights: Sights) -> tuple[Array, Array]:
+    """Columns of the cell's own parameters at both tables, in units of their priors; its model
+    knows no weights, so that compliances answer to the payload."""
+    *frames, springs = geometry(sights)
+    out = []
+    for side, scene in (("here", sights.at_here), ("there", sights.at_there)):
+        blocks = [getattr(b, side) * b.deviation for b in frames]
+        blocks.append(scene.joint * scene.carried[:, None] * springs.deviation)
+        X = np.concatenate(blocks, axis=2)
+        out.append(X.reshape(-1, X.shape[2]))
+    return out[0], out[1]
