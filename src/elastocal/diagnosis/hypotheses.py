@@ -348,6 +348,7 @@ REFERENCES = 12  # starts about which the whole model is evaluated, for the fact
 KEPT_STARTS, AT_ONCE = 12, 50
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
 MOST_STEPS = 40  # of the refinement
+SAME = 0.05  # of χ²: a difference that is none
 
 
 @dataclass(frozen=True)
@@ -472,24 +473,27 @@ class StartSearch:
         each = [self._left(starts[block], profiles[:, block]) for block in blocks]
         left = np.concatenate([one for one, _ in each])
         beside = np.concatenate([C for _, C in each], axis=1)
-        order = np.argsort(left, kind="stable")
         dof = max(len(self.r) - self.X.shape[1] - 1, 1)
-        variance = max(float(left[order[0]]), 1e-300) / dof
-        share = float(np.log(np.exp((left[order[0]] - left) / (2 * variance)).mean()))
+        variance = max(float(left.min()), 1e-300) / dof
+        share = float(np.log(np.exp((left.min() - left) / (2 * variance)).mean()))
+        # Starts that say the same stand in their own order, whatever the rounding.
+        order = np.argsort(np.round((left - left.min()) / (SAME * variance)), kind="stable")
         kept: list[int] = []
         for k in order:
             if len(kept) == KEPT_STARTS:
                 break
             if np.abs(beside[:, kept].T @ beside[:, k]).max(initial=0.0) < ALIKE:
                 kept.append(int(k))
-        best = self._refined(starts, starts[kept[0]], float(left[kept[0]]))
+        best = self._refined(starts, starts[kept[0]], np.sqrt(variance))
         return [best, *(starts[k] for k in kept[1:])], share
 
     def _refined(
-        self, starts: list[dict[str, float]], best: Mapping[str, float], least: float
+        self, starts: list[dict[str, float]], best: Mapping[str, float], noise: float
     ) -> Mapping[str, float]:
-        """The start near `best`, which leaves `least`, that leaves the least: least squares with
-        the amplitude solved for (variable projection; Golub and Pereyra 1973)."""
+        """The start near `best` that leaves the least: least squares with the amplitude solved for
+        (variable projection; Golub and Pereyra 1973).  Where the residual, over `noise`, does not
+        ask for another value, a value stays: each is tied to that of `best` by a spread of all.
+        """
         keys = list(best)
         width = np.array([np.std([start[key] for start in starts]) for key in keys])
         x0 = np.array([best[key] for key in keys])
@@ -497,17 +501,17 @@ class StartSearch:
         def start_of(values: Array) -> dict[str, float]:
             return dict(zip(keys, map(float, x0 + width * values), strict=True))
 
-        def columns_of(trials: list[dict[str, float]]) -> tuple[Array, Array]:
+        def residual(values: Array) -> Array:
+            trials = [start_of(values)]
             profiles = self._profiles(trials)
             assert profiles is not None
-            return self._left(trials, profiles)
+            left, C = self._left(trials, profiles)
+            if left[0] >= self._unexplained @ self._unexplained:  # no amplitude that it can have
+                return np.append(self._unexplained / noise, values)
+            c = C[:, 0]
+            return np.append((self._unexplained - c * (c @ self._unexplained)) / noise, values)
 
-        def residual(values: Array) -> Array:
-            c = columns_of([start_of(values)])[1][:, 0]
-            return np.asarray(self._unexplained - c * (c @ self._unexplained))
-
-        found = start_of(least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS).x)
-        return found if columns_of([found])[0][0] < least else best
+        return start_of(least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS).x)
 
     def _profiles(self, starts: Sequence[Mapping[str, float]]) -> Array | None:
         """(rows, starts)."""
