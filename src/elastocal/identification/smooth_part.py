@@ -49,13 +49,22 @@ class SmoothPart:
             return nothing, nothing
         return self._course(self.group.basis(x))
 
-    def shape(self, x: Array) -> tuple[Array, Array]:
-        """The same of what is left of the function without its mean over x, which offsets and
-        lengths of the arm can stand for."""
+    def shape(self) -> tuple[Array, Array, Array]:
+        """Places x (GRID,) over its range, values and half widths of the 95 % band (components,
+        GRID) of what is left of the function without its mean and its wave of one period per
+        turn (of a time, its slope), for which offsets, lengths and tilts of the arm can stand."""
         if self.group.basis is None:
-            return self.course(x)
+            nothing = np.zeros((len(self.value), 0))
+            return np.zeros(0), nothing, nothing
+        x = self.group.grid(GRID)
+        return x, *self._course(self._own_waves(x))
+
+    def _own_waves(self, x: Array) -> Array:
+        assert self.group.basis is not None
+        alike = [np.ones(len(x)), *((np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],))]
+        Q, _ = np.linalg.qr(np.column_stack(alike))
         waves = self.group.basis(x)
-        return self._course(waves - waves.mean(axis=0))
+        return np.asarray(waves - Q @ (Q.T @ waves))
 
     def _course(self, waves: Array) -> tuple[Array, Array]:
         k = self.value.shape[1]
@@ -71,8 +80,10 @@ class SmoothPart:
 
     @cached_property
     def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
-        """By unit: rms of the function less its mean, over all components and its range, the 95 %
-        interval of that, and the rms half width of the 95 % band."""
+        """By unit: rms of the function's `shape` over all components and its range, the 95 %
+        interval of that, and the rms half width of the 95 % band.
+
+        Of parameters that are no function of one quantity, the root of their sum of squares."""
         basis = self.group.basis
         found = {}
         for unit in dict.fromkeys(self.group.units):
@@ -80,8 +91,7 @@ class SmoothPart:
             if basis is None:
                 waves = np.eye(self.value.shape[1]) * np.sqrt(self.value.shape[1])
             else:
-                waves = basis(self.group.grid(GRID))
-                waves = waves - waves.mean(axis=0)
+                waves = self._own_waves(self.group.grid(GRID))
             mean = self.value[own] @ waves.T
             rng = np.random.default_rng(0)
             k = waves.shape[1]
