@@ -189,6 +189,9 @@ def joint_fit(
         return found.residual, found.r_factor
 
     x = _started(problem, functions, x, reduction)
+    if scales is not None:
+        gone = functions.columns[(scales.scale == 0)[functions.group]]
+        x[gone] = problem.model.nominal[gone]
     residual, r_factor = at(x)
     rounds = 0 if not sizing else CHOICES if scales is None else 1
     steps = 0
@@ -420,6 +423,17 @@ def _check_options(options: Options) -> None:
             f"{option('intervals', options.intervals)} knows of no prior, which smooth functions "
             "have; leave it away"
         )
+
+
+def _followed(observed: Observations, group: SmoothGroup) -> Array:
+    """What a function follows, in every observation (N,)."""
+    table = observed.table
+    if group.basis is None:
+        return np.zeros(0)
+    if not group.lasting:
+        assert table.time is not None
+        return table.time[observed.lead]
+    return np.asarray(table.q[observed.lead, group.joint])
 
 
 class _Course:
@@ -686,7 +700,9 @@ class _Course:
             there = np.flatnonzero(at >= 0)
             matrix[np.ix_(there, there)] = whole[np.ix_(mine, mine)]
             scale = float(fit.scales.scale[g])
-            found.append(SmoothPart(group, scale, float(paid[mine].sum()), value, matrix))
+            places = _followed(fit.problem.observations, group)
+            paid_for = float(paid[mine].sum())
+            found.append(SmoothPart(group, scale, paid_for, value, matrix, places))
         return tuple(found)
 
     def _warnings(self, fit: JointFit) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from elastocal.model.smooth_groups import SmoothGroup
 from elastocal.units import Array
 
 GRID = 200
+PLACES = 500
 DRAWS = 400
 LEVEL = 0.95
 
@@ -28,6 +29,7 @@ class SmoothPart:
         effective: How many coefficients' worth of it the readings determine.
         value: Coefficients (components, waves).
         covariance: Theirs, (components · waves, components · waves).
+        places: What it follows in the readings fitted (n,), in rad or s.
     """
 
     group: SmoothGroup
@@ -35,6 +37,7 @@ class SmoothPart:
     effective: float
     value: Array
     covariance: Array
+    places: Array
 
     @property
     def coefficients(self) -> int:
@@ -80,10 +83,11 @@ class SmoothPart:
 
     @cached_property
     def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
-        """By unit: rms of the function's `shape` over all components and its range, the 95 %
-        interval of that, and the rms half width of the 95 % band.
+        """By unit, over all components and the places of the readings: rms of the function's
+        `shape`, the 95 % interval of that, and the rms half width of the 95 % band.
 
-        Of parameters that are no function of one quantity, the root of their sum of squares."""
+        Of parameters that are no function of one quantity, the root of their sum of squares.
+        """
         basis = self.group.basis
         found = {}
         for unit in dict.fromkeys(self.group.units):
@@ -91,7 +95,7 @@ class SmoothPart:
             if basis is None:
                 waves = np.eye(self.value.shape[1]) * np.sqrt(self.value.shape[1])
             else:
-                waves = self._own_waves(self.group.grid(GRID))
+                waves = self._own_waves(_thinned(self.places))
             mean = self.value[own] @ waves.T
             rng = np.random.default_rng(0)
             k = waves.shape[1]
@@ -118,6 +122,14 @@ class SmoothPart:
             }
             for unit, (rms, ci95, half) in self.sizes.items()
         ]  # fmt: skip
+
+
+def _thinned(places: Array) -> Array:
+    """At most PLACES of them, evenly over their order."""
+    if len(places) <= PLACES:
+        return places
+    ordered = np.sort(places)
+    return np.asarray(ordered[np.linspace(0, len(ordered) - 1, PLACES).astype(int)])
 
 
 def _root(covariance: Array) -> Array:
