@@ -130,9 +130,7 @@ def held_values(estimates: list[dict[str, Any]]) -> dict[str, float]:
     return {e["name"]: e["held"] for e in estimates if e["identifiable"] is not True}
 
 
-def _ordinary(
-    calibrated: CalibratedArm, estimates: list[dict[str, Any]]
-) -> list[dict[str, Any]]:
+def _ordinary(calibrated: CalibratedArm, estimates: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Those of no smooth function, which is zero where nothing shows it."""
     both = zip(estimates, calibrated.model.shrunk, strict=True)
     return [entry for entry, shrunk in both if not shrunk]

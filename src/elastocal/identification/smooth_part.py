@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.smooth_groups import SmoothGroup
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 GRID = 200
 PLACES = 500
@@ -43,6 +43,16 @@ class SmoothPart:
     def coefficients(self) -> int:
         """How many parameters it has."""
         return int(self.value.size)
+
+    def refitted(self, x: Array, columns: IntArray, covariance: Array) -> SmoothPart:
+        """The same function at other parameters x (parameters,), the covariance that of the
+        `columns` fitted."""
+        mine = self.group.columns
+        place = {int(c): k for k, c in enumerate(columns)}
+        at = np.array([place.get(int(c), -1) for c in mine.ravel()])
+        there, matrix = np.flatnonzero(at >= 0), np.zeros((mine.size, mine.size))
+        matrix[np.ix_(there, there)] = covariance[np.ix_(at[there], at[there])]
+        return replace(self, value=x[mine], covariance=matrix)
 
     def course(self, x: Array) -> tuple[Array, Array]:
         """Values and half widths of their 95 % band (components, n) at x (n,); NaN where the
