@@ -26,7 +26,8 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, covariance, project
 from elastocal.diagnosis.shrinkage import left_out_residual, rms_with_interval
 from elastocal.identification.findings import BudgetStep
-from elastocal.model.effects.gears import GearRipple, GearSpectrum
+from elastocal.model.effects.base import index
+from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray
 
@@ -234,14 +235,10 @@ class SumAnswer:
         at_place: dict[tuple[str, str], list[int]] = {}
         for k, c in enumerate(self.found.components):
             if c.named == named:
-                name = GearSpectrum.name if isinstance(c.effect, GearRipple) else c.effect.name
-                at_place.setdefault((name, c.where), []).append(k)
+                at_place.setdefault((c.effect.name, c.where), []).append(k)
         order = sorted(at_place.items(), key=lambda pair: -float(np.median(self.squares(pair[1]))))
         for (name, where), members in order:
             settings = self._settings(members)
-            if name == GearSpectrum.name and len(members) == 1:
-                c = self.found.components[members[0]]
-                name, settings = c.effect.name, dict(c.settings)
             reduction, ci90, ci95 = self._reduction(members)
             probability = max(self._probability(k) for k in members)
             parameters = tuple(p for k in members for p in self._parameters(k))
@@ -265,7 +262,7 @@ class SumAnswer:
         settings: dict[str, float] = {}
         for k, c in zip(members, found, strict=True):
             size, length = float(np.exp(sizes[k]) * c.unit), float(np.exp(lengths[k]))
-            if isinstance(c.effect, GearRipple):
+            if isinstance(c.effect, GearSpectrum):
                 continue
             settings |= dict(c.settings)
             if c.follows:
@@ -274,15 +271,15 @@ class SumAnswer:
                 settings |= {"curve_size_rad": size, "curve_length_rad": length}
             elif c.effect.sized_by:
                 settings[c.effect.sized_by] = size * self._typical(c)
-        ripples = [k for k in members if isinstance(self.found.components[k].effect, GearRipple)]
-        if len(ripples) > 1:
-            lines = sorted(self._line(k) for k in ripples)
-            settings |= {f"order_{n + 1}": order for n, (order, _) in enumerate(lines)}
-            # Of each coefficient, the prior is one size for all lines of a joint.
-            size = math.sqrt(float(np.mean([s**2 for _, s in lines])))
-            settings["spectrum_size_rad"] = size
-            q = self.dataset.table.q[:, int(found[0].where[5:]) - 1]
+        families = [k for k in members if isinstance(self.found.components[k].effect, GearSpectrum)]
+        lines = [line for k in families for line in self._lines(k)]
+        if lines:
+            # One prior size for all lines of a joint.
+            settings["spectrum_size_rad"] = math.sqrt(float(np.mean([s**2 for *_, s in lines])))
+            q = self.dataset.table.q[:, index(found[0].where)]
             settings["spectrum_centre_rad"] = float((q.max() + q.min()) / 2)
+            for n, (order, sd, _) in enumerate(sorted(lines), start=1):
+                settings |= {f"order_{n}": order, f"order_sd_{n}": sd}
         return settings
 
     def _typical(self, c: Component) -> float:
@@ -290,10 +287,12 @@ class SumAnswer:
         assert c.hypothesis is not None
         return float(np.max([p.typical or 0.0 for p in c.hypothesis.parameters]))
 
-    def _line(self, k: int) -> tuple[float, float]:
-        """Order of a line and its prior size in rad."""
+    def _lines(self, k: int) -> list[tuple[float, float, float]]:
+        """Order, its standard deviation and prior size in rad of each line of a family."""
         c = self.found.components[k]
-        return float(c.settings[0][1]), float(np.exp(self.found.sizes.size[k])) * GearRipple.typical
+        given, size = dict(c.settings), float(np.exp(self.found.sizes.size[k])) * c.unit
+        numbers = range(1, len(given) // 2 + 1)
+        return [(given[f"order_{n}"], given[f"order_sd_{n}"], size / n) for n in numbers]
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
         """Estimates of a component's parameters, where they are few and not shrunk."""
