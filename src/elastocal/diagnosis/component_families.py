@@ -96,7 +96,10 @@ def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
             continue
         columns = dataset.packed(h, np.zeros(0))
         if np.abs(columns).max(initial=0.0) > 0:
-            yield Component(family_of(h.effect, cell), h.effect, h.where, columns, hypothesis=h)
+            search = -dataset.columns.shares.get(h.key, 0.0)
+            yield Component(
+                family_of(h.effect, cell), h.effect, h.where, columns, hypothesis=h, search=search
+            )
 
 
 def judged_together(model: Model, table: object) -> list[Hypothesis]:
@@ -211,19 +214,43 @@ def _best_family(dataset: DiagnosisData, grams: Grams, h: Hypothesis, m: int) ->
     each = _family_evidence(dataset, grams, h, orders, m)
     k = int(np.argmax(each))
     search = float(np.log(len(orders) * len(MULTIPLES)))
-    order, evidence = float(orders[k]), float(each[k])
-    width, sd = step, step / 4
-    for _ in range(3):
-        trial = order + np.linspace(-width, width, 17)
-        each = _family_evidence(dataset, grams, h, trial, m)
-        k = int(np.argmax(each))
-        order, evidence = float(trial[k]), float(each[k])
-        near = each > evidence - 4.0
-        if near.sum() >= 4:
-            curvature = -2 * np.polyfit(trial[near] - order, each[near], 2)[0]
-            sd = float(1 / np.sqrt(max(curvature, 1.0 / step**2)))
-        width /= 4
+    order, sd, evidence = _refined(dataset, grams, h, float(orders[k]), m, step)
     return LineFamily(h.where, order, m, evidence - search, sd, search)
+
+
+def tuned_family(dataset: DiagnosisData, found: FittedSum, family: Component) -> Component:
+    """The family of lines with its orders sought anew within NEARBY of their deviations."""
+    h = next(
+        h for h in dataset.hypotheses
+        if isinstance(h.effect, GearRipple) and h.where == family.where
+    )  # fmt: skip
+    given = dict(family.settings)
+    m, order, sd = len(given) // 2, given["order_1"], given["order_sd_1"]
+    grams = _grams(dataset, found.without_these((family,)), found.noise)
+    order, sd, _ = _refined(dataset, grams, h, order, m, NEARBY * sd)
+    return _family_component(dataset, LineFamily(family.where, order, m, 0.0, sd, family.search))
+
+
+NEARBY = 4.0
+
+
+def _refined(
+    dataset: DiagnosisData, grams: Grams, h: Hypothesis, order: float, m: int, width: float
+) -> tuple[float, float, float]:  # fmt: skip
+    """Lowest order of a family, its standard deviation and log evidence, sought within `width` of
+    `order`: the curvature of the evidence says how well it is known."""
+    for narrowed in width / 4.0 ** np.arange(3):
+        trial = order + np.linspace(-narrowed, narrowed, 17)
+        order = float(trial[int(np.argmax(_family_evidence(dataset, grams, h, trial, m)))])
+    trial = np.linspace(-width, width, 33)
+    each = _family_evidence(dataset, grams, h, order + trial, m)
+    evidence = float(each[16])
+    # The parabola through the highest five points, or all that are nearly as high.
+    near = np.abs(trial) <= max(np.abs(trial[each > evidence - 2.0]).min(initial=0.0), trial[18])
+    near |= (each > evidence - 2.0) & (np.abs(trial) < width / 2)
+    curvature = -2 * np.polyfit(trial[near], each[near], 2)[0]
+    sd = float(1 / np.sqrt(max(curvature, 1.0 / width**2)))
+    return order, sd, evidence
 
 
 def _family_evidence(

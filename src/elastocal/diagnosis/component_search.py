@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from elastocal.diagnosis.component_families import (
-    MANY_POSES,
     catalogue_components,
     family_of,
     fields,
     joint_curves,
     judged_together,
     line_families,
+    tuned_family,
 )
 from elastocal.diagnosis.components import COST, Component, FittedSum, fit_sum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
@@ -23,10 +23,12 @@ from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.model.effects.base import index
+from elastocal.model.effects.gears import GearSpectrum
 from elastocal.units import Progress
 
 # Searches for more beside what has been found.
 LINE_SEARCHES, FIELD_SEARCHES = 16, 3
+FEW_POSES = 300  # up to which lines may be sought before curves
 MOST_FIELDS = 4  # that one search adds
 
 
@@ -44,17 +46,20 @@ def search_components(
     others = [*catalogue_components(full), *_searched(full, chosen)]
     progress(f"sizes of {len(curves) + len(others)} components at once")
     both = [*curves, *others]
-    found = _with_lines(full, data, _swapped(full, data, fit_sum(data, both, instrument), both))
-    if len(full.blocks.member) <= MANY_POSES:
+    found = _swapped(full, data, fit_sum(data, both, instrument), both)
+    lined = False
+    if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
         # none of them stands out.
         progress("families of lines before curves")
         first = _swapped(full, data, fit_sum(data, others, instrument), others)
         first = _with_lines(full, data, first)
         other = _wider(data, first, curves) or first
-        print("A", found.score, "B", other.score)
-        if other.score > found.score:
-            found = other
+        lined = other.score > found.score
+        found = other if lined else found
+    if not lined:
+        progress("families of lines beside the components")
+        found = _with_lines(full, data, found)
     for _ in range(FIELD_SEARCHES):
         progress("fields beside the components")
         more = fields(full, found.data, found.noise, found.components, MOST_FIELDS)
@@ -62,7 +67,8 @@ def search_components(
         if wider is None:
             break
         found = wider
-    return full, found
+    progress("what can be left out")
+    return full, _spared(data, found)
 
 
 def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
@@ -73,7 +79,7 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
     for _ in range(LINE_SEARCHES):
         stand_out = line_families(dataset, found)
         wider = None
-        many = len(dataset.blocks.member) > MANY_POSES / 4
+        many = len(dataset.blocks.member) > FEW_POSES
         for chosen in [stand_out] if many else [[family] for family in stand_out[:TRIED]]:
             without = {id(c) for family in chosen for c in family.instead_of}
             kept = [k for k, c in enumerate(found.components) if id(c) not in without]
@@ -90,10 +96,46 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
                 break
         if wider is None:
             break
-        found = wider
+        found = wider if many else _tuned(dataset, data, wider)
     return found
 
 
+def _tuned(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum with the orders of its lines sought anew, close by, beside what else is in it now."""
+    for c in found.components:
+        if not isinstance(c.effect, GearSpectrum):
+            continue
+        near = tuned_family(dataset, found, c)
+        if abs(near.settings[0][1] - c.settings[0][1]) < TUNED * c.settings[1][1]:
+            continue
+        start = found.sizes
+        tuned = [near if other is c else other for other in found.components]
+        fitted = fit_sum(data, tuned, found.noise, start, refit_noise=False)
+        if fitted.score > found.score:
+            found = fitted
+    return found
+
+
+TUNED = 0.2  # standard deviations of an order that are worth another fit
+
+
+def _spared(data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum without what the others can stand in for, once their sizes have followed."""
+    spared = 0
+    order = np.argsort(found.earned - [c.cost for c in found.components])
+    for c in [found.components[k] for k in order[:SPARED]]:
+        kept = [k for k, other in enumerate(found.components) if other is not c]
+        if len(kept) == len(found.components):
+            continue
+        fewer = [found.components[k] for k in kept]
+        start = found.sizes.chosen(kept)
+        fitted = fit_sum(data, fewer, found.noise, start, refit_noise=False)
+        if fitted.score > found.score:
+            found, spared = fitted, spared + 1
+    return fit_sum(data, found.components, found.noise, found.sizes) if spared else found
+
+
+SPARED = 6  # components that are tried to be left out, those first that earn least
 TRIED = 3  # families that are tried, the best first, before a search is given up
 
 
