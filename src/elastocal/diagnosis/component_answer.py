@@ -34,6 +34,7 @@ from elastocal.units import Array, BoolArray
 DRAWS = 400
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
+TOLD = 0.02  # share of the gap from which it matters which of several effects it is
 LARGE = 0.1  # share of the gap from which what has no name leaves the verdict open
 
 
@@ -83,6 +84,14 @@ class SumAnswer:
         w = self.draws[index]
         return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
 
+    def shares(self, members: Sequence[int]) -> Array:
+        """What these components add to the mean square of the whole, over that (draws,): shares
+        sum to one, and one that cancels a part of others is negative."""
+        index = np.concatenate([np.r_[self._span(k)] for k in members])
+        w = self.draws
+        with_all = np.einsum("kd,kd->d", w[index], self.gram[index] @ w)
+        return np.asarray(with_all / np.maximum(self.total, 1e-300))
+
     @cached_property
     def total(self) -> Array:
         return self.squares(range(len(self.found.components)))
@@ -99,9 +108,7 @@ class SumAnswer:
         return tuple(sorted(rows, key=lambda row: -row.share))
 
     def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
-        square = self.squares(members)
-        share = square / np.maximum(self.total, 1e-300)
-        rms = np.sqrt(square)
+        share, rms = self.shares(members), np.sqrt(self.squares(members))
         chosen = [self.found.components[k] for k in members]
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
@@ -121,7 +128,7 @@ class SumAnswer:
         return tuple(sorted((self._group(*item) for item in kinds.items()), key=lambda g: -g.share))
 
     def _group(self, name: str, members: list[int]) -> EffectGroup:
-        share = self.squares(members) / np.maximum(self.total, 1e-300)
+        share = self.shares(members)
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         chosen = [self.found.components[k] for k in members]
         reduction, ci90, _ = self._reduction(members)
@@ -183,8 +190,21 @@ class SumAnswer:
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         sets = []
         for k, rivals in self._rivals.items():
-            own = self.found.components[k].hypothesis
+            c, own = self.found.components[k], self.found.components[k].hypothesis
             assert own is not None
+            if abs(float(np.median(self.shares([k])))) < TOLD:
+                continue
+            if _of_gear(c):
+                # Which harmonic of one joint's error it is decides nothing.
+                angular = {(e.effect.name, e.where) for e in self.found.components if _of_gear(e)}
+                rivals = {
+                    key: p for key, p in rivals.items() if key == own.key or key[1] != c.where
+                }
+                rivals = {
+                    key: p for key, p in rivals.items() if key not in angular or key == own.key
+                }
+                whole = sum(rivals.values())
+                rivals = {key: p / whole for key, p in rivals.items()}
             if rivals.get(own.key, 0.0) < NAMED:
                 keys = [own.key, *(key for key in rivals if key != own.key)][:3]
                 sets.append(tuple(EffectAt(*key) for key in keys))
@@ -196,7 +216,7 @@ class SumAnswer:
         members = [k for k, c in enumerate(self.found.components) if not c.named]
         if not members:
             return 0.0
-        return float(np.median(self.squares(members) / np.maximum(self.total, 1e-300)))
+        return float(np.median(self.shares(members)))
 
     @property
     def n_causes(self) -> int:
