@@ -129,7 +129,7 @@ def judged_together(model: Model, table: object) -> list[Hypothesis]:
 MULTIPLES = (1, 2, 3)  # lines of a family, up to so many times the lowest order
 LOWEST, HIGHEST = 2.5, 250.0  # orders
 STEP = 1.5  # of the highest order of a family, in units of 1/range(q)
-MANY_POSES = 1200  # from so many on single lines show by themselves
+MANY_POSES = 300  # from so many on single lines show by themselves
 LINE = 5e-5  # rad, a typical line
 LINE_SCALES = np.array([0.3, 1.0, 3.0, 10.0])
 PIECE = 4_000_000  # numbers of directions that are held at a time

@@ -115,7 +115,8 @@ class ComponentShare:
     "load", "move" (the last one), "time", "temperature", "pose", "tool".  `share` is what it
     adds to the mean square gap after geometry, over that, with its 90 % interval: shares sum to
     one, and that of a component which cancels a part of others may be negative.  `rms` in m, with
-    its 95 % interval.  `probability` that it is there at all; `named` where some effect of the catalogue is in it.
+    its 95 % interval.  `probability` that it is there at all; `named` where some effect of the
+    catalogue is in it.
     """
 
     family: str
