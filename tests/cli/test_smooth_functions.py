@@ -12,6 +12,8 @@ from support.robots import KR270
 from typer.testing import CliRunner, Result
 
 from elastocal.cli.app import app
+from elastocal.model import Model
+from elastocal.model.smooth_groups import smooth_groups
 
 CELL = """
 name = "curved"
@@ -99,22 +101,30 @@ def test_the_report_draws_them(folder: Path) -> None:
 
 
 def test_compensate_undoes_them(folder: Path) -> None:
-    """The commands put the true arm, curves and all, where the nominal arm should be."""
-    poses(folder / "targets.csv", 12, 3)
-    out = folder / "commands.csv"
+    """The commands put the true marker, curves and all, where it should be."""
+    cell, out = folder / "cell.toml", folder / "commands.csv"
+    model = Model(cell)
+    truth = json.loads((folder / "truth.json").read_text())
+    x = np.array([truth[name] for name in model.names])
+    poses(folder / "q.csv", 12, 3)
+    plan = model.read_plan(folder / "q.csv")
+    wanted = model.target_poses(model.table(plan.q), x)[1]
+    with (folder / "targets.csv").open("w") as file:
+        file.write("x_mm,y_mm,z_mm\n")
+        file.writelines(",".join(map(repr, map(float, p * 1e3))) + "\n" for p in wanted)
     done = run(
-        "compensate",
-        folder / "cell.toml",
-        folder / "result.json",
-        folder / "targets.csv",
-        "-o",
-        out,
-    )
+        "compensate", cell, folder / "result.json", folder / "targets.csv", "-o", out,
+        "--frame", "tracker",
+    )  # fmt: skip
     assert done.exit_code == 0, done.output
     assert "12 of 12 targets reached" in done.output
     rows = list(csv.DictReader(out.open()))
-    std = np.array([float(row["std_um"]) for row in rows])
-    assert (std > 1).all() and np.median(std) < 100
+    q = np.radians([[float(row[f"q{k + 1}_deg"]) for k in range(6)] for row in rows])
+    std = np.array([float(row["std_um"]) for row in rows]) * 1e-6
+    inside = (q[:, 0] > -1.5) & (q[:, 0] < 1.5) & (q[:, 1] > -1.8) & (q[:, 1] < -0.4)
+    error = np.linalg.norm(model.target_poses(model.table(q), x)[1] - wanted, axis=1)
+    assert inside.sum() >= 3
+    assert (error[inside] < 4 * std[inside]).all() and np.median(error[inside]) < 1e-4
 
 
 def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
@@ -148,9 +158,6 @@ def test_export_writes_them_as_corrections(folder: Path) -> None:
     assert float(own[-1]["position_deg"]) == pytest.approx(np.degrees(-0.4), abs=1e-3)
     # Beside the truth, less what offsets stand for.
     truth = json.loads((folder / "truth.json").read_text())
-    from elastocal.model import Model
-    from elastocal.model.smooth_groups import smooth_groups
-
     model = Model(folder / "cell.toml")
     group = smooth_groups(model)[1]
     x = np.radians([float(row["position_deg"]) for row in own])

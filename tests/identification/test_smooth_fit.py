@@ -67,7 +67,7 @@ def campaign(seed: int = 0, n: int = 80, curves: float = 1.0):
 
 
 def test_new_poses_are_predicted_to_the_noise():
-    model, x, table, test, fit = campaign()
+    _model, _x, table, test, fit = campaign()
     plain = identify(arm(*PLACED, "joint_offset"), table, test=test)
     assert fit.converged and fit.method == "reml"
     assert plain.test.rms > 3e-4, "the curves are large"
@@ -100,7 +100,7 @@ def test_every_parameter_stands_in_the_result_and_functions_stand_together():
 def test_the_band_of_a_curve_holds_the_true_one():
     inside = []
     for seed in range(3):
-        model, x, _, _, fit = campaign(seed)
+        _model, x, _, _, fit = campaign(seed)
         for part in fit.smooth:
             grid, value, half = part.shape()
             truth = replace(part, value=x[part.group.columns]).shape()[1]
@@ -111,7 +111,7 @@ def test_the_band_of_a_curve_holds_the_true_one():
 
 def test_held_out_residuals_are_those_of_refits():
     """Leaving out a configuration for good: prior and noise as found, on the model itself."""
-    model, x, table, _, _ = campaign(n=40)
+    model, _x, table, _, _ = campaign(n=40)
     options = Options(method="ols", faulty="keep")
     fit = identify(model, table, options)
     observed = observe(table, model.observe)
@@ -180,7 +180,7 @@ def test_a_curve_that_is_larger_than_stated_is_fitted_all_the_same():
 
 def test_faulty_readings_are_judged_beside_the_curves():
     """0.3 mm hide in what curves of 0.5 mrad leave a model without them, not beside them."""
-    model, x, table, test, clean = campaign()
+    model, _x, table, test, clean = campaign()
     position = np.asarray(table.position).copy()
     position[[5, 40]] += [[3e-4, 0, 0], [0, 0, -4e-4]]
     fit = identify(model, replace(table, position=position), test=test)
@@ -193,7 +193,7 @@ def test_readings_of_one_place_that_agree_are_no_errors():
     """A bend that only a few neighbouring poses see: the model lacks something there."""
     model, x, table, *_ = campaign()
     q = table.q.copy()
-    q[:3] = [1.9, 1.9, -1.9] + np.array([[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 1e-3]])
+    q[:3] = np.array([[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 1e-3]]) + np.array([1.9, 1.9, -1.9])
     rng = np.random.default_rng(3)
     moved = measured(model, replace(table, q=q), x, SIGMA, rng)
     position = np.asarray(moved.position).copy()
@@ -209,7 +209,7 @@ def test_readings_without_noise_are_no_reason_to_fail():
 
 
 def test_stated_noise_and_plain_weights_are_taken_as_they_are():
-    model, x, table, test, _ = campaign()
+    model, _x, table, test, _ = campaign()
     for method in ("ols", "wls"):
         noise = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
         known = Model.assembled(model.chain, replace(model.cell, tracker=noise))
@@ -245,7 +245,7 @@ def test_a_stated_prior_joins_that_of_the_curves():
 
 
 def test_bounds_on_ordinary_parameters_do_not_profile_the_curves():
-    model, x, table, *_ = campaign()
+    _model, _x, table, *_ = campaign()
     effects = (*EFFECTS, "joint_compliance:joint2")
     elastic = arm(*effects)
     fit = identify(elastic, table, Options(constraints=non_negative("joint2.compliance")))
@@ -253,7 +253,7 @@ def test_bounds_on_ordinary_parameters_do_not_profile_the_curves():
 
 
 def test_functions_may_be_fixed():
-    model, x, table, *_ = campaign()
+    model, _x, table, *_ = campaign()
     fit = identify(model, table, Options(fixed=("joint_curve",)))
     assert not fit.smooth and fit.heldout_rms > 2e-4
     two = identify(model, table, Options(fixed=("joint3.curve_1",)))

@@ -69,7 +69,7 @@ from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-STEPS, FEW, HALVINGS = 25, 5, 8
+STEPS, FEW, HALVINGS = 25, 3, 8
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
 ROUGH = 1e-2  # the same, where rounding allows no better step
 ROUNDING = 1e-12

@@ -29,8 +29,8 @@ SMALL = 0.05
 PRICE = 0.75
 # Noise as shares of the variance that ordinary parameters leave, from which the search starts.
 SHARES = (1.0, 0.1, 0.01, 0.001)
-STEPS = 60
-TOLERANCE = 1e-3  # of the log-likelihood per row, relative
+STEPS = 40
+TOLERANCE = 1e-2  # of the log-likelihood per row, relative
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class ShrunkProblem:
             # From nothing the likelihood shows no way back: those there start once more.
             variance = self._terms(np.exp(self._spread(free, alive))).q / self.spare
             small = free < np.log(SMALL / variance)
-            if small.any():
+            if start is None and small.any():
                 again, other = least(np.where(small, -np.log(variance), free))
                 if again < value:
                     free = other
@@ -235,7 +235,7 @@ class ShrunkPosterior:
     """The estimate under a prior: ordinary columns first, then the shrunk ones that take part.
 
     `R` (columns, columns) is upper triangular, RᵀR the normal matrix of readings and prior in
-    units of σ; z (ordinary,) its right side and b (own,) the estimate of the shrunk parameters, from
+    units of σ; z (ordinary,) its right side and b (own,) the shrunk parameters' estimate, from
     nominal.  `own` index those that take part, `prior` (own,) is σ over their standard deviations.
     """
 
