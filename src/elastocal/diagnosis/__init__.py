@@ -9,8 +9,9 @@ ROOMS = {
     ),
     "diagnose": "DiagnosisOptions write_extended_cell",
     "diagnosis": (
-        "Candidate Curve Diagnosis EffectAt ExtraPlan FaultyReading FittedParameter "
-        "FoundEffect Gap Location NearRepeats NoiseFloor RivalPair StructureTest Untested publish"
+        "Candidate ComponentShare Curve Diagnosis EffectAt EffectGroup ExtraPlan FaultyReading "
+        "FittedParameter FoundEffect Gap Location NearRepeats NoiseFloor RivalPair "
+        "StructureTest Untested publish"
     ),
     "diagnosis_data": "DiagnosisData diagnosis_data_of",
     "discrimination": (

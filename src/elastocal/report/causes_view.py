@@ -90,12 +90,12 @@ def share_text(fraction: float, fine: bool | None = None) -> str:
     return f"{100 * fraction + 0.0:.{1 if fine else 0}f} %".replace("-", "−")
 
 
-def span_text(ends: Interval) -> str:
-    """ "50 to 59 %", "1.2 to 2.0 %"."""
+def span_text(ends: Interval, middle: float) -> str:
+    """ "50 to 59 %", "1.2 to 2.0 %", as fine as what is in the `middle`."""
     low, high = ends
     if not (math.isfinite(low) and math.isfinite(high)):
         return "–"
-    fine = max(abs(low), abs(high)) < FINE
+    fine = abs(middle) < FINE
     return f"{share_text(low, fine).removesuffix(' %')} to {share_text(high, fine)}"
 
 
@@ -108,7 +108,9 @@ def headline_of_causes(d: Diagnosis) -> str:
     ]
     if more := len(found) - len(told):
         told.append(counted(more, "smaller cause"))
-    text, several = together(told), len(found) > 1 or len(d.groups[0].places) > 1
+    first = d.groups[0]
+    plural = len(first.places) > 1 or first.name.endswith("errors")
+    text, several = together(told), len(found) > 1 or plural
     if d.verdict == "explained":
         return f"{text} explain{'s' * (not several)} the gap."
     if d.verdict == "ambiguous":
@@ -129,8 +131,9 @@ def cause_rows(d: Diagnosis) -> ShownTable:
     """One row per finding: its share of the gap, and what it takes off the error of new poses."""
     rows = [
         (
-            c.name, share_text(c.share), span_text(c.share_ci90),
-            "–" if c.reduction is None else share_text(c.reduction), span_text(c.reduction_ci90),
+            c.name, share_text(c.share), span_text(c.share_ci90, c.share),
+            "–" if c.reduction is None else share_text(c.reduction),
+            span_text(c.reduction_ci90, c.reduction or 0.0),
         )
         for c in causes(d)
     ]  # fmt: skip
@@ -150,7 +153,7 @@ def place_rows(d: Diagnosis) -> ShownTable:
             effects = ", ".join(map(plain_name, c.effects)) if c.named else NAMELESS
             rows.append((
                 place(c.where), family(c), effects, f"{length(c.rms)} ({lengths(c.rms_ci95)})",
-                f"{share_text(c.share)} ({span_text(c.share_ci90).removesuffix(' %')})",
+                f"{share_text(c.share)} ({span_text(c.share_ci90, c.share).removesuffix(' %')})",
                 probability(c.probability),
             ))  # fmt: skip
         told += parts
@@ -197,8 +200,8 @@ def field_rows(d: Diagnosis) -> ShownTable:
 
 def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
     """A row for everything that a field follows; the last columns in the first row only."""
-    ends = f.gap_reduction_ci95
-    told: Sequence[str] = (share_text(f.gap_reduction), span_text(ends))
+    fall = f.gap_reduction
+    told: Sequence[str] = (share_text(fall), span_text(f.gap_reduction_ci95, fall))
     for key, value in f.settings.items():
         name, _, rest = key.rpartition("size")
         if not name or rest not in ("", "_rad"):

@@ -440,7 +440,7 @@ def chain_boxes(d: Diagnosis) -> list[ChainBox]:
 
 def _evidence(d: Diagnosis, value: float) -> str:
     shared = d.location is not None and d.location.shares
-    return share_text(value) if shared else probability(value)
+    return share_text(min(value, 1.0)) if shared else probability(value)
 
 
 def likeliest_places(d: Diagnosis) -> list[tuple[str, str]]:
