@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from elastocal.errors import InputError
-from elastocal.measurements import Measurements, families, read_measurements, write_measurements
+from elastocal.measurements import (
+    Measurements,
+    families,
+    read_measurements,
+    with_moves,
+    write_measurements,
+)
 from elastocal.text import is_label
 
 SETTINGS = settings(
@@ -166,6 +172,7 @@ def test_what_is_written_reads_back_bit_for_bit(tmp_path, table, data):
     path = tmp_path / "data.csv"
     write_measurements(table, path, joint_kinds=kinds)
     again = read_measurements(path, joint_kinds=kinds, marker_names=table.marker_names)
+    table = with_moves(table)  # what follows from the order of the rows is no column
     for name in vars(table):
         before, after = getattr(table, name), getattr(again, name)
         if isinstance(before, np.ndarray):

@@ -162,7 +162,9 @@ STILL = 1e-4  # rad or m; a joint that moved by less has stayed where it was
 def visits(table: Measurements) -> IntArray:
     """Number (n,) of each row's visit: its configuration, repeat and force."""
     number = np.zeros(len(table), dtype=np.int64)
-    for values in (table.configuration, table.repeat, *np.round(table.force, 6).T):
+    with np.errstate(over="ignore"):  # of forces beyond all measure
+        force = np.round(table.force, 6)
+    for values in (table.configuration, table.repeat, *force.T):
         codes = np.unique(values, return_inverse=True)[1].ravel()
         number = number * (int(codes.max(initial=0)) + 1) + codes
         number = np.unique(number, return_inverse=True)[1].ravel()
