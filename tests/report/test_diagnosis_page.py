@@ -72,7 +72,7 @@ def test_every_number_of_the_answer_is_on_the_page(pages):
     rows = {row[0]: row for row in page.rows if row}
     assert rows["gear eccentricity at joint 2"][1] == "0.98"  # the last table of the two
     assert rows["joint2.eccentricity_sin"][1:] == ["0.112", "0.012", "mrad"]
-    assert rows["joint 2 angle"][1:] == ["< 0.001", "0.0040"]
+    assert rows["joint 2 angle"][1:] == ["0.00050", "0.0040"]
     assert rows["joint 2"][1] == "0.98"
     assert rows["88"][1:] == ["29", "M3", "1.30 mm", "71.0"]
     assert rows["joint compliance"][1:3] == ["84.0 µm", "71.0 µm to 97.0 µm"]
