@@ -210,7 +210,7 @@ class DirectChecks:
         return self._over_limits(squared, power, np.where(known, self.size, 0), "repeats")
 
     def _over_limits(
-        self, squared: Array, power: Array, dof: Array, check: str
+        self, squared: Array, power: Array, dof: IntArray, check: str
     ) -> tuple[Array, Array]:
         """χ² statistics (N,) over their limits, the scale set by their median when the `check` is
         first made."""

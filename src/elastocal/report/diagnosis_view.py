@@ -206,9 +206,12 @@ def _error_lines(d: Diagnosis) -> list[str]:
     return [f"{text} Of the noise-free error of new poses {together(each)}.", *rest]
 
 
+MATERIAL = 0.2  # of the noise: 2 % more in all
+
+
 def _unexplained_lines(d: Diagnosis) -> list[str]:
     """What looks like noise and is none."""
-    if not d.gap.unexplained:
+    if d.gap.unexplained <= MATERIAL * d.gap.noise_floor:
         return []
     return [
         f"{length(d.gap.unexplained)} rms look like scatter of the arm and are no noise: readings "
