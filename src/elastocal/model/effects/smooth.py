@@ -78,7 +78,7 @@ class Waves:
             period, reach = 2 * math.pi, math.inf
         count = math.ceil(HIGHEST / length * period / (2 * math.pi))
         order = np.arange(1, min(max(count, 1), MOST_WAVES) + 1)
-        frequency = np.asarray(2 * np.pi / period * order, dtype=np.float64)
+        frequency = np.asarray(2 * np.pi * order / period, dtype=np.float64)
         return cls(low, frequency, span, reach)
 
     def variances(self, size: float, length: float) -> Array:
