@@ -7,6 +7,10 @@ ROOMS = {
     "baseline": (
         "Baseline Blocks VisitPlaces fit_baseline from_centre made_once prior_deviations thinned"
     ),
+    "component_answer": "SumAnswer",
+    "component_families": "catalogue_components driven_columns joint_curves line_families",
+    "component_search": "compared_score search_components",
+    "components": "Component FittedSum Sizes SumOfComponents fit_sum posed",
     "diagnose": "DiagnosisOptions write_extended_cell",
     "diagnosis": (
         "Candidate ComponentShare Curve Diagnosis EffectAt EffectGroup ExtraPlan FaultyReading "
