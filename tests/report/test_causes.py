@@ -112,6 +112,13 @@ def test_sentences_do_not_repeat_the_tables():
     ]
 
 
+def test_what_corrections_without_a_name_take_away_is_told_apart():
+    error = dict(diagnosis_lines(MANY_UNKNOWN))["Error"]
+    assert "from 426 µm to 137 µm rms (noise alone: 61.0 µm)" in error
+    assert error.endswith("Smooth corrections without a name take it to 90.0 µm.")
+    assert "without a name" not in dict(diagnosis_lines(MANY))["Error"]
+
+
 def test_every_family_is_a_phrase():
     families = ("angle", "gravity", "torque", "load", "move", "time", "temperature", "pose", "tool")
     d = replace(MANY, components=tuple(part(f, "joint2", ("joint_curve",), 0.1) for f in families))
