@@ -35,6 +35,7 @@ from elastocal.report.diagnosis_view import (
     gap_rows,
 )
 from elastocal.report.effect_names import name_of, places, settings_text
+from elastocal.report.figures import share_bars
 
 
 def test_the_headline_names_findings_with_their_shares():
@@ -90,6 +91,16 @@ def test_a_single_cause_has_no_table_of_causes():
         assert not cause_rows(d).rows and not place_rows(d).rows and not field_rows(d).rows
 
 
+def test_a_share_that_cancels_others_is_negative_and_drawn():
+    parts = (*MANY.components, replace(part("load", "base", ("base_drift",), 0.03), share=-0.03,
+                                       share_ci90=(-0.05, -0.01)))  # fmt: skip
+    group = replace(MANY.groups[0], name="base_drift", places=("base",), effects=("base_drift",),
+                    share=-0.03, share_ci90=(-0.05, -0.01))  # fmt: skip
+    d = replace(MANY, components=parts, groups=(*MANY.groups, group))
+    assert cause_rows(d).rows[-1][1:3] == ("−3.0 %", "−5.0 to −1.0 %")
+    assert "svg" in share_bars(d)
+
+
 def test_sentences_do_not_repeat_the_tables():
     labels = [label for label, _ in diagnosis_lines(MANY_AMBIGUOUS)]
     assert labels == ["Verdict", "Error", "Curves", "Chance"]
@@ -99,6 +110,13 @@ def test_sentences_do_not_repeat_the_tables():
     assert alike(MANY_AMBIGUOUS) == [
         "gear eccentricity at joint 5 (probability 0.58) and gear second harmonic at joint 5"
     ]
+
+
+def test_what_corrections_without_a_name_take_away_is_told_apart():
+    error = dict(diagnosis_lines(MANY_UNKNOWN))["Error"]
+    assert "from 426 µm to 137 µm rms (noise alone: 61.0 µm)" in error
+    assert error.endswith("Smooth corrections without a name take it to 90.0 µm.")
+    assert "without a name" not in dict(diagnosis_lines(MANY))["Error"]
 
 
 def test_every_family_is_a_phrase():
@@ -143,7 +161,7 @@ def test_places(where, runs, text):
 @pytest.mark.parametrize(
     ("share", "text"),
     [(0.553, "55 %"), (1.004, "100 %"), (0.0161, "1.6 %"), (0.0002, "< 0.1 %"), (-0.012, "−1.2 %"),
-     (float("nan"), "–"), (0.0, "0.0 %")],
+     (float("nan"), "–"), (0.0, "0.0 %"), (-0.0002, "0.0 %")],
 )  # fmt: skip
 def test_shares(share, text):
     assert share_text(share) == text
@@ -171,6 +189,16 @@ def test_settings_of_a_curve_are_short():
     text = settings_text(curve(2, 3.2e-4).settings)
     assert text == "from −166° to 28.6°, size 0.320 mrad, length 4.01°"
     assert settings_text({"sag_size_rad": 2.2e-4}) == "sag size 0.220 mrad"
+
+
+def test_orders_of_a_spectrum_have_their_uncertainty_and_do_not_drown_the_rest():
+    lines = {f"order_{n}": 18.5193 * n for n in range(1, 9)}
+    sds = {f"order_sd_{n}": 0.012 * n for n in range(1, 9)}
+    size = {"spectrum_size_rad": 5e-5, "spectrum_centre_rad": -0.3}
+    text = settings_text(size | lines | sds)
+    assert text.startswith("spectrum size 0.0500 mrad, orders 18.519 ± 0.024, 37.04 ± 0.05, ")
+    assert text.endswith("and 2 more") and "centre" not in text
+    assert settings_text({"order_1": 2.0}) == "order 2.000"
 
 
 def test_a_written_cell_is_told_in_short_where_much_was_added():

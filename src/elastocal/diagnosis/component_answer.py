@@ -249,10 +249,7 @@ class SumAnswer:
             at_stage.setdefault(_stage_of(c), []).append(k)
             places[c.where] = max(places.get(c.where, 0.0), self._there(k))
         stages = {stage: max(map(self._there, own)) for stage, own in at_stage.items()}
-        shares = {
-            stage: float(np.median(self.squares(own) / np.maximum(self.total, 1e-300)))
-            for stage, own in at_stage.items()
-        }
+        shares = {stage: float(np.median(self.shares(own))) for stage, own in at_stage.items()}
         open_ones = [k for k in members if not self.found.components[k].named]
         chosen = open_ones if self.verdict == "unknown_effect" else list(members)
         largest = max(chosen, key=lambda k: float(np.median(self.squares([k]))))

@@ -427,9 +427,9 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         )  # fmt: skip
         yield Finding("many_causes", "note", numbers, remedy)
     if d.verdict == "unknown_effect" and d.effects:
-        named = {"effects": tuple(f"{f.effect}:{f.where}" for f in d.effects)}
+        numbers = {"effects": tuple(f"{f.effect}:{f.where}" for f in d.effects)}
         alone = _kept_back("the effects named added, and nothing for what has no name: keep it")
-        yield Finding("named_beside_unknown", "care", named, "" if d.fields else alone)
+        yield Finding("named_beside_unknown", "care", numbers, "" if d.fields else alone)
     if d.fields:
         numbers = {"fields": tuple(f"{f.effect}:{f.where}" for f in d.fields)}
         beside = "the effects named and " if d.effects else ""

@@ -87,7 +87,8 @@ def share_text(fraction: float, fine: bool | None = None) -> str:
     fine = abs(fraction) < FINE if fine is None else fine
     if fine and 0 < fraction < 0.0005:
         return "< 0.1 %"
-    return f"{100 * fraction + 0.0:.{1 if fine else 0}f} %".replace("-", "−")
+    digits = 1 if fine else 0
+    return f"{round(100 * fraction, digits) + 0.0:.{digits}f} %".replace("-", "−")
 
 
 def span_text(ends: Interval, middle: float) -> str:

@@ -197,6 +197,10 @@ def _error_lines(d: Diagnosis) -> list[str]:
         f"On held-out poses the error falls from {calibrated} to {length(d.gap.explained)} rms "
         f"(noise alone: {floor})."
     )
+    nameless = [s for s in d.budget if s.step.startswith("unknown:")]
+    if d.groups and nameless:
+        left = length(nameless[-1].heldout_rms)
+        text += f" Smooth corrections without a name take it to {left}."
     if d.groups:  # the table of causes says what each takes away
         return [text, *rest]
     if len(d.effects) == 1:

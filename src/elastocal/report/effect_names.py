@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Candidate, EffectAt, FoundEffect
-from elastocal.report.formatting import printable, significant, together
+from elastocal.report.formatting import printable, significant, together, with_uncertainty
 
 # Places that are the only one their effects have: "base drift", not "base drift at base".
 SINGLE = ("base", "wrist", "load", "tracker")
@@ -155,13 +155,33 @@ def settings_text(settings: Mapping[str, float]) -> str:
     begin = first.pop() if len(first) == 1 < len(settings) else ""
     texts = []
     for key, value in settings.items():
+        if LINE.fullmatch(key) or key.endswith(REFERENCE):
+            continue
         if key in pairs:
             high = setting_value(pairs[key], settings[pairs[key]])
             texts.append(f"from {setting_value(key, value)} to {high}")
         elif key not in pairs.values():
             name = plain_name(_name_and_unit(key)[0].removeprefix(begin))
             texts.append(f"{name} {setting_value(key, value)}")
-    return ", ".join(texts)
+    return ", ".join([*texts, *_orders(settings)])
+
+
+LINE = re.compile(r"order_(sd_)?[0-9]+")  # of a spectrum: an order and how uncertain it is
+REFERENCE = "_centre_rad"  # where phases count from says nothing
+MOST_ORDERS = 6
+
+
+def _orders(settings: Mapping[str, float]) -> list[str]:
+    """ "orders 1.000 ± 0.002, 18.52 ± 0.03 and 4 more", with 95 % half widths."""
+    told = []
+    orders = [key for key in settings if (line := LINE.fullmatch(key)) and not line[1]]
+    for key in orders[:MOST_ORDERS]:
+        sd = settings.get(key.replace("_", "_sd_"), 0.0)
+        value, half = with_uncertainty(settings[key], 1.96 * sd)
+        told.append(f"{value} ± {half}" if sd > 0 else significant(settings[key], 4))
+    if more := len(orders) - len(told):
+        told.append(f"{more} more")
+    return [f"order{'s' * (len(orders) > 1)} {together(told)}"] if told else []
 
 
 def _name_and_unit(key: str) -> tuple[str, str]:

@@ -252,22 +252,23 @@ def share_bars(d: Diagnosis) -> str:
                 (f"{place(c.where)}, {family(c)}", c.share, c.share_ci90, False, colour)
                 for c in cause.parts
             ]
-    longest = max((row[2][1] for row in rows if math.isfinite(row[2][1])), default=1.0)
+    ends = [end for row in rows for end in row[2] if math.isfinite(end)]
+    least, most = min(0.0, *ends, 0.0), max(0.01, *ends, 0.01)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for k, (_, share, ci90, whole, colour) in enumerate(rows):
             axes.barh(k, 100 * share, height=0.62 if whole else 0.34, facecolor=colour,
                       edgecolor="none", alpha=1.0 if whole else 0.45)  # fmt: skip
-            ends = [100 * end for end in ci90]
-            axes.plot(ends, [k, k], color=INK, linewidth=1.4, solid_capstyle="butt")
-            axes.plot(ends, [k, k], "|", color=INK, markersize=7 if whole else 5)
-            axes.annotate(share_text(share), (max(100 * share, ends[1]), k), (6, 0),
+            both = [100 * end for end in ci90]
+            axes.plot(both, [k, k], color=INK, linewidth=1.4, solid_capstyle="butt")
+            axes.plot(both, [k, k], "|", color=INK, markersize=7 if whole else 5)
+            axes.annotate(share_text(share), (max(100 * share, both[1]), k), (6, 0),
                           textcoords="offset points", va="center", fontsize=8)  # fmt: skip
         _name_rows(axes, [_axis_name(name) for name, *_ in rows])
         for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
             tick.set_fontsize(9 if row[3] else 8)
-        axes.set_xlim(0, 112 * max(longest, 0.01))
+        axes.set_xlim(100 * least, 112 * most)
         axes.set_xlabel("share of the gap in %, with 90 % interval")
 
     return drawn(draw, WIDTH, 0.7 + 0.8 * BAR_HEIGHT * len(rows), "What the gap is made of")

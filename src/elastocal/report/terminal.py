@@ -296,8 +296,8 @@ def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
     if found.rows:
         yield table_of("What the gap is made of", found, whole=True)
         yield Text(
-            "share: of the mean square error of the calibrated arm, by itself; shares of causes "
-            "that go together do not add up to 100 %. error falls by: of new poses, once this and "
+            "share: what it adds to the mean square error of the calibrated arm, over that; below "
+            "zero where it cancels a part of others. error falls by: of new poses, once this and "
             "nothing else joins the model.\n",
             style="dim",
         )
