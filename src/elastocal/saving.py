@@ -119,7 +119,8 @@ def wish_of(
 
     Args:
         path: The file to write.
-        format: urdf, mjcf, dh, mdh (modified DH), yaml or json; None goes by the file's ending.
+        format: urdf, mjcf, dh, mdh (modified DH), yaml, json or corrections (smooth functions as
+            CSV); None goes by the file's ending.
         load: Force (3,) in N at the load point (data's axes) to state costs under; default none.
         frames: URDF: links for markers and load point.
         base_frame: URDF: the data's frame above the robot's base.

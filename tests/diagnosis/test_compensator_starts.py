@@ -69,8 +69,8 @@ def test_a_profile_times_the_factor_of_its_row_is_the_column_of_the_whole_model(
     search: StartSearch,
 ) -> None:
     for start in (search.starts[77], search.starts[400]):
-        _, whole = search._amplitude(start)
-        profile = SPRING.profiles("joint2", [start], search.base.observed.table.q)
+        _, whole = search._amplitude(start, search.part.table)
+        profile = SPRING.profiles("joint2", [start], search.part.table.q)
         fast = search._factor * profile
         assert np.abs(fast - whole).max() < 2e-3 * np.abs(whole).max()
 

@@ -30,6 +30,7 @@ from elastocal.diagnosis import (
     project,
     scan,
 )
+from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.effect_search import FLIPS
 
 TRIED = ("gear_eccentricity", "encoder_scale", "encoder_jump", "marker_slip", "hysteresis")
@@ -79,7 +80,7 @@ def test_what_was_planted_is_chosen_with_its_time() -> None:
     found = run(noisy(1, (item(*SLIP), (1.0, -0.7, 0.4))))
     assert keys(found) == {SLIP[:2]}
     assert found.chosen.items[0].settings == pytest.approx(645.0, abs=16)
-    assert len(found.slots) == len(found.p_values) == 1 and found.p_values[0] == 1 / 200
+    assert len(found.slots) == len(found.p_values) == 1 and found.p_values[0] == SMALLEST_P
 
 
 def test_three_effects_are_chosen_and_no_fourth() -> None:
@@ -102,9 +103,9 @@ def test_false_alarms_keep_to_the_level() -> None:
     assert sum(bool(run(noisy(s)).chosen.items) for s in range(500, 560)) <= 8
 
 
-def test_a_level_below_what_the_flips_resolve_claims_nothing() -> None:
+def test_a_level_below_what_the_tail_of_the_flips_resolves_claims_nothing() -> None:
     dataset = noisy(1, (item(*SLIP), (1.0, -0.7, 0.4)))
-    assert run(dataset, level=0.004).chosen.items == ()
+    assert run(dataset, level=SMALLEST_P / 2).chosen.items == ()
 
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])

@@ -42,7 +42,10 @@ def export(
     ],
     format: Annotated[
         str | None,
-        typer.Option(help="urdf, mjcf, dh, mdh (modified DH), yaml, json; default: by the ending."),
+        typer.Option(
+            help="urdf, mjcf, dh, mdh (modified DH), yaml, json, or corrections (smooth functions "
+            "as CSV); default: by the ending."
+        ),
     ] = None,
     load: Annotated[
         tuple[float, float, float] | None,
@@ -175,4 +178,5 @@ NAMES = {
     "mdh": ("The DH table", "a DH table"),
     "yaml": ("Geometry alone", "geometry alone"),
     "json": ("Geometry alone", "geometry alone"),
+    "corrections": ("Geometry alone", "geometry alone"),
 }

@@ -309,17 +309,20 @@ def undetermined(tool: CalibratedTool, rows: list[NDArray], seed: int) -> Undete
     arm = tool.calibrated
     names = {name: i for i, name in enumerate(arm.model.names)}
     kept = np.array([names[name] for name in arm.determined], dtype=np.int64)
-    left = np.setdiff1d(np.arange(len(names)), kept)
-    sizes = _sizes(arm, kept)
-    if not len(left) or not len(kept):
-        return Undetermined(kept, left, np.zeros((len(kept), len(left))), sizes[left])
+    # Smooth functions have their prior: where the readings do not show them they are zero.
+    shrunk = arm.model.shrunk
+    left = np.setdiff1d(np.flatnonzero(~shrunk), kept)
+    sizes, own = _sizes(arm, kept), ~shrunk[kept]
+    mixing = np.zeros((len(kept), len(left)))
+    if not len(left) or not own.any():
+        return Undetermined(kept, left, mixing, sizes[left])
     low, high = finite_ranges(tool.chain, *joint_limits(tool.cell, tool.chain))
-    n = max(SPARE * len(names) // 3, 1)
+    n = max(SPARE * int((~shrunk).sum()) // 3, 1)
     q = np.random.default_rng(seed).uniform(low, high, (n, tool.chain.n_joints))
     some = [values[np.arange(n) % len(values)] for values in rows]
     B = tool.marker_sensitivity(some, q)
     B = B[np.isfinite(B).all(axis=(1, 2))].reshape(-1, len(names)) * sizes
-    mixing = np.asarray(np.linalg.lstsq(B[:, kept], B[:, left], rcond=1e-10)[0], dtype=float)
+    mixing[own] = np.linalg.lstsq(B[:, kept[own]], B[:, left], rcond=1e-10)[0]
     known = sizes[left] > 0
     mixing[:, known] *= sizes[kept][:, None] / sizes[left][known]
     return Undetermined(kept, left, mixing, sizes[left])

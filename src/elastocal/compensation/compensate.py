@@ -27,11 +27,12 @@ from elastocal.errors import InsufficientDataError, option
 from elastocal.identification.start import check_limits
 from elastocal.measurements import families
 from elastocal.model import rigid
-from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.calibrated import CalibratedArm, lasting
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.effects import effect_of
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
+from elastocal.model.smooth_groups import smooth_groups
 from elastocal.tables import column, csv_text
 from elastocal.text import listed, plain
 from elastocal.units import Array, IntArray
@@ -122,6 +123,7 @@ def compensate(
     Raises InputError where the table lacks a column that the model needs, or a nominal command
     lies beyond the limits.
     """
+    arm, of_one_campaign = lasting(arm)
     tool = CalibratedTool(arm, point)
     chain = tool.chain
     limits = joint_limits(tool.cell, chain)
@@ -163,7 +165,13 @@ def compensate(
         np.column_stack([before[1], found.turn]), status, goals, force, T, place, turn,
         task.errors(nominal, every)[0], uncertainty, (),
     )  # fmt: skip
-    return replace(result, warnings=notices_of(tool.cell, result, limits, path))
+    told = notices_of(tool.cell, result, limits, path) + _beyond_functions(arm, result)
+    if of_one_campaign:
+        told += (
+            f"The {listed(of_one_campaign, 4)} {'is' if len(of_one_campaign) == 1 else 'are'} of "
+            "one campaign and no part of these commands.",
+        )
+    return replace(result, warnings=told)
 
 
 def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
@@ -332,6 +340,25 @@ def _beyond_levels(cell: Cell, targets: Targets, q: Array, reached: NDArray[np.b
                 "[model.compliance_levels], where the compliance of the nearest level is assumed"
             )
     return told
+
+
+def _beyond_functions(arm: CalibratedArm, result: Compensation) -> tuple[str, ...]:
+    """Commands where no reading shows what a smooth function corrects elsewhere."""
+    told = []
+    known = np.isin(arm.model.names, arm.determined)
+    for group in smooth_groups(arm.model):
+        if group.basis is None or group.whole_turn or not known[group.columns].any():
+            continue
+        angle = result.q[:, group.joint]
+        out = result.reached & ((angle < group.low) | (angle > group.high))
+        if out.any():
+            low, high = np.degrees([group.low, group.high])
+            told.append(
+                f"{_rows(result.targets, out)}: {group.follows} stands outside {low:.1f}° to "
+                f"{high:.1f}°, where the {group.name} was measured; there it goes to zero, and "
+                "the uncertainty grows to its whole size"
+            )
+    return tuple(told)
 
 
 def _rows(targets: Targets, which: NDArray) -> str:

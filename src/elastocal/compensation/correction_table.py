@@ -14,7 +14,7 @@ from elastocal.compensation.commands import Goals
 from elastocal.compensation.compensate import Compensation, compensate, nominal_flanges
 from elastocal.compensation.tool import CalibratedTool, Targets, ToolPoint, targets_at
 from elastocal.errors import InputError, option
-from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.calibrated import CalibratedArm, lasting
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.inverse_kinematics import Reaching
 from elastocal.units import Array
@@ -126,6 +126,7 @@ def correction_table(
     Beside singular postures and limits, where q_c is far from the nominal command or beyond
     reach, it is the tool's error there with its sign changed (FIRST_ORDER).
     """
+    arm = lasting(arm)[0]
     points = grid.points()
     progress(f"{len(points)} grid points")
     result = compensate(arm, _targets(grid, points, force), point, near, seed, progress)

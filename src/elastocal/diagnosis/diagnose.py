@@ -199,7 +199,7 @@ def diagnose(
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
-    dataset, found, screened = _searched(dataset, options, progress)
+    dataset, search, found, screened = _searched(dataset, options, progress)
     progress("judging all that may act at once")
     full, total = search_components(dataset, found.chosen, progress)
     progress("confirming")
@@ -211,6 +211,7 @@ def diagnose(
         return _diagnosis_of_sum(
             answer_of_sum, dataset, found, screened, untested, left_out, given, source
         )
+    found = search.settled(found)
     answer = judge(found)
     gap, steps = budget(dataset, found, rng)
     findings = _findings(found, answer, base, gap, rng)
@@ -313,7 +314,7 @@ def _unknown(found: SelectedEffects) -> float:
 
 def _searched(
     dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
-) -> tuple[DiagnosisData, SelectedEffects, OutlierScreening]:
+) -> tuple[DiagnosisData, ForwardSelection, SelectedEffects, OutlierScreening]:
     """What is missing, and the data without the faulty readings, which are sought twice: beside a
     large effect nothing looks faulty, or the wrong readings do."""
 
@@ -333,7 +334,7 @@ def _searched(
         if (screened.faulty != before).any():
             progress("searching again without faulty readings")
             search, found = search_without(screened.faulty)
-    return dataset.without(screened.faulty), search.settled(found), screened
+    return dataset.without(screened.faulty), search, found, screened
 
 
 def _check_enough(table: Measurements) -> None:

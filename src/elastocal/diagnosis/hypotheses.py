@@ -37,7 +37,7 @@ from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.effects.play import BY_ORDER, Backlash, Hysteresis
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import observe
+from elastocal.model.observations import Observations, observe, rows_needed, subset
 from elastocal.units import Array, IntArray
 
 # What each need of an effect asks the user to record.
@@ -345,9 +345,10 @@ def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
 
 ROWS = 3000  # of the equations, as many as tell one start from another
 REFERENCES = 12  # starts about which the whole model is evaluated, for the factors of the rows
-KEPT_STARTS = 12
+KEPT_STARTS, AT_ONCE = 12, 50
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
 MOST_STEPS = 40  # of the refinement
+SAME = 0.05  # of χ²: a difference that is none
 
 
 @dataclass(frozen=True)
@@ -387,18 +388,19 @@ def with_tangents(
 class StartSearch:
     """The starts of one hypothesis against the residual of the fitted arm.
 
-    `X` (rows, parameters) are the fitted columns and `r` (rows,) the residual, both over the noise
-    in some of the `equations`, followed by an equation for the prior of each fitted parameter;
-    `whitening` (N, size, size) divides by the noise.  The effect's first parameter is the
-    amplitude that the others have no columns without.
+    `part` are some of the observations, from the table's `rows`.  `X` (equations, parameters) are
+    the fitted columns and `r` (equations,) the residual there, both over the noise, followed by an
+    equation for the prior of each fitted parameter; `whitening` (N, size, size) divides by the
+    noise.  The effect's first parameter is the amplitude that the others have no columns without.
     """
 
     full: Model
     h: Hypothesis
     base: Baseline
     x: Array
+    part: Observations
+    rows: IntArray
     whitening: Array
-    equations: IntArray
     X: Array
     r: Array
 
@@ -407,24 +409,26 @@ class StartSearch:
         """x (K,) and B (n_rows, size, K) are those of `full`."""
         names = {name: k for k, name in enumerate(full.names)}
         fitted = [names[name] for name in base.model.names]
+        size = base.observed.size
         # What is only planned has no residual yet that a spring could answer for.
-        last = base.n_measured * base.observed.size - 1
-        equations = np.unique(np.linspace(0, last, min(ROWS, last + 1)).astype(int))
-        whitening = np.linalg.inv(np.linalg.cholesky(base.covariance))
+        last = base.n_measured - 1
+        chosen = np.zeros(len(base.observed.lead), dtype=bool)
+        chosen[np.linspace(0, last, min(ROWS // size, last + 1)).astype(int)] = True
+        part, rows = subset(base.observed, chosen), rows_needed(base.observed, chosen)
+        whitening = np.linalg.inv(np.linalg.cholesky(base.covariance[chosen]))
         width = prior_deviations(base)
-        X = base.observed.apply(B[:, :, fitted]) * width
-        r = base.residual.reshape(-1, base.observed.size, 1) + (
-            X @ (from_centre(base) / width)[:, None]
-        )
-        X, r = ((whitening @ each).reshape(-1, each.shape[2])[equations] for each in (X, r))
-        X = np.vstack([X, np.eye(X.shape[1])])
+        X = part.apply(B[np.ix_(rows, range(B.shape[1]), fitted)]) * width
+        r = base.residual.reshape(-1, size, 1)[chosen]
+        r = r + X @ (from_centre(base) / width)[:, None]
+        X, r = ((whitening @ each).reshape(-1, each.shape[2]) for each in (X, r))
         r = np.append(r[:, 0], np.zeros(X.shape[1]))
-        return cls(full, h, base, x, whitening, equations, X, r)
+        X = np.vstack([X, np.eye(X.shape[1])])
+        return cls(full, h, base, x, part, rows, whitening, X, r)
 
     def seen(self, columns: Array) -> Array:
-        """Columns (n_rows, size, k) of the table as (rows, k) of the equations."""
-        C = (self.whitening @ self.base.observed.apply(columns)).reshape(-1, columns.shape[2])
-        return np.vstack([C[self.equations], np.zeros((self.X.shape[1], C.shape[1]))])
+        """Columns (rows, size, k) of the part's table as (equations, k)."""
+        C = (self.whitening @ self.part.apply(columns)).reshape(-1, columns.shape[2])
+        return np.vstack([C, np.zeros((self.X.shape[1], C.shape[1]))])
 
     @cached_property
     def starts(self) -> tuple[dict[str, float], ...]:
@@ -437,8 +441,8 @@ class StartSearch:
 
     def _about(self, start: Mapping[str, float]) -> Tangent:
         own, table = own_columns(self.full, self.h), self.base.observed.table
-        at, column = self._amplitude(start)
-        left, amplitude, _ = self._fits(column[:, :, None])
+        at, column = self._amplitude(start, table)
+        left, amplitude, _ = self._fits(column[self.rows][:, :, None])
         at[own[0]] += amplitude[0]
         observed = observe(table, self.full.observe)
         columns = self.full.regressor(table, at, np.array(own), observed).B
@@ -446,9 +450,9 @@ class StartSearch:
         columns[:, :, 0] = column
         return Tangent(at[own], columns, float(left[0]))
 
-    def _amplitude(self, start: Mapping[str, float]) -> tuple[Array, Array]:
+    def _amplitude(self, start: Mapping[str, float], table: Measurements) -> tuple[Array, Array]:
         """x (K,) at a start, and the column (n_rows, size) of the amplitude there, from none."""
-        table, at = self.base.observed.table, self.x.copy()
+        at = self.x.copy()
         at[own_columns(self.full, self.h)[0]] = self.h.parameters[0].nominal
         for key, value in start.items():
             at[self.full.names.index(f"{self.h.where}.{key}")] = value
@@ -465,25 +469,31 @@ class StartSearch:
         profiles = self._profiles(starts)
         if profiles is None:
             return None
-        left, beside = self._left(starts, profiles)
-        order = np.argsort(left, kind="stable")
-        dof = max(len(self.equations) - 1, 1)  # those of the prior are as many as its parameters
-        variance = max(float(left[order[0]]), 1e-300) / dof
-        share = float(np.log(np.exp((left[order[0]] - left) / (2 * variance)).mean()))
+        blocks = [slice(k, k + AT_ONCE) for k in range(0, len(starts), AT_ONCE)]
+        each = [self._left(starts[block], profiles[:, block]) for block in blocks]
+        left = np.concatenate([one for one, _ in each])
+        beside = np.concatenate([C for _, C in each], axis=1)
+        dof = max(len(self.r) - self.X.shape[1] - 1, 1)
+        variance = max(float(left.min()), 1e-300) / dof
+        share = float(np.log(np.exp((left.min() - left) / (2 * variance)).mean()))
+        # Starts that say the same stand in their own order, whatever the rounding.
+        order = np.argsort(np.round((left - left.min()) / (SAME * variance)), kind="stable")
         kept: list[int] = []
         for k in order:
             if len(kept) == KEPT_STARTS:
                 break
             if np.abs(beside[:, kept].T @ beside[:, k]).max(initial=0.0) < ALIKE:
                 kept.append(int(k))
-        best = self._refined(starts, starts[kept[0]], float(left[kept[0]]))
+        best = self._refined(starts, starts[kept[0]], np.sqrt(variance))
         return [best, *(starts[k] for k in kept[1:])], share
 
     def _refined(
-        self, starts: list[dict[str, float]], best: Mapping[str, float], least: float
+        self, starts: list[dict[str, float]], best: Mapping[str, float], noise: float
     ) -> Mapping[str, float]:
-        """The start near `best`, which leaves `least`, that leaves the least: least squares with
-        the amplitude solved for (variable projection; Golub and Pereyra 1973)."""
+        """The start near `best` that leaves the least: least squares with the amplitude solved for
+        (variable projection; Golub and Pereyra 1973).  Where the residual, over `noise`, does not
+        ask for another value, a value stays: each is tied to that of `best` by a spread of all.
+        """
         keys = list(best)
         width = np.array([np.std([start[key] for start in starts]) for key in keys])
         x0 = np.array([best[key] for key in keys])
@@ -491,32 +501,32 @@ class StartSearch:
         def start_of(values: Array) -> dict[str, float]:
             return dict(zip(keys, map(float, x0 + width * values), strict=True))
 
-        def columns_of(trials: list[dict[str, float]]) -> tuple[Array, Array]:
+        def residual(values: Array) -> Array:
+            trials = [start_of(values)]
             profiles = self._profiles(trials)
             assert profiles is not None
-            return self._left(trials, profiles)
+            left, C = self._left(trials, profiles)
+            if left[0] >= self._unexplained @ self._unexplained:  # no amplitude that it can have
+                return np.append(self._unexplained / noise, values)
+            c = C[:, 0]
+            return np.append((self._unexplained - c * (c @ self._unexplained)) / noise, values)
 
-        def residual(values: Array) -> Array:
-            c = columns_of([start_of(values)])[1][:, 0]
-            return np.asarray(self._unexplained - c * (c @ self._unexplained))
-
-        found = start_of(least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS).x)
-        return found if columns_of([found])[0][0] < least else best
+        return start_of(least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS).x)
 
     def _profiles(self, starts: Sequence[Mapping[str, float]]) -> Array | None:
-        """(n_rows, starts)."""
+        """(rows, starts)."""
         if not starts[0]:
             return None
-        return self.h.effect.profiles(self.h.where, starts, self.base.observed.table.q)
+        return self.h.effect.profiles(self.h.where, starts, self.part.table.q)
 
     @cached_property
     def _factor(self) -> Array:
-        """(n_rows, size): what a profile is to be multiplied with for the amplitude's column."""
+        """(rows, size): what a profile is to be multiplied with for the amplitude's column."""
         chosen = np.linspace(0, len(self.starts) - 1, REFERENCES).astype(int)
         references = [self.starts[k] for k in chosen]
         profiles = self._profiles(references)
         assert profiles is not None
-        columns = np.stack([self._amplitude(start)[1] for start in references])
+        columns = np.stack([self._amplitude(s, self.part.table)[1] for s in references])
         products = np.einsum("sni,ns->ni", columns, profiles)
         return np.asarray(products / np.maximum((profiles**2).sum(axis=1), 1e-300)[:, None])
 
@@ -542,7 +552,7 @@ class StartSearch:
         return np.asarray(self.r - self._span @ (self._span.T @ self.r))
 
     def _fits(self, columns: Array) -> tuple[Array, Array, Array]:
-        """Of each of the columns (n_rows, size, k) by itself what it leaves of the residual's sum
+        """Of each of the columns (rows, size, k) by itself what it leaves of the residual's sum
         of squares (k,), its amplitude (k,), and itself of unit length beside the span (rows, k)."""
         C = self.seen(columns)
         C -= self._span @ (self._span.T @ C)

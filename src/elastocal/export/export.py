@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from elastocal.errors import ElastocalError, InputError, option
+from elastocal.export.corrections import corrections_csv
 from elastocal.export.dh_table import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
 from elastocal.export.exportable import (
     Conditions,
@@ -129,6 +130,12 @@ def held_values(estimates: list[dict[str, Any]]) -> dict[str, float]:
     return {e["name"]: e["held"] for e in estimates if e["identifiable"] is not True}
 
 
+def _ordinary(calibrated: CalibratedArm, estimates: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those of no smooth function, which is zero where nothing shows it."""
+    both = zip(estimates, calibrated.model.shrunk, strict=True)
+    return [entry for entry, shrunk in both if not shrunk]
+
+
 def parameter_document(
     calibrated: CalibratedArm, estimates: list[dict[str, Any]], pieces: ExportNumbers, cost: Cost
 ) -> dict[str, Any]:
@@ -194,7 +201,7 @@ ENDINGS = {
     ".yml": "yaml",
     ".json": "json",
 }
-FORMATS = ("urdf", "mjcf", "dh", "mdh", "yaml", "json")
+FORMATS = ("urdf", "mjcf", "dh", "mdh", "yaml", "json", "corrections")
 
 
 def format_of(path: Path, asked: str | None) -> str:
@@ -364,7 +371,7 @@ def export(
         cost=cost,
         checked=checked,
         checked_with=tool,
-        held=held_values(estimates),
+        held=held_values(_ordinary(calibrated, estimates)),
         of_the_measurement=kept.of_the_measurement,
         warnings=(*_warnings(calibrated, cost), *warnings),
         without_beta=beta,
@@ -467,7 +474,16 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
     return text, checked, "elastocal's own reader of DH tables", [], beta
 
 
-WRITERS = {"urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh}
+def _corrections(
+    calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
+) -> Written:
+    text = corrections_csv(calibrated, _note(calibrated, wish))
+    return text, None, "", [], None
+
+
+WRITERS = {
+    "urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh, "corrections": _corrections,
+}  # fmt: skip
 
 
 def _warnings(calibrated: CalibratedArm, cost: Cost) -> list[str]:

@@ -369,6 +369,7 @@ def intervals_with_knowledge(
     prior: GaussianPrior | None,
     of_readings: Array,
     options: Options,
+    many: set[str] | None = None,
 ) -> Intervals:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
@@ -378,6 +379,7 @@ def intervals_with_knowledge(
 
     The covariance takes equalities for exact and leaves inequalities out: knowing more than it
     says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
+    Parameters that are `many`, those of smooth functions, have t intervals in any case.
     """
     kind, dof = options.intervals, degrees_of_freedom(of_readings, local.prior_share)
     matrix, inside = local.covariance, not any(a.kind != "equality" for a in found.active)
@@ -400,7 +402,11 @@ def intervals_with_knowledge(
             Covariance("constrained bootstrap", matrix, dof, text), drawn.interval(local.x, LEVEL)
         )
     ends = []
-    for name, wide in zip(local.names, _inflation(local, dof), strict=True):
+    plain = Covariance("t", matrix, dof, "").interval(local.x, LEVEL)
+    for k, (name, wide) in enumerate(zip(local.names, _inflation(local, dof), strict=True)):
+        if name in (many or ()):
+            ends.append((float(plain[k, 0]), float(plain[k, 1])))
+            continue
         wider = None if prior is None else replace(prior, covariance=prior.covariance * wide**2)
         sigma = local.sigma * wide
         if kind == "profile":
@@ -451,15 +457,44 @@ class KnowledgeFit:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class FunctionPrior:
+    """What smooth functions bring into a fit: the `prior` of their parameters, the noise `sigma`
+    of a whitened row beside them and its degrees of freedom `dof`, and where the prior's part of
+    the objective `stands` in the fit without further knowledge."""
+
+    prior: GaussianPrior
+    sigma: float
+    dof: float
+    stands: float
+
+
+def joined(stated: GaussianPrior | None, own: GaussianPrior | None) -> GaussianPrior | None:
+    """Both priors; of a parameter that both name, the stated one."""
+    if stated is None or own is None:
+        return own if stated is None else stated
+    rest = [k for k, name in enumerate(own.names) if name not in set(stated.names)]
+    n, m = len(stated.names), len(rest)
+    covariance = np.zeros((n + m, n + m))
+    covariance[:n, :n] = stated.covariance
+    covariance[n:, n:] = own.covariance[np.ix_(rest, rest)]
+    return GaussianPrior(
+        (*stated.names, *(own.names[k] for k in rest)),
+        np.concatenate([stated.mean, own.mean[rest]]),
+        covariance,
+    )
+
+
 def fit_with_knowledge(
-    solution: Solution, before: Intervals, options: Options, progress: Progress
-) -> KnowledgeFit:
+    solution: Solution, before: Intervals, options: Options, progress: Progress,
+    own: FunctionPrior | None = None,
+) -> KnowledgeFit:  # fmt: skip
     """Minimise Σ ρ(W (y − h(X))) + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
 
     W and the readings are those of the method's `solution`, σ the noise of a whitened row under
     it, ρ squares or, for the method huber, Huber's loss.  `fitted_columns` says what is fitted,
     `intervals_with_knowledge` what the intervals are; t intervals have the degrees of freedom of
-    `before`, the method's own.
+    `before`, the method's own.  `own` is the prior of smooth functions, which joins the stated one.
 
     Raises InputError for constraints that contradict each other or held values, names that are no
     parameters, and tables too large to hold B; InsufficientDataError where an equality names a
@@ -472,9 +507,10 @@ def fit_with_knowledge(
             f"fit a part of the table, or {option('bounded', True)} for the physical bounds alone"
         )
     constraints = (options.constraints or Constraints()) + own_bounds(solution)
-    prior, name = options.prior, "huber" if options.resolved == "huber" else "squares"
+    prior = joined(options.prior, None if own is None else own.prior)
+    name = "huber" if options.resolved == "huber" else "squares"
     size = problem.observations.size if name == "huber" else 1
-    sigma = _noise(solution, name, size)
+    sigma = _noise(solution, name, size) if own is None else own.sigma
     columns = fitted_columns(solution, before.covariance.std, constraints, prior)
     posed = replace(problem, bounded=False).fit_of(columns, solution.fit.x, solution.sizes)
     progress("fitting under constraints" if prior is None else "fitting with the prior")
@@ -482,10 +518,14 @@ def fit_with_knowledge(
     loss: ResidualLoss = loss_of(name, size, sigma)  # type: ignore[arg-type]
     local = LinearisedFit.at(posed, found, constraints, prior, loss, sigma)
     progress("intervals under constraints" if prior is None else "intervals with the prior")
+    dof = _dof(solution, before, columns) if own is None else np.full(len(columns), own.dof)
     intervals = intervals_with_knowledge(
-        posed, found, local, constraints, prior, _dof(solution, before, columns), options
-    )
-    shares = {} if prior is None else dict(zip(found.names, local.prior_share, strict=True))
+        posed, found, local, constraints, prior, dof, options,
+        set() if own is None else set(own.prior.names),
+    )  # fmt: skip
+    shares = {} if options.prior is None else dict(zip(found.names, local.prior_share, strict=True))
+    if own is not None:
+        shares = {n: s for n, s in shares.items() if n not in set(own.prior.names)}
     known = replace(
         solution,
         fit=_as_fit(posed, found, local),
@@ -495,7 +535,8 @@ def fit_with_knowledge(
     return KnowledgeFit(
         known, intervals, found.active,
         {n: float(s) for n, s in shares.items() if np.isfinite(s)},
-        round(local.effective), local.leverage, _contradiction(solution, before, found, local),
+        round(local.effective), local.leverage,
+        _contradiction(solution, before, found, local, own),
     )  # fmt: skip
 
 
@@ -509,24 +550,28 @@ def _noise(solution: Solution, loss: str, size: int) -> float:
 
 
 def _contradiction(
-    solution: Solution, before: Intervals, found: ConstrainedFit, local: LinearisedFit
-) -> tuple[str, ...]:
+    solution: Solution, before: Intervals, found: ConstrainedFit, local: LinearisedFit,
+    own: FunctionPrior | None,
+) -> tuple[str, ...]:  # fmt: skip
     """A sentence where the objective grew by more than noise explains (F-test), for squares.
 
     Rows of the prior and active constraints count as degrees of freedom, less the parameters they
     made estimable.  At active bounds the true distribution is smaller (χ̄²): the test is cautious.
     """
-    stated = len(local.P) + len(found.active) - (len(found.columns) - len(solution.fit.columns))
+    rows = len(local.P) - (0 if own is None else len(own.prior.names))
+    stated = rows + len(found.active) - (len(found.columns) - len(solution.fit.columns))
     if stated < 1 or not local.loss.quadratic:
         return ()
     grown = found.objective - float(solution.fit.whitened @ solution.fit.whitened)
     dof = max(float(before.covariance.dof.min()), 1.0)
+    if own is not None:
+        grown, dof = grown - own.stands, own.dof
     F = max(grown, 0.0) / (stated * local.sigma**2)
     p = float(stats.f.sf(F, stated, dof) if np.isfinite(dof) else stats.chi2.sf(F * stated, stated))
     if p > CONTRADICTED:
         return ()
     what = [f"'{a.label}'" for a in found.active]
-    what += ["the prior"] if len(local.P) else []
+    what += ["the prior"] if rows else []
     return (
         f"The readings contradict {listed(what, 6)}: without, they are fitted better than noise "
         f"explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). Check "

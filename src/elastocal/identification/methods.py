@@ -25,7 +25,7 @@ from elastocal.identification.noise_choice import (
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_fit
-from elastocal.identification.smooth_fit import fit_smooth
+from elastocal.identification.smooth_fit import fit_smooth, with_functions_free
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.solve import Problem, Solution, fit_kept, held_at_bounds, heldout_of
 from elastocal.identification.weighted_problem import Weights
@@ -194,10 +194,22 @@ def with_smooth(
     `every` and `sound` are fits of the ordinary ones alone.
     """
     found = fit_smooth(every, sound, faulty, free, options, progress)
-    return MethodResult(
+    result = MethodResult(
         found.method, found.solution, found.intervals, found.noise, found.good,
         effective=found.effective, leverage=found.leverage, warnings=found.warnings,
         smooth=found.parts, standard=found.standard,
+    )  # fmt: skip
+    if not options.knows:
+        return result
+    known = fit_with_knowledge(
+        with_functions_free(found.solution), found.intervals, options, progress, found.prior
+    )
+    fit, matrix = known.solution.fit, known.intervals.covariance.matrix
+    return replace(
+        result, method="constrained", solution=known.solution, intervals=known.intervals,
+        active=known.active, prior_share=known.prior_share, effective=known.effective,
+        leverage=known.leverage, warnings=(*result.warnings, *known.warnings),
+        smooth=tuple(part.refitted(fit.x, fit.columns, matrix) for part in found.parts),
     )  # fmt: skip
 
 

@@ -23,6 +23,8 @@ from scipy import linalg, sparse, stats
 from elastocal.errors import ElastocalError, InputError, option
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.intervals import LEVEL, Intervals
+from elastocal.identification.knowledge import GaussianPrior
+from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import (
     NoiseFit,
@@ -99,6 +101,7 @@ class SmoothFit(NamedTuple):
     noise: NoiseFit | None
     good: BoolArray
     parts: tuple[SmoothPart, ...]
+    prior: FunctionPrior
     effective: int
     leverage: Array
     standard: Array
@@ -189,6 +192,9 @@ def joint_fit(
         return found.residual, found.r_factor
 
     x = _started(problem, functions, x, reduction)
+    if scales is not None:
+        gone = functions.columns[(scales.scale == 0)[functions.group]]
+        x[gone] = problem.model.nominal[gone]
     residual, r_factor = at(x)
     rounds = 0 if not sizing else CHOICES if scales is None else 1
     steps = 0
@@ -384,6 +390,13 @@ def _same_size(codes: IntArray) -> Iterator[IntArray]:
         yield order[starts[counts == count][:, None] + np.arange(count)]
 
 
+def with_functions_free(solution: Solution) -> Solution:
+    """The solution as one whose problem has the columns of functions among the free ones."""
+    problem = solution.problem
+    free = np.union1d(problem.free, solution.fit.columns)
+    return replace(solution, problem=replace(problem, free=free))
+
+
 # The course: fit, noise and faulty readings in turn, then what else may change.
 
 
@@ -420,6 +433,17 @@ def _check_options(options: Options) -> None:
             f"{option('intervals', options.intervals)} knows of no prior, which smooth functions "
             "have; leave it away"
         )
+
+
+def _followed(observed: Observations, group: SmoothGroup) -> Array:
+    """What a function follows, in every observation (N,)."""
+    table = observed.table
+    if group.basis is None:
+        return np.zeros(0)
+    if not group.lasting:
+        assert table.time is not None
+        return table.time[observed.lead]
+    return np.asarray(table.q[observed.lead, group.joint])
 
 
 class _Course:
@@ -666,28 +690,31 @@ class _Course:
             method = "ols" if fit.problem.weights.kind == "none" else "wls"
         return SmoothFit(
             method, solution, intervals, noise, good, self._parts(fit, covariance.matrix),
-            effective, cross.leverage, self.standard, self._warnings(fit),
+            self._prior(fit, spare), effective, cross.leverage, self.standard, self._warnings(fit),
         )  # fmt: skip
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
-        f, k = fit.functions, fit.posterior.ordinary
-        whole = np.zeros((len(f.columns), len(f.columns)))
-        own = fit.posterior.own
-        whole[np.ix_(own, own)] = covariance[k:, k:]
+        f = fit.functions
         paid = np.zeros(len(f.columns))
-        paid[own] = fit.posterior.effective_of
+        paid[fit.posterior.own] = fit.posterior.effective_of
         found = []
         for g, group in enumerate(f.groups):
-            mine = np.flatnonzero(f.group == g)
-            value = np.where(np.isin(group.columns, f.columns), fit.x[group.columns], 0.0)
-            at = np.full(group.columns.size, -1)
-            at[np.isin(group.columns.ravel(), f.columns)] = mine
-            matrix = np.zeros((at.size, at.size))
-            there = np.flatnonzero(at >= 0)
-            matrix[np.ix_(there, there)] = whole[np.ix_(mine, mine)]
-            scale = float(fit.scales.scale[g])
-            found.append(SmoothPart(group, scale, float(paid[mine].sum()), value, matrix))
+            empty = np.zeros((group.columns.size, group.columns.size))
+            part = SmoothPart(
+                group, float(fit.scales.scale[g]), float(paid[f.group == g].sum()),
+                fit.x[group.columns], empty, _followed(fit.problem.observations, group),
+            )  # fmt: skip
+            found.append(part.refitted(fit.x, fit.columns, covariance))
         return tuple(found)
+
+    def _prior(self, fit: JointFit, dof: float) -> FunctionPrior:
+        f, own = fit.functions, fit.posterior.own
+        std = fit.sigma / fit.posterior.prior
+        columns = f.columns[own]
+        names = tuple(self.model.names[c] for c in columns)
+        b = (fit.x[columns] - f.nominal[own]) * fit.posterior.prior
+        prior = GaussianPrior.independent(names, f.nominal[own], std)
+        return FunctionPrior(prior, fit.sigma, dof, float(b @ b))
 
     def _warnings(self, fit: JointFit) -> tuple[str, ...]:
         told = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.smooth_groups import SmoothGroup
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 GRID = 200
+PLACES = 500
 DRAWS = 400
 LEVEL = 0.95
 
@@ -28,6 +29,7 @@ class SmoothPart:
         effective: How many coefficients' worth of it the readings determine.
         value: Coefficients (components, waves).
         covariance: Theirs, (components · waves, components · waves).
+        places: What it follows in the readings fitted (n,), in rad or s.
     """
 
     group: SmoothGroup
@@ -35,11 +37,22 @@ class SmoothPart:
     effective: float
     value: Array
     covariance: Array
+    places: Array
 
     @property
     def coefficients(self) -> int:
         """How many parameters it has."""
         return int(self.value.size)
+
+    def refitted(self, x: Array, columns: IntArray, covariance: Array) -> SmoothPart:
+        """The same function at other parameters x (parameters,), the covariance that of the
+        `columns` fitted."""
+        mine = self.group.columns
+        place = {int(c): k for k, c in enumerate(columns)}
+        at = np.array([place.get(int(c), -1) for c in mine.ravel()])
+        there, matrix = np.flatnonzero(at >= 0), np.zeros((mine.size, mine.size))
+        matrix[np.ix_(there, there)] = covariance[np.ix_(at[there], at[there])]
+        return replace(self, value=x[mine], covariance=matrix)
 
     def course(self, x: Array) -> tuple[Array, Array]:
         """Values and half widths of their 95 % band (components, n) at x (n,); NaN where the
@@ -49,13 +62,22 @@ class SmoothPart:
             return nothing, nothing
         return self._course(self.group.basis(x))
 
-    def shape(self, x: Array) -> tuple[Array, Array]:
-        """The same of what is left of the function without its mean over x, which offsets and
-        lengths of the arm can stand for."""
+    def shape(self) -> tuple[Array, Array, Array]:
+        """Places x (GRID,) over its range, values and half widths of the 95 % band (components,
+        GRID) of what is left of the function without its mean and its wave of one period per
+        turn (of a time, its slope), for which offsets, lengths and tilts of the arm can stand."""
         if self.group.basis is None:
-            return self.course(x)
+            nothing = np.zeros((len(self.value), 0))
+            return np.zeros(0), nothing, nothing
+        x = self.group.grid(GRID)
+        return x, *self._course(self._own_waves(x))
+
+    def _own_waves(self, x: Array) -> Array:
+        assert self.group.basis is not None
+        alike = [np.ones(len(x)), *((np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],))]
+        Q, _ = np.linalg.qr(np.column_stack(alike))
         waves = self.group.basis(x)
-        return self._course(waves - waves.mean(axis=0))
+        return np.asarray(waves - Q @ (Q.T @ waves))
 
     def _course(self, waves: Array) -> tuple[Array, Array]:
         k = self.value.shape[1]
@@ -71,8 +93,11 @@ class SmoothPart:
 
     @cached_property
     def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
-        """By unit: rms of the function less its mean, over all components and its range, the 95 %
-        interval of that, and the rms half width of the 95 % band."""
+        """By unit, over all components and the places of the readings: rms of the function's
+        `shape`, the 95 % interval of that, and the rms half width of the 95 % band.
+
+        Of parameters that are no function of one quantity, the root of their sum of squares.
+        """
         basis = self.group.basis
         found = {}
         for unit in dict.fromkeys(self.group.units):
@@ -80,8 +105,7 @@ class SmoothPart:
             if basis is None:
                 waves = np.eye(self.value.shape[1]) * np.sqrt(self.value.shape[1])
             else:
-                waves = basis(self.group.grid(GRID))
-                waves = waves - waves.mean(axis=0)
+                waves = self._own_waves(_thinned(self.places))
             mean = self.value[own] @ waves.T
             rng = np.random.default_rng(0)
             k = waves.shape[1]
@@ -108,6 +132,14 @@ class SmoothPart:
             }
             for unit, (rms, ci95, half) in self.sizes.items()
         ]  # fmt: skip
+
+
+def _thinned(places: Array) -> Array:
+    """At most PLACES of them, evenly over their order."""
+    if len(places) <= PLACES:
+        return places
+    ordered = np.sort(places)
+    return np.asarray(ordered[np.linspace(0, len(ordered) - 1, PLACES).astype(int)])
 
 
 def _root(covariance: Array) -> Array:

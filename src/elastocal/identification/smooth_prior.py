@@ -25,8 +25,8 @@ from elastocal.units import Array, IntArray
 LEAST, MOST = 1e-6, 1e6
 SMALL = 0.05
 # Of log λ above 0: a function may be smaller than stated at no price, but ten times the size costs
-# what a likelihood ratio of a hundred gains.  Data that hardly show a function know no upper limit.
-PRICE = 1.5
+# what a likelihood ratio of 1e8 gains.  Data that hardly show a function know no upper limit.
+PRICE = 0.75
 # Noise as shares of the variance that ordinary parameters leave, from which the search starts.
 SHARES = (1.0, 0.1, 0.01, 0.001)
 STEPS = 60

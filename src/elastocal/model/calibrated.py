@@ -18,8 +18,10 @@ from elastocal.errors import InputError
 from elastocal.files import read_text
 from elastocal.model.chain import Chain
 from elastocal.model.choice import cell_of
+from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import nominal_flange
+from elastocal.model.smooth_groups import smooth_groups
 from elastocal.units import Array
 
 SCHEMA = "elastocal/identification/1"
@@ -90,6 +92,29 @@ class CalibratedArm(Saved):
             True
         """
         return self.model.pose(q, self.x, force)
+
+
+def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
+    """The arm without smooth functions of the time, which are of one campaign, and their names."""
+    model = arm.model
+    gone = [group.name for group in smooth_groups(model) if not group.lasting]
+    if not gone:
+        return arm, ()
+    cell = model.cell
+    for name in dict.fromkeys(choice.name for choice in cell.model.effects):
+        cell = effect_of(name).lasting(cell)
+    rest = Model.assembled(model.chain, cell)
+    left = set(rest.names)
+    kept = [k for k, name in enumerate(arm.determined) if name in left]
+    entries = dict(zip(model.names, arm.entries, strict=True)) if arm.entries else {}
+    return CalibratedArm(
+        rest,
+        np.array([arm.values[name] for name in rest.names]),
+        tuple(arm.determined[k] for k in kept),
+        arm.covariance[np.ix_(kept, kept)],
+        arm.source,
+        tuple(entries[name] for name in rest.names if name in entries),
+    ), tuple(gone)  # fmt: skip
 
 
 def read_calibrated(cell_path: str | Path, result_path: str | Path) -> CalibratedArm:

@@ -86,10 +86,15 @@ def alone(n: int) -> sparse.csr_array:
     return sparse.csr_array((np.ones(n), places[:n], places), shape=(n, n))
 
 
+def rows_needed(observed: Observations, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The table rows that the observations where `chosen` (N,) holds need."""
+    return np.unique(observed.combine[chosen].indices).astype(np.int64)
+
+
 def subset(observed: Observations, chosen: NDArray[np.bool_]) -> Observations:
     """The observations where `chosen` (N,) holds, with only the table rows they need."""
     combine = observed.combine[chosen]
-    rows = np.unique(combine.indices)
+    rows = rows_needed(observed, chosen)
     value = observed.value.reshape(-1, observed.size)[chosen].ravel()
     lead = np.searchsorted(rows, observed.lead[chosen])
     return Observations(observed.kind, value, combine[:, rows], lead, observed.table.take(rows))

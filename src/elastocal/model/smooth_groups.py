@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from elastocal.model.effects import effect_of
+from elastocal.model.effects.base import index
+from elastocal.model.effects.smooth import FULL_TURN
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, IntArray
 
@@ -43,6 +45,16 @@ class SmoothGroup:
     def lasting(self) -> bool:
         """Whether it belongs to the arm, and not to the time of one campaign."""
         return self.follows != "time"
+
+    @property
+    def joint(self) -> int:
+        """Index of the joint that it follows."""
+        return index(self.follows)
+
+    @property
+    def whole_turn(self) -> bool:
+        """Whether it was measured all the way round, so that no angle lies outside."""
+        return self.lasting and self.high - self.low >= FULL_TURN * 2 * np.pi
 
     def grid(self, n: int) -> Array:
         """n values (n,) of what it follows, over its range."""

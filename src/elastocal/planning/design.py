@@ -469,9 +469,11 @@ class _Design:
             self.warnings.append(
                 "torques of poses that are not measured yet are computed from load and weights"
             )
-        self.cell, self.options = cell, options
         self.checkpoint, self.progress = checkpoint, progress
         self.model = Model(cell, options.done.marker_names if options.done else ())
+        if self.model.shrunk.any():
+            self.model, options = self._without_functions(options)
+        self.options = options
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
@@ -479,6 +481,20 @@ class _Design:
         self.states = load_states(self.cell)
         self.space = joint_space(self.cell, self.chain)
         self.feasibility = Feasibility(self.cell, self.chain)
+
+    def _without_functions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
+        """The model without its smooth functions, which no plan is made for."""
+        whole = self.model
+        functions = dict.fromkeys(p.effect for p in whole.parameters if p.shrunk)
+        self.warnings.append(
+            f"the plan holds the smooth functions ({listed(functions)}) at zero: it is made for "
+            "the other parameters; to show functions too, measure many poses all over the joints' "
+            "ranges"
+        )
+        rest = tuple(c for c in whole.cell.model.effects if c.name not in functions)
+        held = [n for n in options.fixed if whole.shrunk[whole.meant_by(n)].all()]
+        fixed = tuple(n for n in options.fixed if n not in held or not whole.meant_by(n))
+        return whole.with_effects(rest), replace(options, fixed=fixed)
 
     def run(self) -> Plan:
         progress, options = self.progress, self.options

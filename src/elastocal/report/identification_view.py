@@ -64,6 +64,7 @@ from elastocal.report.method_and_noise import (
     shape_line,
     size_rows,
 )
+from elastocal.report.smooth_view import counted_functions, smooth_lines, smooth_table
 
 LARGEST_TERMS = 4
 Truth = dict[str, float]
@@ -71,7 +72,8 @@ Published = Mapping[str, tuple[float, float]]
 
 
 def names_of(result: Calibration, standing: str) -> list[str]:
-    return [printable(name) for name, s in standings(result).items() if s == standing]
+    found = standings(result)
+    return [printable(e.name) for e in result.ordinary if found[e.name] == standing]
 
 
 def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
@@ -127,7 +129,7 @@ def inside(value: float | None, ci95: tuple[float, float] | None) -> str:
 
 def coverage(result: Calibration, truth: Truth) -> tuple[int, int]:
     """How many 95 % intervals hold the true value, of how many that could be compared."""
-    found = [inside(truth.get(e.name), e.ci95) for e in result.estimates]
+    found = [inside(truth.get(e.name), e.ci95) for e in result.ordinary]
     found += [inside(combination_truth(result, c, truth), c.ci95) for c in result.combinations]
     return found.count("inside"), len(found) - found.count("")
 
@@ -163,7 +165,7 @@ READINGS = {
 
 def what_was_identified(result: Calibration) -> str:
     alone, n = len(names_of(result, ALONE)), len(result.combinations)
-    text = f"{alone} of {counted(len(result.estimates), 'parameter')} known on their own"
+    text = f"{alone} of {counted(len(result.ordinary), 'parameter')} known on their own"
     if n:
         absorbed = len(names_of(result, ABSORBED))
         text += (
@@ -174,7 +176,7 @@ def what_was_identified(result: Calibration) -> str:
         text += f"; {unseen} not visible in these data"
     if fixed := len(names_of(result, FIXED)):
         text += f"; {fixed} fixed by the user"
-    return text + "."
+    return text + counted_functions(result) + "."
 
 
 def how_well_it_predicts(result: Calibration) -> str:
@@ -311,6 +313,7 @@ def summary_lines(result: Calibration, truth: Truth | None = None) -> list[str]:
     lines += [f"{label}: {text}" for label, text in noise_lines(result)]
     lines.append(f"Intervals: {intervals_line(result)}")
     lines += [f"{label}: {text}" for label, text in held_lines(result)]
+    lines += [f"Smooth function: {text}" for text in smooth_lines(result)]
     if truth:
         lines.append(f"Truth: {coverage_line(result, truth)}")
     if pairs := correlation_lines(result):
@@ -361,13 +364,13 @@ class ParameterRow:
 def parameter_rows(
     result: Calibration, truth: Truth | None, published: Published | None = None
 ) -> list[ParameterRow]:
-    """One row per parameter, all of them, in the model's order.
+    """One row per parameter, all of them but those of smooth functions, in the model's order.
 
     `published`: values and half widths (SI) that others found, by name.
     """
     rows = []
     effects = {p.name: p.effect.replace("_", " ") for p in result.model.parameters}
-    for e in result.estimates:
+    for e in result.ordinary:
         true = None if truth is None else truth.get(e.name)
         nominal = e.nominal if nominal_known(result, e.name) else None
         rows.append(
@@ -616,7 +619,7 @@ def identification_contents(
         *held_lines(result),
         *([("Truth", coverage_line(result, truth))] if truth else []),
     ]
-    found: list[Estimate | Combination] = [*result.estimates, *result.combinations]
+    found: list[Estimate | Combination] = [*result.ordinary, *result.combinations]
     endless = any(math.isinf(end) for e in found for end in e.ci95 or ())
     deviating = () if summary is None else summary.deviating
     scatter = None if summary is None else summary.whole.held_out_mean_square
@@ -648,6 +651,7 @@ def identification_contents(
         "parameters": parameter_rows(result, truth, published),
         "combinations": combination_rows(result, truth),
         "endless": " An interval without an end runs to the edge." if endless else "",
+        "smooth": smooth_table(result),
         "undetermined": [_sentence(line) for line in undetermined_lines(result)],
         "correlations": correlation_lines(result, MOST_CORRELATIONS_LISTED),
         "faults": fault_lines(result),

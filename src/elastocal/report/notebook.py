@@ -106,7 +106,7 @@ def residuals(result: Calibration, interactive: bool) -> Any:
 
 def parameters(result: Calibration, interactive: bool) -> Any:
     """Deviation of each identified parameter from nominal in units of its 95 % half width."""
-    kept = [e for e in result.estimates if e.value is not None and e.ci95 is not None]
+    kept = [e for e in result.ordinary if e.value is not None and e.ci95 is not None]
     kept = [e for e in kept if np.isfinite(e.ci95).all()][:MOST_BARS]  # type: ignore[arg-type]
     value = np.array([e.value - e.nominal for e in kept if e.value is not None])
     ends = np.array([e.ci95 for e in kept], dtype=float).reshape(-1, 2)

@@ -27,6 +27,7 @@ from elastocal.report.figures import (
 from elastocal.report.formatting import length, short_name, significant
 from elastocal.report.identification_view import budget_steps, rms_by_kind
 from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
+from elastocal.report.smooth_view import smooth_figure
 from elastocal.units import Array
 
 if TYPE_CHECKING:
@@ -412,7 +413,9 @@ def correlations(result: Calibration) -> tuple[list[str], Array]:
     """Names and correlations (n, n) of the determined parameters with a finite variance; of many,
     those that correlate most."""
     variance = np.diag(result.covariance)
-    good = np.flatnonzero(np.isfinite(variance) & (variance > 0))
+    shrunk = {n for n, s in zip(result.model.names, result.model.shrunk, strict=True) if s}
+    told = np.array([name not in shrunk for name in result.determined], dtype=bool)
+    good = np.flatnonzero(np.isfinite(variance) & (variance > 0) & told)
     sd = np.sqrt(variance[good])
     r = result.covariance[np.ix_(good, good)] / np.outer(sd, sd)
     names = [result.determined[k] for k in good]
@@ -453,6 +456,7 @@ def drawn_for(
         "by_configuration": by_configuration(residuals),
         "matrix": correlation_matrix(result),
         "waterfall": "",
+        "smooth": smooth_figure(result),
     }  # fmt: skip
     if budget is not None:
         steps = budget_steps(result, budget)

@@ -132,8 +132,8 @@ def parameter_table(
     leaves out parameters that have no number of their own.  `brief` is for narrow terminals:
     value, interval and unit in one column, neither nominal nor true value.
     """
-    notes = undetermined or any(e.note for e in result.estimates if e.identifiable)
-    lopsided = any_lopsided(result.estimates)
+    notes = undetermined or any(e.note for e in result.ordinary if e.identifiable)
+    lopsided = any_lopsided(result.ordinary)
     table = _numbers_table("Parameters", "parameter", truth is not None, brief, lopsided)
     if not brief:
         table.add_column("nominal", justify="right", overflow="fold")
@@ -205,7 +205,7 @@ def print_result(console: Console, result: Calibration, truth: Truth | None = No
     """Single estimates, combinations, what is not determined, and the summary in words."""
     brief = console.width < NARROW
     alone = len(names_of(result, ALONE))
-    listed = console.width >= WIDE and 0 < len(result.estimates) - alone <= FEW
+    listed = console.width >= WIDE and 0 < len(result.ordinary) - alone <= FEW
     if alone or listed:
         console.print(parameter_table(result, truth, listed, brief))
     if result.combinations:

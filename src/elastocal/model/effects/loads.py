@@ -184,7 +184,9 @@ ANCHOR_DEFAULT = 0.4  # m, where it has none
 ANGLES, ARMS = 24, (0.12, 0.25, 0.4, 0.6, 0.8)
 # s₀/a of springs that pull and push a little and much, of gas springs that push and pull with
 # nearly the same force everywhere, in shares of the shortest and the longest length or of a.
-PULLING, PUSHING, GAS = (0.0, 0.7), (1.3,), (6.0, -4.0)
+# Without a free length a torque is a sine, whatever the arm.
+PULLING, PUSHING, GAS = (0.7,), (1.3,), (6.0, -4.0)
+NO_LENGTH = (0.25, 0.0)
 
 
 def spring_energy(q: Any, x: Any, y: Any, arm: Any, free: Any) -> ca.SX:
@@ -231,13 +233,11 @@ class GravityCompensator(Effect):
             return ()
         length = float(np.linalg.norm(link_ends(chain)[index(place)][:3, 3]))
         a = ANCHOR_SHARE * length if length > SHORTEST else ANCHOR_DEFAULT
-        shapes = [
-            (share, free)
-            for share in ARMS
-            for free in (
-                *(f * (1 - share) for f in PULLING), *(f * (1 + share) for f in PUSHING), *GAS
-            )
-        ]  # fmt: skip
+        shapes = [NO_LENGTH]
+        for share in ARMS:
+            shapes += [(share, f * (1 - share)) for f in PULLING]
+            shapes += [(share, f * (1 + share)) for f in PUSHING]
+            shapes += [(share, f) for f in GAS]
         return tuple(
             dict(zip(GEOMETRY, (a * np.cos(t), a * np.sin(t), a * share, a * free), strict=True))
             for t in np.linspace(0, 2 * np.pi, ANGLES, endpoint=False)
