@@ -55,6 +55,8 @@ def calibrated(name: str) -> CalibratedArm:
     place = effect.places(chain, cell)[0]
     keys = {s.key for s in effect.settings(place, chain, cell) if s.default is None}
     settings = {place: {key: 20.0 if "order" in key else 900.0 for key in keys}} if keys else {}
+    if name == "residual_field":  # one that follows nothing is none
+        settings = {place: {"field_joint1_size": 1e-4}}
     cell = kr270_cell(
         [f"{name}:{place}", *(() if name == "joint_compliance" else ["joint_compliance"])],
         observe,

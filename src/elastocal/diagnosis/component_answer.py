@@ -26,13 +26,15 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, covariance, project
 from elastocal.diagnosis.shrinkage import left_out_residual, rms_with_interval
 from elastocal.identification.findings import BudgetStep
-from elastocal.model.effects.gears import GearRipple, GearSpectrum
+from elastocal.model.effects.base import index
+from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray
 
 DRAWS = 400
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
+TOLD = 0.02  # share of the gap from which it matters which of several effects it is
 LARGE = 0.1  # share of the gap from which what has no name leaves the verdict open
 
 
@@ -82,6 +84,14 @@ class SumAnswer:
         w = self.draws[index]
         return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
 
+    def shares(self, members: Sequence[int]) -> Array:
+        """What these components add to the mean square of the whole, over that (draws,): shares
+        sum to one, and one that cancels a part of others is negative."""
+        index = np.concatenate([np.r_[self._span(k)] for k in members])
+        w = self.draws
+        with_all = np.einsum("kd,kd->d", w[index], self.gram[index] @ w)
+        return np.asarray(with_all / np.maximum(self.total, 1e-300))
+
     @cached_property
     def total(self) -> Array:
         return self.squares(range(len(self.found.components)))
@@ -98,9 +108,7 @@ class SumAnswer:
         return tuple(sorted(rows, key=lambda row: -row.share))
 
     def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
-        square = self.squares(members)
-        share = square / np.maximum(self.total, 1e-300)
-        rms = np.sqrt(square)
+        share, rms = self.shares(members), np.sqrt(self.squares(members))
         chosen = [self.found.components[k] for k in members]
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
@@ -120,7 +128,7 @@ class SumAnswer:
         return tuple(sorted((self._group(*item) for item in kinds.items()), key=lambda g: -g.share))
 
     def _group(self, name: str, members: list[int]) -> EffectGroup:
-        share = self.squares(members) / np.maximum(self.total, 1e-300)
+        share = self.shares(members)
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         chosen = [self.found.components[k] for k in members]
         reduction, ci90, _ = self._reduction(members)
@@ -182,8 +190,21 @@ class SumAnswer:
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         sets = []
         for k, rivals in self._rivals.items():
-            own = self.found.components[k].hypothesis
+            c, own = self.found.components[k], self.found.components[k].hypothesis
             assert own is not None
+            if abs(float(np.median(self.shares([k])))) < TOLD:
+                continue
+            if _of_gear(c):
+                # Which harmonic of one joint's error it is decides nothing.
+                angular = {(e.effect.name, e.where) for e in self.found.components if _of_gear(e)}
+                rivals = {
+                    key: p for key, p in rivals.items() if key == own.key or key[1] != c.where
+                }
+                rivals = {
+                    key: p for key, p in rivals.items() if key not in angular or key == own.key
+                }
+                whole = sum(rivals.values())
+                rivals = {key: p / whole for key, p in rivals.items()}
             if rivals.get(own.key, 0.0) < NAMED:
                 keys = [own.key, *(key for key in rivals if key != own.key)][:3]
                 sets.append(tuple(EffectAt(*key) for key in keys))
@@ -195,7 +216,7 @@ class SumAnswer:
         members = [k for k, c in enumerate(self.found.components) if not c.named]
         if not members:
             return 0.0
-        return float(np.median(self.squares(members) / np.maximum(self.total, 1e-300)))
+        return float(np.median(self.shares(members)))
 
     @property
     def n_causes(self) -> int:
@@ -234,14 +255,10 @@ class SumAnswer:
         at_place: dict[tuple[str, str], list[int]] = {}
         for k, c in enumerate(self.found.components):
             if c.named == named:
-                name = GearSpectrum.name if isinstance(c.effect, GearRipple) else c.effect.name
-                at_place.setdefault((name, c.where), []).append(k)
+                at_place.setdefault((c.effect.name, c.where), []).append(k)
         order = sorted(at_place.items(), key=lambda pair: -float(np.median(self.squares(pair[1]))))
         for (name, where), members in order:
             settings = self._settings(members)
-            if name == GearSpectrum.name and len(members) == 1:
-                c = self.found.components[members[0]]
-                name, settings = c.effect.name, dict(c.settings)
             reduction, ci90, ci95 = self._reduction(members)
             probability = max(self._probability(k) for k in members)
             parameters = tuple(p for k in members for p in self._parameters(k))
@@ -265,7 +282,7 @@ class SumAnswer:
         settings: dict[str, float] = {}
         for k, c in zip(members, found, strict=True):
             size, length = float(np.exp(sizes[k]) * c.unit), float(np.exp(lengths[k]))
-            if isinstance(c.effect, GearRipple):
+            if isinstance(c.effect, GearSpectrum):
                 continue
             settings |= dict(c.settings)
             if c.follows:
@@ -274,15 +291,15 @@ class SumAnswer:
                 settings |= {"curve_size_rad": size, "curve_length_rad": length}
             elif c.effect.sized_by:
                 settings[c.effect.sized_by] = size * self._typical(c)
-        ripples = [k for k in members if isinstance(self.found.components[k].effect, GearRipple)]
-        if len(ripples) > 1:
-            lines = sorted(self._line(k) for k in ripples)
-            settings |= {f"order_{n + 1}": order for n, (order, _) in enumerate(lines)}
-            # Of each coefficient, the prior is one size for all lines of a joint.
-            size = math.sqrt(float(np.mean([s**2 for _, s in lines])))
-            settings["spectrum_size_rad"] = size
-            q = self.dataset.table.q[:, int(found[0].where[5:]) - 1]
+        families = [k for k in members if isinstance(self.found.components[k].effect, GearSpectrum)]
+        lines = [line for k in families for line in self._lines(k)]
+        if lines:
+            # One prior size for all lines of a joint.
+            settings["spectrum_size_rad"] = math.sqrt(float(np.mean([s**2 for *_, s in lines])))
+            q = self.dataset.table.q[:, index(found[0].where)]
             settings["spectrum_centre_rad"] = float((q.max() + q.min()) / 2)
+            for n, (order, sd, _) in enumerate(sorted(lines), start=1):
+                settings |= {f"order_{n}": order, f"order_sd_{n}": sd}
         return settings
 
     def _typical(self, c: Component) -> float:
@@ -290,10 +307,12 @@ class SumAnswer:
         assert c.hypothesis is not None
         return float(np.max([p.typical or 0.0 for p in c.hypothesis.parameters]))
 
-    def _line(self, k: int) -> tuple[float, float]:
-        """Order of a line and its prior size in rad."""
+    def _lines(self, k: int) -> list[tuple[float, float, float]]:
+        """Order, its standard deviation and prior size in rad of each line of a family."""
         c = self.found.components[k]
-        return float(c.settings[0][1]), float(np.exp(self.found.sizes.size[k])) * GearRipple.typical
+        given, size = dict(c.settings), float(np.exp(self.found.sizes.size[k])) * c.unit
+        numbers = range(1, len(given) // 2 + 1)
+        return [(given[f"order_{n}"], given[f"order_sd_{n}"], size / n) for n in numbers]
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
         """Estimates of a component's parameters, where they are few and not shrunk."""

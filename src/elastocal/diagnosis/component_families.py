@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.diagnosis.components import Component, Family
+from elastocal.diagnosis.components import Component, Family, FittedSum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Constants, Hypothesis, RegressorDirection, recorded
@@ -17,7 +18,7 @@ from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
 from elastocal.model.effects.driven import DrivenEffect
-from elastocal.model.effects.gears import GearRipple, GearSpectrum
+from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
@@ -95,7 +96,10 @@ def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
             continue
         columns = dataset.packed(h, np.zeros(0))
         if np.abs(columns).max(initial=0.0) > 0:
-            yield Component(family_of(h.effect, cell), h.effect, h.where, columns, hypothesis=h)
+            search = -dataset.columns.shares.get(h.key, 0.0)
+            yield Component(
+                family_of(h.effect, cell), h.effect, h.where, columns, hypothesis=h, search=search
+            )
 
 
 def judged_together(model: Model, table: object) -> list[Hypothesis]:
@@ -115,52 +119,173 @@ def judged_together(model: Model, table: object) -> list[Hypothesis]:
     ]
 
 
-# What is looked for beside those: lines of a joint's error, and smooth fields without a name.
+# What is looked for beside those: families of lines of a joint's error, and smooth fields.
+#
+# A wheel that turns N times per turn of the joint makes lines at N and its multiples: sought
+# together they show where none of them would by itself.  The evidence of 2m columns at N, 2N, …,
+# mN is that of any group; N runs over a grid as fine as the highest of them needs, and each point
+# costs its share of the prior.
 
-SCANNED = 1500  # configurations, at most, that a search looks at
-LINES_AT_ONCE = 3  # of a joint, from one search
-FIELD_LENGTHS = (0.25, 1.5)  # of the range of what a field follows
-LEAST_SPAN = {"time": 60.0}
+MULTIPLES = (1, 2, 3)  # lines of a family, up to so many times the lowest order
+LOWEST, HIGHEST = 2.5, 250.0  # orders
+STEP = 1.5  # of the highest order of a family, in units of 1/range(q)
+MANY_POSES = 300  # from so many on single lines show by themselves
+LINE = 5e-5  # rad, a typical line
+LINE_SCALES = np.array([0.3, 1.0, 3.0, 10.0])
+PIECE = 4_000_000  # numbers of directions that are held at a time
 
 
-def lines(
-    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, taken: Sequence[Component]
-) -> list[Component]:
-    """The most conspicuous lines of every joint beside what is in `data`, each clear of the others
-    and of those `taken`."""
-    grams, found = _grams(dataset, data, noise), []
+@dataclass(frozen=True)
+class LineFamily:
+    """Lines of the joint `where` at `order` and its multiples: `gain` in nats less the search,
+    `sd` how well these data know the order, `search` what finding it cost, the joint's `scatter`
+    beside them, and the components that they are `instead_of`."""
+
+    where: str
+    order: float
+    multiples: int
+    gain: float
+    sd: float
+    search: float
+    scatter: float = 0.0
+    instead_of: tuple[Component, ...] = ()
+    component: Component = field(init=False)
+
+    def placed(self, component: Component) -> LineFamily:
+        """The same with its component."""
+        object.__setattr__(self, "component", component)
+        return self
+
+
+def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
+    """The most conspicuous family of lines of every joint beside the sum, the best first.
+
+    What is not found yet counts as scatter of its joint, or as its curve: so a family is tried
+    beside these, and in their place.
+    """
+    out, now = [], project(found.data, found.noise).marginal
+    beside = _grams(dataset, found.data, found.noise)
     for h in dataset.hypotheses:
         if not isinstance(h.effect, GearRipple):
             continue
-        grid = dataset.grids[h.key]
-        each = grams.of_hypothesis(h).evidence(h.scales) + grid.log_prior
-        orders = grid.values[:, 0]
-        near = [dict(c.settings)[h.settings[0].key] for c in taken
-                if isinstance(c.effect, GearRipple) and c.where == h.where]  # fmt: skip
-        for k in np.argsort(-each)[:200]:
-            if each[k] < 3.0 or len(near) >= 40:
-                break
-            if any(abs(orders[k] - other) < 2 * grid.step[k, 0] for other in near):
-                continue
-            order = _refined_order(grams, h, float(orders[k]), float(grid.step[k, 0]))
-            near.append(order)
-            columns = dataset.packed(h, np.array([order]))
-            settings = ((h.settings[0].key, order),)
-            found.append((float(each[k]), Component(
-                "angle", h.effect, h.where, columns, settings=settings, hypothesis=h)))  # fmt: skip
-            if sum(c.where == h.where for _, c in found) >= LINES_AT_ONCE:
-                break
-    return [c for _, c in sorted(found, key=lambda pair: -pair[0])]
+        i = index(h.where)
+        own = [c for c in found.components if c.where == h.where]
+        if (
+            sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
+            > MOST_FOUND
+        ):
+            continue
+        tried = [_best(dataset, beside, h, 0.0, float(found.noise.joint[i]), ())]
+        curves = tuple(c for c in own if isinstance(c.effect, JointCurve))
+        joint = found.noise.joint.copy()
+        joint[i] = min(joint[i], NoiseValues.usual(len(joint)).joint[i])
+        if curves or joint[i] < found.noise.joint[i]:
+            noise, data = replace(found.noise, joint=joint), found.without_these(curves)
+            grams = _grams(dataset, data, noise)
+            tried.append(_best(dataset, grams, h, grams.at.marginal - now, joint[i], curves))
+        best = max(tried, key=lambda family: family.gain)
+        if best.gain > 0:
+            out.append(best.placed(_family_component(dataset, best)))
+    return sorted(out, key=lambda family: -family.gain)
 
 
-def _refined_order(grams: Grams, h: Hypothesis, order: float, step: float) -> float:
-    for width in step / 8.0 ** np.arange(3):
-        trial = order + np.linspace(-width, width, 21)
-        trial = np.clip(trial, h.settings[0].lower, h.settings[0].upper)
-        order = float(
-            trial[int(np.argmax(grams.of_hypothesis(h, trial[:, None]).evidence(h.scales)))]
-        )
-    return order
+MOST_FOUND = MOST_LINES - 3
+
+
+def _best(
+    dataset: DiagnosisData, grams: Grams, h: Hypothesis, gain: float, scatter: float,
+    curves: tuple[Component, ...],
+) -> LineFamily:  # fmt: skip
+    """The best family of a joint, of any number of multiples; `gain` is that of what it is in the
+    place of."""
+    families = [_best_family(dataset, grams, h, m) for m in _multiples(dataset)]
+    best = max(families, key=lambda family: family.gain)
+    return replace(best, gain=best.gain + gain, scatter=float(scatter), instead_of=curves)
+
+
+def _multiples(dataset: DiagnosisData) -> tuple[int, ...]:
+    return MULTIPLES[:1] if len(dataset.blocks.member) > MANY_POSES else MULTIPLES
+
+
+def _best_family(dataset: DiagnosisData, grams: Grams, h: Hypothesis, m: int) -> LineFamily:
+    q = dataset.table.q[:, index(h.where)]
+    step = STEP / max(float(np.ptp(q)), 1e-3) / m
+    orders = np.arange(LOWEST, HIGHEST / m, step)
+    each = _family_evidence(dataset, grams, h, orders, m)
+    k = int(np.argmax(each))
+    search = float(np.log(len(orders) * len(MULTIPLES)))
+    order, sd, evidence = _refined(dataset, grams, h, float(orders[k]), m, step)
+    return LineFamily(h.where, order, m, evidence - search, sd, search)
+
+
+def tuned_family(dataset: DiagnosisData, found: FittedSum, family: Component) -> Component:
+    """The family of lines with its orders sought anew within NEARBY of their deviations."""
+    h = next(
+        h for h in dataset.hypotheses
+        if isinstance(h.effect, GearRipple) and h.where == family.where
+    )  # fmt: skip
+    given = dict(family.settings)
+    m, order, sd = len(given) // 2, given["order_1"], given["order_sd_1"]
+    grams = _grams(dataset, found.without_these((family,)), found.noise)
+    order, sd, _ = _refined(dataset, grams, h, order, m, NEARBY * sd)
+    return _family_component(dataset, LineFamily(family.where, order, m, 0.0, sd, family.search))
+
+
+NEARBY = 4.0
+
+
+def _refined(
+    dataset: DiagnosisData, grams: Grams, h: Hypothesis, order: float, m: int, width: float
+) -> tuple[float, float, float]:  # fmt: skip
+    """Lowest order of a family, its standard deviation and log evidence, sought within `width` of
+    `order`: the curvature of the evidence says how well it is known."""
+    for narrowed in width / 4.0 ** np.arange(3):
+        trial = order + np.linspace(-narrowed, narrowed, 17)
+        order = float(trial[int(np.argmax(_family_evidence(dataset, grams, h, trial, m)))])
+    trial = np.linspace(-width, width, 33)
+    each = _family_evidence(dataset, grams, h, order + trial, m)
+    evidence = float(each[16])
+    # The parabola through the highest five points, or all that are nearly as high.
+    near = np.abs(trial) <= max(np.abs(trial[each > evidence - 2.0]).min(initial=0.0), trial[18])
+    near |= (each > evidence - 2.0) & (np.abs(trial) < width / 2)
+    curvature = -2 * np.polyfit(trial[near], each[near], 2)[0]
+    sd = float(1 / np.sqrt(max(curvature, 1.0 / width**2)))
+    return order, sd, evidence
+
+
+def _family_evidence(
+    dataset: DiagnosisData, grams: Grams, h: Hypothesis, orders: Array, m: int
+) -> Array:
+    """Log evidence (G,) of the families of m lines at `orders` (G,)."""
+    sums = grams.entry(h.entry_key(dataset.base.model))
+    piece = max(1, PIECE // (sums.b.size * 2 * m))
+    out = []
+    for start in range(0, len(orders), piece):
+        some = orders[start : start + piece, None]
+        # The amplitudes of multiples fall with their number, in the mean.
+        D = [dataset.direction(h, some * k) / k for k in range(1, m + 1)]
+        out.append(sums.driven(np.concatenate(D, axis=4)).evidence(LINE_SCALES))
+    return np.concatenate(out)
+
+
+def _family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
+    effect, where = GearSpectrum(), family.where
+    q = dataset.table.q[:, index(where)]
+    settings = {"spectrum_size_rad": 1.0, "spectrum_centre_rad": float((q.max() + q.min()) / 2)}
+    for k in range(1, family.multiples + 1):
+        settings |= {f"order_{k}": k * family.order, f"order_sd_{k}": k * family.sd}
+    constants = Constants.of(dataset.base.model, where, settings)
+    parameters = effect.parameters(where, constants.chain, constants.cell)
+    typical = [p.typical or 0.0 for p in parameters]
+    columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
+    columns /= np.array([int(p.key.split("_")[1]) for p in parameters])
+    kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
+    return Component("angle", effect, where, columns, LINE, settings=kept, search=family.search)
+
+
+# Smooth fields.
+
+FIELD_LENGTHS = (0.25, 1.5)  # of the range of what a field follows
 
 
 def _grams(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> Grams:

@@ -13,7 +13,8 @@ from elastocal.diagnosis.component_families import (
     fields,
     joint_curves,
     judged_together,
-    lines,
+    line_families,
+    tuned_family,
 )
 from elastocal.diagnosis.components import COST, Component, FittedSum, fit_sum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
@@ -21,9 +22,13 @@ from elastocal.diagnosis.evidence import ANOTHER, Grams, Prior, direct
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
+from elastocal.model.effects.base import index
+from elastocal.model.effects.gears import GearSpectrum
 from elastocal.units import Progress
 
-SEARCHES = 3  # for lines and fields beside what has been found
+# Searches for more beside what has been found.
+LINE_SEARCHES, FIELD_SEARCHES = 16, 3
+FEW_POSES = 300  # up to which lines may be sought before curves
 MOST_FIELDS = 4  # that one search adds
 
 
@@ -36,24 +41,116 @@ def search_components(
     """
     full = _with_together(dataset)
     data = with_equal_noise(full)
-    noise = chosen.noise.of_instrument() if data.stated else _started(data)
-    components = [*joint_curves(full), *catalogue_components(full), *_searched(full, chosen)]
-    progress(f"sizes of {len(components)} components at once")
-    found = _swapped(full, data, fit_sum(data, components, noise), components)
-    for _ in range(SEARCHES):
-        progress("lines and fields beside the components")
-        more = lines(full, found.data, found.noise, found.components)
-        more += fields(full, found.data, found.noise, found.components, MOST_FIELDS)
-        if not more:
-            break
-        start = found.sizes
-        for component in more:
-            start = start.and_one(component)
-        wider = fit_sum(data, [*found.components, *more], found.noise, start)
-        if wider.score <= found.score + 0.5:
+    instrument = chosen.noise.of_instrument() if data.stated else _started(data)
+    curves = list(joint_curves(full))
+    others = [*catalogue_components(full), *_searched(full, chosen)]
+    progress(f"sizes of {len(curves) + len(others)} components at once")
+    both = [*curves, *others]
+    found = _swapped(full, data, fit_sum(data, both, instrument), both)
+    lined = False
+    if len(full.blocks.member) <= FEW_POSES:
+        # A curve takes up the lines of its joint as far as these few poses show them, and then
+        # none of them stands out.
+        progress("families of lines before curves")
+        first = _swapped(full, data, fit_sum(data, others, instrument), others)
+        first = _with_lines(full, data, first)
+        other = _wider(data, first, curves) or first
+        lined = other.score > found.score
+        found = other if lined else found
+    if not lined:
+        progress("families of lines beside the components")
+        found = _with_lines(full, data, found)
+    for _ in range(FIELD_SEARCHES):
+        progress("fields beside the components")
+        more = fields(full, found.data, found.noise, found.components, MOST_FIELDS)
+        wider = _wider(data, found, more)
+        if wider is None:
             break
         found = wider
-    return full, found
+    progress("what can be left out")
+    return full, _spared(data, found)
+
+
+def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum and the families of lines that stand out beside it, the best first.
+
+    With many poses all that stand out come in at once: what one hides from another is little.
+    """
+    for _ in range(LINE_SEARCHES):
+        stand_out = line_families(dataset, found)
+        wider = None
+        many = len(dataset.blocks.member) > FEW_POSES
+        for chosen in [stand_out] if many else [[family] for family in stand_out[:TRIED]]:
+            without = {id(c) for family in chosen for c in family.instead_of}
+            kept = [k for k, c in enumerate(found.components) if id(c) not in without]
+            start = found.sizes.chosen(kept)
+            for family in chosen:
+                start = start.and_one(family.component)
+            components = [*(found.components[k] for k in kept), *(f.component for f in chosen)]
+            joint = found.noise.joint.copy()
+            for family in chosen:
+                joint[index(family.where)] = family.scatter
+            fitted = fit_sum(data, components, replace(found.noise, joint=joint), start)
+            if fitted.score > found.score + GAINED:
+                wider = fitted
+                break
+        if wider is None:
+            break
+        found = wider if many else _tuned(dataset, data, wider)
+    return found
+
+
+def _tuned(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum with the orders of its lines sought anew, close by, beside what else is in it now."""
+    for c in found.components:
+        if not isinstance(c.effect, GearSpectrum):
+            continue
+        near = tuned_family(dataset, found, c)
+        if abs(near.settings[0][1] - c.settings[0][1]) < TUNED * c.settings[1][1]:
+            continue
+        start = found.sizes
+        tuned = [near if other is c else other for other in found.components]
+        fitted = fit_sum(data, tuned, found.noise, start, refit_noise=False)
+        if fitted.score > found.score:
+            found = fitted
+    return found
+
+
+TUNED = 0.2  # standard deviations of an order that are worth another fit
+
+
+def _spared(data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum without what the others can stand in for, once their sizes have followed."""
+    spared = 0
+    order = np.argsort(found.earned - [c.cost for c in found.components])
+    for c in [found.components[k] for k in order[:SPARED]]:
+        kept = [k for k, other in enumerate(found.components) if other is not c]
+        if len(kept) == len(found.components):
+            continue
+        fewer = [found.components[k] for k in kept]
+        start = found.sizes.chosen(kept)
+        fitted = fit_sum(data, fewer, found.noise, start, refit_noise=False)
+        if fitted.score > found.score:
+            found, spared = fitted, spared + 1
+    return fit_sum(data, found.components, found.noise, found.sizes) if spared else found
+
+
+SPARED = 6  # components that are tried to be left out, those first that earn least
+TRIED = 3  # families that are tried, the best first, before a search is given up
+
+
+def _wider(data: NoisyData, found: FittedSum, more: Sequence[Component]) -> FittedSum | None:
+    """The sum with these as well, or what is left of them; None where it is no better."""
+    if not more:
+        return None
+    start = found.sizes
+    for component in more:
+        start = start.and_one(component)
+    wider = fit_sum(data, [*found.components, *more], found.noise, start)
+    return wider if wider.score > found.score + GAINED else None
+
+
+GAINED = 0.5  # nats that a search must bring for another one
 
 
 def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -> float:
@@ -71,10 +168,8 @@ def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -
     for c in found.components:
         price = odds.get(c.hypothesis.key, usual) if c.hypothesis is not None else usual
         if c.hypothesis is not None and c.settings:
-            grid = dataset.grids[c.hypothesis.key]
-            price += float(grid.log_prior[grid.nearest(np.array([v for _, v in c.settings]))])
             price = known.get(c.hypothesis.key, price)
-        score += c.cost + price
+        score += c.cost - c.search + price
     return score
 
 

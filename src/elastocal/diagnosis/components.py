@@ -53,7 +53,8 @@ class Component:
 
     `waves` are those of a smooth function, whose spectrum its length decides, between the
     logarithms `lengths`; they stand in the columns `repeat` times, once for each component of the
-    motion.  `settings` are constants of the effect by key; `follows` is what a field depends on.
+    motion.  `settings` are constants of the effect by key, `search` what finding them cost in nats;
+    `follows` is what a field depends on.
     """
 
     family: Family
@@ -67,6 +68,7 @@ class Component:
     repeat: int = 1
     settings: tuple[tuple[str, float], ...] = ()
     hypothesis: Hypothesis | None = None
+    search: float = 0.0
 
     @property
     def label(self) -> str:
@@ -85,7 +87,9 @@ class Component:
     def cost(self) -> float:
         """Nats that it has to earn: its prior odds, and the search for its size and length."""
         low, high = self.lengths
-        return COST + (float(np.log((high - low) / AFTERWARDS)) if high > low else 0.0)
+        return (
+            COST + self.search + (float(np.log((high - low) / AFTERWARDS)) if high > low else 0.0)
+        )
 
     def shares(self, log_length: float) -> tuple[Array, Array]:
         """Prior variances (k,) at size 1, and the slope of their logarithms in log ℓ."""
@@ -156,7 +160,8 @@ class SumOfComponents:
         """√v, L of LLᵀ = I + √v M √v/a², b = (LLᵀ)⁻¹ √v z/a², and −2ℓ."""
         a2 = np.exp(2 * at.factor)
         root = np.sqrt(self.variances(at))
-        A = root[:, None] * (self.weighted.M / a2) * root[None, :]
+        A = self.weighted.M * (root / a2)
+        A *= root[:, None]
         A[np.diag_indices_from(A)] += 1
         L = linalg.cholesky(A, lower=True, overwrite_a=True, check_finite=False)
         z = root * self.weighted.z / a2
@@ -172,8 +177,9 @@ class SumOfComponents:
         K = len(self.components)
         at = Sizes(float(theta[0]), theta[1 : K + 1], theta[K + 1 :])
         root, L, b, value = self.factored(at)
-        inverse = linalg.lapack.dpotri(L, lower=1, overwrite_c=1)[0]
-        left = np.diag(inverse)  # a coefficient's posterior over its prior variance
+        inverse = linalg.lapack.dtrtri(L, lower=1, overwrite_c=1)[0]
+        # A coefficient's posterior over its prior variance.
+        left = np.einsum("ij,ij->j", inverse, inverse)
         each = (1 - left) - b**2  # ∂(−2ℓ)/∂ log v
         slope = np.zeros_like(theta)
         for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
@@ -199,7 +205,7 @@ class SumOfComponents:
         theta = np.concatenate([[at.factor], at.size, at.length])
         found = optimize.minimize(
             self.objective, theta, jac=True, method="L-BFGS-B", bounds=bounds,
-            options={"maxiter": steps, "ftol": 1e-9, "gtol": 1e-2},
+            options={"maxiter": steps, "ftol": 2e-7, "gtol": 1e-2},
         )  # fmt: skip
         x = found.x
         return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
@@ -257,8 +263,13 @@ class FittedSum:
 
     def without(self, k: int) -> NoisyData:
         """The data without the columns of component k."""
+        return self.without_these((self.components[k],))
+
+    def without_these(self, some: Sequence[Component]) -> NoisyData:
+        """The data without the columns of some of the components."""
         kept = np.ones(self.data.X.shape[2], dtype=bool)
-        kept[self.spans[k]] = False
+        for c, span in zip(self.components, self.spans, strict=True):
+            kept[span] &= not any(c is other for other in some)
         return replace(self.data, X=self.data.X[:, :, kept], precision=self.data.precision[kept])
 
 
@@ -278,7 +289,7 @@ def fit_sum(
         problem = posed(data, components, noise)
         for _ in range(ROUNDS * 4):
             at = problem.climbed(at, STEPS)
-            kept = _kept(problem, at)
+            kept = _kept(problem, at, strict=last == rounds - 1)
             if len(kept) == len(components):
                 break
             components, at = [components[k] for k in kept], at.chosen(kept)
@@ -302,11 +313,14 @@ def fit_sum(
     return FittedSum(tuple(components), at, noise, problem.earned(at), score, with_all)
 
 
-def _kept(problem: SumOfComponents, at: Sizes) -> list[int]:
+def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     """Components that stay: not the worst of those that do not earn their cost, nor those that are
-    next to nothing."""
+    next to nothing; only these go where not `strict`, since under a noise that does not suit them
+    the others may earn too little."""
     costs = np.array([c.cost for c in problem.components])
     earned = problem.earned(at) - (at.size**2) / 2 / SPREAD**2
+    if not strict:
+        costs = np.full(len(costs), MOST_AT_ONCE)
     poor = np.flatnonzero(earned < costs)
     if not len(poor):
         return list(range(len(costs)))

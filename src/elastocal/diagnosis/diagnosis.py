@@ -112,10 +112,11 @@ class ComponentShare:
     """What errors of one kind at one place contribute to the gap, all components judged together.
 
     `family` says what the error depends on: "angle" (the joint's own), "gravity", "torque",
-    "load", "move" (the last one), "time", "temperature", "pose", "tool".  `share` is the fraction
-    of the mean square gap after geometry that it makes alone, with its 90 % interval; shares of
-    components that go together do not add up to one.  `rms` in m, with its 95 % interval.
-    `probability` that it is there at all; `named` where some effect of the catalogue is in it.
+    "load", "move" (the last one), "time", "temperature", "pose", "tool".  `share` is what it
+    adds to the mean square gap after geometry, over that, with its 90 % interval: shares sum to
+    one, and that of a component which cancels a part of others may be negative.  `rms` in m, with
+    its 95 % interval.  `probability` that it is there at all; `named` where some effect of the
+    catalogue is in it.
     """
 
     family: str

@@ -69,7 +69,7 @@ from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-STEPS, FEW, HALVINGS = 25, 5, 8
+STEPS, FEW, HALVINGS = 25, 3, 8
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
 ROUGH = 1e-2  # the same, where rounding allows no better step
 ROUNDING = 1e-12
@@ -78,7 +78,7 @@ ROUNDS = 5
 # Two readings say the same where what the fit knows of them is that correlated, and their errors
 # differ by less than this share of themselves.
 SAME_POSE, ALIKE = 0.8, 0.5
-STILL = 0.02  # relative change of the noise at which the rounds end
+STILL = 0.05  # relative change of the noise at which the rounds end
 ALONE = 1e-9  # share of a direction that other configurations and the prior must see
 # Logarithms of the likelihood ratio: below the first the readings do not show a function at all,
 # above the second no doubt is left that it is there.

@@ -29,8 +29,8 @@ SMALL = 0.05
 PRICE = 0.75
 # Noise as shares of the variance that ordinary parameters leave, from which the search starts.
 SHARES = (1.0, 0.1, 0.01, 0.001)
-STEPS = 60
-TOLERANCE = 1e-3  # of the log-likelihood per row, relative
+STEPS = 40
+TOLERANCE = 1e-2  # of the log-likelihood per row, relative
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class ShrunkProblem:
             # From nothing the likelihood shows no way back: those there start once more.
             variance = self._terms(np.exp(self._spread(free, alive))).q / self.spare
             small = free < np.log(SMALL / variance)
-            if small.any():
+            if start is None and small.any():
                 again, other = least(np.where(small, -np.log(variance), free))
                 if again < value:
                     free = other
@@ -224,10 +224,9 @@ class ShrunkProblem:
         b = linalg.solve_triangular(
             U, linalg.solve_triangular(U, self.right[own], trans="T"), check_finite=False
         )
-        alpha = linalg.solve_triangular(self.R, self.z - across @ b)
         R = np.block([[self.R, across], [np.zeros((len(own), self.ordinary)), U]])
         return ShrunkPosterior(
-            R, np.concatenate([alpha, b]), self.ordinary, own, 1 / root, scales.variance, self.rows
+            R, self.z, b, self.ordinary, own, 1 / root, scales.variance, self.rows
         )
 
 
@@ -236,17 +235,25 @@ class ShrunkPosterior:
     """The estimate under a prior: ordinary columns first, then the shrunk ones that take part.
 
     `R` (columns, columns) is upper triangular, RᵀR the normal matrix of readings and prior in
-    units of σ; `step` (columns,) are α, and b from nominal.  `own` index the shrunk parameters
-    that take part, `prior` (own,) is σ over their standard deviations.
+    units of σ; z (ordinary,) its right side and b (own,) the shrunk parameters' estimate, from
+    nominal.  `own` index those that take part, `prior` (own,) is σ over their standard deviations.
     """
 
     R: Array
-    step: Array
+    z: Array
+    b: Array
     ordinary: int
     own: IntArray
     prior: Array
     variance: float
     rows: int
+
+    @cached_property
+    def step(self) -> Array:
+        """α and b (columns,).  Raises LinAlgError where ordinary columns depend on each other."""
+        k = self.ordinary
+        alpha = linalg.solve_triangular(self.R[:k, :k], self.z - self.R[:k, k:] @ self.b)
+        return np.concatenate([alpha, self.b])
 
     @cached_property
     def marginal(self) -> RFactor:

@@ -1,0 +1,196 @@
+"""Smooth functions from the command line: simulate, identify, compensate, export, design."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.robots import KR270
+from typer.testing import CliRunner, Result
+
+from elastocal.cli.app import app
+from elastocal.model import Model
+from elastocal.model.smooth_groups import smooth_groups
+
+CELL = """
+name = "curved"
+[robot]
+urdf = "arm.urdf"
+[tool]
+markers_m = { M1 = [0.1, 0.05, 0.2] }
+[tracker]
+sigma_um = 20
+[model]
+observe = "position"
+effects = [
+    "base_frame", "marker_position", "joint_offset", "joint_curve:joint1", "joint_curve:joint2",
+]
+[model.nominal.settings.joint1]
+curve_size_rad = 4e-4
+curve_length_rad = 0.5
+curve_low_rad = -1.5
+curve_high_rad = 1.5
+[model.nominal.settings.joint2]
+curve_size_rad = 4e-4
+curve_length_rad = 0.4
+curve_low_rad = -1.8
+curve_high_rad = -0.4
+"""
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
+
+
+def poses(path: Path, n: int, seed: int, wide: float = 1.0) -> None:
+    rng = np.random.default_rng(seed)
+    low = np.array([-1.5, -1.8, 0.2, -2.0, -1.5, -2.0])
+    high = np.array([1.5, -0.4, 2.0, 2.0, 1.5, 2.0])
+    q = rng.uniform(low, low + wide * (high - low), (n, 6))
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([f"q{i + 1}_rad" for i in range(6)])
+        writer.writerows(q.tolist())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cell, readings of an arm with curves drawn at random, and its calibration."""
+    here = tmp_path_factory.mktemp("curved")
+    (here / "arm.urdf").write_bytes(KR270.read_bytes())
+    (here / "cell.toml").write_text(CELL)
+    poses(here / "poses.csv", 90, 0)
+    poses(here / "more.csv", 60, 1)
+    truth = here / "truth.json"
+    cell = here / "cell.toml"
+    made = run(
+        "simulate", cell, here / "poses.csv", "-o", here / "data.csv", "--draw", 1, "--truth", truth
+    )
+    assert made.exit_code == 0, made.output
+    values = [f"--set={name}={value!r}" for name, value in json.loads(truth.read_text()).items()]
+    made = run("simulate", cell, here / "more.csv", "-o", here / "test.csv", "--seed", 5, *values)
+    assert made.exit_code == 0, made.output
+    done = run(
+        "identify", cell, here / "data.csv", "--test", here / "test.csv",
+        "-o", here / "result.json", "--report", here / "report.html",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    (here / "told.txt").write_text(done.output)
+    return here
+
+
+def test_identify_tells_functions_by_the_line(folder: Path) -> None:
+    told = (folder / "told.txt").read_text()
+    assert "Smooth function: joint curve of joint1:" in told and "coefficients' worth" in told
+    assert "curve_1" not in told
+    assert "2 smooth functions of" in told
+    result = json.loads((folder / "result.json").read_text())
+    assert result["test_rms_um"] < 60
+    assert [entry["where"] for entry in result["smooth"]] == ["joint1", "joint2"]
+    names = [p["name"] for p in result["parameters"]]
+    assert "joint2.curve_3" in names and len(names) > 40
+
+
+def test_the_report_draws_them(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    assert "Smooth functions" in page and "smooth-functions" in page
+    assert "curve_1" not in page
+
+
+def test_compensate_undoes_them(folder: Path) -> None:
+    """The commands put the true marker, curves and all, where it should be."""
+    cell, out = folder / "cell.toml", folder / "commands.csv"
+    model = Model(cell)
+    truth = json.loads((folder / "truth.json").read_text())
+    x = np.array([truth[name] for name in model.names])
+    poses(folder / "q.csv", 12, 3)
+    plan = model.read_plan(folder / "q.csv")
+    wanted = model.target_poses(model.table(plan.q), x)[1]
+    with (folder / "targets.csv").open("w") as file:
+        file.write("x_mm,y_mm,z_mm\n")
+        file.writelines(",".join(map(repr, map(float, p * 1e3))) + "\n" for p in wanted)
+    done = run(
+        "compensate", cell, folder / "result.json", folder / "targets.csv", "-o", out,
+        "--frame", "tracker",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "12 of 12 targets reached" in done.output
+    rows = list(csv.DictReader(out.open()))
+    q = np.radians([[float(row[f"q{k + 1}_deg"]) for k in range(6)] for row in rows])
+    std = np.array([float(row["std_um"]) for row in rows]) * 1e-6
+    inside = (q[:, 0] > -1.5) & (q[:, 0] < 1.5) & (q[:, 1] > -1.8) & (q[:, 1] < -0.4)
+    error = np.linalg.norm(model.target_poses(model.table(q), x)[1] - wanted, axis=1)
+    assert inside.sum() >= 3
+    assert (error[inside] < 4 * std[inside]).all() and np.median(error[inside]) < 1e-4
+
+
+def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
+    with (folder / "far.csv").open("w") as file:
+        file.write("q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n")
+        file.write("0.5,-1.0,1.0,0.1,0.5,0.1\n2.5,-1.0,1.0,0.1,0.5,0.1\n")
+    out = folder / "far_commands.csv"
+    done = run(
+        "compensate", folder / "cell.toml", folder / "result.json", folder / "far.csv", "-o", out
+    )
+    assert done.exit_code == 0, done.output
+    assert "joint1 stands outside -85.9° to 85.9°" in done.output
+    near, far = (float(row["std_um"]) for row in csv.DictReader(out.open()))
+    assert far > 2 * near
+
+
+def test_export_writes_them_as_corrections(folder: Path) -> None:
+    out = folder / "corrections.csv"
+    done = run(
+        "export", folder / "cell.toml", folder / "result.json", "-o", out, "--format",
+        "corrections", "--poses", 20,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "joint curve" in done.output
+    lines = out.read_text().splitlines()
+    assert lines[0].startswith("# calibrated by elastocal")
+    rows = list(csv.DictReader(lines[1:]))
+    assert {row["where"] for row in rows} == {"joint1", "joint2"}
+    own = [row for row in rows if row["where"] == "joint2"]
+    assert float(own[0]["position_deg"]) == pytest.approx(np.degrees(-1.8), abs=1e-3)
+    assert float(own[-1]["position_deg"]) == pytest.approx(np.degrees(-0.4), abs=1e-3)
+    # Beside the truth, less what offsets stand for.
+    truth = json.loads((folder / "truth.json").read_text())
+    model = Model(folder / "cell.toml")
+    group = smooth_groups(model)[1]
+    x = np.radians([float(row["position_deg"]) for row in own])
+    assert group.basis is not None
+    true = group.basis(x) @ [truth[model.names[c]] for c in group.columns[0]] * 1e6
+    found = np.array([float(row["value"]) for row in own])
+    half = np.array([float(row["half95"]) for row in own])
+    assert (np.abs(found - true) < 1.5 * half).mean() > 0.9
+    assert all(row["unit"] == "urad" for row in rows)
+
+
+def test_export_holds_the_rest_and_says_what_that_costs(folder: Path) -> None:
+    out = folder / "arm_out.urdf"
+    done = run("export", folder / "cell.toml", folder / "result.json", "-o", out, "--poses", 20)
+    assert done.exit_code == 0, done.output
+    assert "joint curve" in done.output and "cannot hold" in done.output
+
+
+def test_no_corrections_of_an_arm_without_functions(folder: Path) -> None:
+    plain = CELL.replace(', "joint_curve:joint1", "joint_curve:joint2"', "")
+    (folder / "plain.toml").write_text(plain)
+    run("identify", folder / "plain.toml", folder / "data.csv", "-o", folder / "plain.json")
+    done = run(
+        "export", folder / "plain.toml", folder / "plain.json", "-o", folder / "none.csv",
+        "--format", "corrections", "--poses", 10,
+    )  # fmt: skip
+    assert done.exit_code == 2 and "no smooth function" in done.output
+
+
+def test_design_holds_them_and_says_so(folder: Path) -> None:
+    done = run(
+        "design", folder / "cell.toml", "--poses", 8, "--candidates", 60, "--effort", "quick",
+        "--criterion", "D", "-o", folder / "plan.csv",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "holds the smooth functions (joint_curve) at zero" in done.output

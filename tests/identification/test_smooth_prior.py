@@ -1,0 +1,134 @@
+"""Parameters with a prior beside parameters without one, against textbook formulas."""
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from elastocal.identification.smooth_prior import LinearRows, Scales
+from elastocal.identification.weighted_problem import RFactor
+
+ROWS, FREE, SHRUNK = 80, 4, 15
+GROUP = np.repeat([0, 1, 2], 5)
+STD = np.concatenate([np.full(5, 0.5), np.linspace(1.0, 0.2, 5), np.full(5, 0.3)])
+
+
+def drawn(seed: int, scale: tuple[float, ...] = (1.0, 1.0, 1.0), sigma: float = 0.3):
+    """B (rows, free + shrunk), e, and true α and b."""
+    rng = np.random.default_rng(seed)
+    B = rng.normal(size=(ROWS, FREE + SHRUNK))
+    alpha = 3 * rng.normal(size=FREE)
+    b = STD * np.sqrt(np.array(scale))[GROUP] * rng.normal(size=SHRUNK)
+    e = B @ np.concatenate([alpha, b]) + sigma * rng.normal(size=ROWS)
+    return B, e, alpha, b
+
+
+def linear(B, e, away=None) -> LinearRows:
+    away = np.zeros(SHRUNK) if away is None else away
+    return LinearRows.of(RFactor.of(B, e), FREE, away, STD, GROUP)
+
+
+def marginal(B, e, scales: Scales, kept: np.ndarray) -> tuple[np.ndarray, float]:
+    """V of the rows, and −2 × the restricted log-likelihood but a constant, by the textbook."""
+    Bf, Bs = B[:, kept], B[:, FREE:]
+    V = scales.variance * np.eye(ROWS) + Bs * (STD**2 * scales.scale[GROUP]) @ Bs.T
+    W = np.linalg.inv(V)
+    N = Bf.T @ W @ Bf
+    P = W - W @ Bf @ np.linalg.inv(N) @ Bf.T @ W
+    return V, np.linalg.slogdet(V)[1] + np.linalg.slogdet(N)[1] + e @ P @ e
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kept", [np.arange(FREE), np.array([0, 2])])
+def test_the_posterior_is_that_of_ridge_regression(seed, kept):
+    B, e, *_ = drawn(seed)
+    scales = Scales(np.array([1.0, 0.3, 0.0]), 0.2, np.zeros(3))
+    found = linear(B, e).only(kept).posterior(scales)
+    own = np.flatnonzero(scales.scale[GROUP] > 0)
+    assert np.array_equal(found.own, own)
+    chosen = np.concatenate([kept, FREE + own])
+    C, prior = B[:, chosen], np.zeros(len(chosen))
+    prior[len(kept) :] = scales.variance / (STD**2 * scales.scale[GROUP])[own]
+    normal = C.T @ C + np.diag(prior)
+    assert np.allclose(found.step, np.linalg.solve(normal, C.T @ e), rtol=1e-9)
+    assert np.allclose(found.cofactor, np.linalg.inv(normal), rtol=1e-8)
+    hat = C @ np.linalg.solve(normal, C.T)
+    assert np.isclose(found.effective, np.trace(hat))
+    assert np.allclose(np.diag(C @ found.cofactor @ C.T), np.diag(hat))
+    share = np.diag(found.cofactor * prior @ found.cofactor) / np.diag(found.cofactor)
+    assert np.allclose(found.prior_share, share)
+
+
+def test_the_marginal_factor_takes_the_functions_for_noise():
+    B, e, *_ = drawn(0)
+    scales = Scales(np.array([1.0, 0.3, 2.0]), 0.2, np.zeros(3))
+    V, _ = marginal(B, e, scales, np.arange(FREE))
+    R = linear(B, e).only(np.arange(FREE)).posterior(scales).marginal.R
+    information = B[:, :FREE].T @ np.linalg.inv(V) @ B[:, :FREE]
+    assert np.allclose(R.T @ R / scales.variance, information, rtol=1e-9)
+
+
+def test_functions_away_from_nominal_make_no_difference():
+    B, e, *_ = drawn(1)
+    away = np.random.default_rng(5).normal(size=SHRUNK)
+    there = linear(B, e - B[:, FREE:] @ away, away).only(np.arange(FREE))
+    here = linear(B, e).only(np.arange(FREE))
+    assert np.allclose(there.right, here.right) and np.isclose(there.total, here.total)
+    scales = Scales(np.ones(3), 0.1, np.zeros(3))
+    assert np.allclose(there.posterior(scales).step, here.posterior(scales).step)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sizes_are_those_of_the_largest_restricted_likelihood(seed):
+    B, e, *_ = drawn(seed, (0.5, 0.9, 0.2))
+    problem = linear(B, e).only(np.arange(FREE))
+    found = problem.scales()
+    assert (found.scale < 1).all(), "else their price matters"
+
+    def textbook(log):
+        scale, variance = np.exp(log[:3]), np.exp(log[3])
+        return marginal(B, e, Scales(scale, variance, np.zeros(3)), np.arange(FREE))[1]
+
+    at = np.log([*np.maximum(found.scale, 1e-6), found.variance])
+    better = optimize.minimize(textbook, at, method="Nelder-Mead", options={"maxiter": 4000})
+    assert textbook(at) - better.fun < 0.05
+    none = Scales(np.where(np.arange(3) == 1, 0.0, found.scale), found.variance, np.zeros(3))
+    # What a group gains is at the variance that goes with its absence, so never more than here.
+    worse = marginal(B, e, none, np.arange(FREE))[1] - textbook(at)
+    assert found.gain[1] <= worse / 2 + 1e-6
+
+
+def test_what_is_not_there_is_shrunk_to_nothing():
+    B, e, _, b = drawn(2, (1.0, 0.0, 0.0))
+    found = linear(B, e).only(np.arange(FREE)).scales()
+    assert found.scale[0] > 0.1 and found.gain[0] > 10
+    assert (found.gain[1:] < 2).all()
+    posterior = linear(B, e).only(np.arange(FREE)).posterior(found)
+    assert np.abs(posterior.step[FREE + 5 :]).max(initial=0) < 0.5 * np.abs(b[:5]).max()
+
+
+def test_a_group_at_zero_stays_there():
+    B, e, *_ = drawn(3)
+    start = Scales(np.array([1.0, 0.0, 1.0]), 0.1, np.zeros(3))
+    assert linear(B, e).only(np.arange(FREE)).scales(start).scale[1] == 0.0
+
+
+def test_ten_times_the_size_has_its_price():
+    """Data that hardly show a function would else take it for anything."""
+    B, e, *_ = drawn(4, (1.0, 1.0, 0.0))
+    B[:, FREE + 10 :] *= 1e-4
+    found = linear(B, e).only(np.arange(FREE)).scales()
+    assert found.scale[2] < 10
+
+
+def test_posterior_intervals_hold_the_truth():
+    hits, n = 0, 0
+    for seed in range(40):
+        B, e, alpha, b = drawn(100 + seed)
+        problem = linear(B, e).only(np.arange(FREE))
+        posterior = problem.posterior(problem.scales())
+        truth = np.concatenate([alpha, b])[np.r_[0:FREE, FREE + posterior.own]]
+        std = np.sqrt(posterior.variance * np.diag(posterior.cofactor))
+        hits += int((np.abs(posterior.step - truth) < 1.96 * std).sum())
+        n += len(truth)
+    low, high = stats.binom.ppf([0.0005, 0.9995], n, 0.94)
+    assert low <= hits <= high
