@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 
 import pytest
 from support.cells import kr270_cell, kr270_chain
-from support.diagnoses import EXPLAINED, EXTRA, UNKNOWN, VERDICTS
+from support.diagnoses import EXPLAINED, EXTRA, MANY_UNKNOWN, UNKNOWN, VERDICTS
 
 from elastocal.diagnosis import Diagnosis, Gap, NearRepeats, publish
 from elastocal.identification import BudgetStep
@@ -106,3 +106,30 @@ def test_curves_and_extra_poses(model):
     assert len(curve["x"]) == len(curve["y"]) == len(curve["sd"]) == 40
     assert content["extra_plan"]["pairs"][0]["distance_after"] == 5.6
     assert content["extra_plan"]["n_poses"] == 2
+
+
+def test_components_groups_and_fields(model):
+    content = publish(MANY_UNKNOWN, model, "data.csv")
+    first = content["components"][0]
+    assert (first["family"], first["where"], first["effects"]) == (
+        "angle", "joint2", ["joint_curve"],
+    )  # fmt: skip
+    assert first["effect"] == "joint_curve" and first["named"] is True
+    assert first["share"] == 0.55 and first["share_ci90"] == pytest.approx([0.495, 0.605])
+    rms = 426 * math.sqrt(0.55)
+    assert first["rms_um"] == pytest.approx(rms)
+    assert first["rms_ci95_um"] == pytest.approx([0.94 * rms, 1.06 * rms])
+    assert content["components"][-1]["named"] is False
+    gears = content["groups"][0]
+    assert (gears["name"], gears["places"]) == ("gear_errors", ["joint1", "joint2", "joint5"])
+    assert gears["effects"] == ["joint_curve", "gear_eccentricity"]
+    assert (gears["share"], gears["share_ci90"]) == (0.82, [0.79, 0.85])
+    assert (gears["gap_reduction"], gears["gap_reduction_ci90"]) == (0.54, [0.52, 0.56])
+    (field,) = content["fields"]
+    assert (field["effect"], field["where"]) == ("residual_field", "base")
+    assert field["settings"]["field_time_length"] == 5400.0
+    assert content["location"]["evidence"]["shares"] == {"transmission": 0.97, "tracker": 0.05}
+    kinds = [f["kind"] for f in content["findings"]]
+    assert kinds[:4] == [
+        "unknown_effect", "many_causes", "named_beside_unknown", "corrected_without_a_name",
+    ]  # fmt: skip

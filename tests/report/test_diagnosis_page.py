@@ -43,7 +43,8 @@ def test_names_from_files_are_text_and_nothing_comes_from_elsewhere(name, pages)
 @pytest.mark.parametrize("name", VERDICTS)
 def test_figures_are_well_formed_and_follow_the_page_colours(name, pages):
     figures = re.findall(r"<svg.*?</svg>", pages[name], re.DOTALL)
-    assert len(figures) == (4 if VERDICTS[name].curves else 3)
+    shown = VERDICTS[name]
+    assert len(figures) == 3 + bool(shown.curves) + bool(shown.components)
     for figure in figures:
         ElementTree.fromstring(figure)
         assert "aria-label" in figure
@@ -53,10 +54,15 @@ def test_figures_are_well_formed_and_follow_the_page_colours(name, pages):
 
 
 def test_sections_appear_where_there_is_something_to_tell(pages):
+    many = {name for name in VERDICTS if name.startswith("many")}
     heads = {
         "Shape of the unknown dependence": {"unknown"},
-        "Effects found": {"explained", "two", "ambiguous", "planned", "inseparable"},
-        "These data cannot tell apart": {"ambiguous", "planned", "inseparable"},
+        "What the gap is made of": many,
+        "Error curves of the joints": many,
+        "Corrections without a name": {"many unknown"},
+        "one at a time": many,
+        "Effects found": {"explained", "two", "ambiguous", "planned", "inseparable"} | many,
+        "These data cannot tell apart": {"ambiguous", "planned", "inseparable", "many ambiguous"},
         "Extra poses": {"planned", "inseparable"},
         "d with the extra poses": {"planned", "inseparable"},
         "The data single out no link": {"nothing", "unlocated"},
@@ -72,7 +78,7 @@ def test_every_number_of_the_answer_is_on_the_page(pages):
     rows = {row[0]: row for row in page.rows if row}
     assert rows["gear eccentricity at joint 2"][1] == "0.98"  # the last table of the two
     assert rows["joint2.eccentricity_sin"][1:] == ["0.112", "0.012", "mrad"]
-    assert rows["joint 2 angle"][1:] == ["< 0.001", "0.0040"]
+    assert rows["joint 2 angle"][1:] == ["0.00050", "0.0040"]
     assert rows["joint 2"][1] == "0.98"
     assert rows["88"][1:] == ["29", "M3", "1.30 mm", "71.0"]
     assert rows["joint compliance"][1:3] == ["84.0 µm", "71.0 µm to 97.0 µm"]
@@ -93,6 +99,27 @@ def test_shade_of_the_chain_is_the_evidence(pages):
     assert chain[0].count("likeliest") == 1
     unlocated = re.search(r'<svg class="chain".*?</svg>', pages["unlocated"], re.DOTALL)
     assert unlocated and "fill-opacity" not in unlocated[0]
+
+
+def test_of_many_causes_the_chain_shows_shares_and_no_probabilities(pages):
+    chain = re.search(r'<svg class="chain".*?</svg>', pages["many"], re.DOTALL)
+    assert chain
+    assert "97 %" in chain[0] and "5.0 %" in chain[0] and "0.98" not in chain[0]
+    assert "Share of the gap that comes about in each link" in Page(pages["many"]).text
+
+
+def test_places_stand_below_their_finding(pages):
+    page = Page(pages["many"])
+    rows = [row for row in page.rows if row]
+    heads = [row[0] for row in rows]
+    table = heads.index("place")
+    first, second = (
+        heads.index(name, table)
+        for name in ("gear errors at joints 1, 2 and 5", "gravity sag at joints 2 and 3")
+    )
+    assert heads[first + 1 : second] == ["joint 2", "joint 1", "joint 5"]
+    assert rows[first + 1][1:3] == ["against its own angle", "joint curve"]
+    assert heads[second + 1 : second + 3] == ["joint 3", "joint 2"]
 
 
 def test_extra_poses_in_people_s_units(pages):

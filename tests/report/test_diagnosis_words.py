@@ -30,18 +30,20 @@ from elastocal.report.diagnosis_view import (
     diagnosis_headline,
     diagnosis_lines,
     diagnosis_steps,
-    effect_at,
     gap_rows,
     hypothesis_rows,
-    name_of,
     noise_floor_lines,
+    seen_from,
+    sensitivity,
+    untested_rows,
+)
+from elastocal.report.effect_names import (
+    effect_at,
+    name_of,
     p_value,
     probability,
     reduction,
-    seen_from,
-    sensitivity,
     settings_text,
-    untested_rows,
 )
 from elastocal.report.formatting import together
 
@@ -161,7 +163,7 @@ def test_the_same_advice_is_given_once():
     advice = [s for s in diagnosis_steps(EXPLAINED) if "direction of the last motion" in s]
     assert len(advice) == 1
     (row,) = untested_rows(EXPLAINED).rows
-    assert row[0] == "hysteresis (joint 1, joint 2)"
+    assert row[0] == "hysteresis (joints 1 and 2)"
 
 
 @pytest.mark.parametrize("name", VERDICTS)

@@ -106,10 +106,12 @@ def test_diagnosis_as_html_and_frame(name):
     text = " ".join(parsed(d).words)
     assert "Verdict:" in text and "noise alone" in text
     frame = d.to_dataframe()
-    assert list(frame.effect) == [c.effect for c in d.candidates]
-    assert int(frame.found.sum()) == len(
-        {(f.effect, f.where) for f in d.effects} & {(c.effect, c.where) for c in d.candidates}
-    )
+    tried = {(c.effect, c.where) for c in d.candidates}
+    found = {(f.effect, f.where) for f in d.effects}
+    only = [f.effect for f in d.effects if (f.effect, f.where) not in tried]
+    assert list(frame.effect) == [*only, *(c.effect for c in d.candidates)]
+    assert set(zip(frame.effect[frame.found], frame["where"][frame.found], strict=True)) == found
+    assert ("What the gap is made of" in text) == bool(d.groups)
 
 
 def drawn_points(figure):

@@ -8,9 +8,11 @@ import numpy as np
 
 from elastocal.diagnosis import (
     Candidate,
+    ComponentShare,
     Curve,
     Diagnosis,
     EffectAt,
+    EffectGroup,
     ExtraPlan,
     FaultyReading,
     FittedParameter,
@@ -217,6 +219,86 @@ INSEPARABLE = replace(
     inseparable=(EXTRA.rivals,),
 )
 
+# Many causes at once: errors of three gears, sag at two joints, and a creep that nobody can name.
+
+
+def curve(joint: int, size: float) -> FoundEffect:
+    settings = {
+        "curve_low_rad": -2.9, "curve_high_rad": 0.5, "curve_size_rad": size,
+        "curve_length_rad": 0.07,
+    }  # fmt: skip
+    return FoundEffect(
+        "joint_curve", f"joint{joint}", 0.999, 0.2, (0.18, 0.22), (0.17, 0.23), (), settings
+    )
+
+
+def part(family: str, where: str, effects: tuple[str, ...], share: float, p: float = 0.999):
+    rms = 426e-6 * share**0.5
+    return ComponentShare(
+        family, where, effects, share, (0.9 * share, 1.1 * share), rms, (0.94 * rms, 1.06 * rms),
+        p, effects != ("residual_field",),
+    )  # fmt: skip
+
+
+JOINTS = ("joint1", "joint2", "joint5")
+MANY = replace(
+    EXPLAINED,
+    gap=replace(EXPLAINED.gap, calibrated=426e-6, explained=137e-6, noise_floor=61e-6),
+    budget=(
+        *EXPLAINED.budget[:2],
+        BudgetStep("geometry", 426e-6, (384e-6, 472e-6)),
+        BudgetStep("gear_errors:joint1+joint2+joint5", 213e-6, (156e-6, 290e-6)),
+        BudgetStep("gravity_sag:joint2+joint3", 137e-6, (104e-6, 179e-6)),
+        BudgetStep("noise_floor", 61e-6, (61e-6, 61e-6)),
+    ),
+    effects=(
+        curve(2, 3.2e-4), curve(1, 3.3e-4),
+        FoundEffect("gravity_sag", "joint3", 0.99, 0.02, (0.01, 0.03), (0.0, 0.04), (),
+                    {"sag_size_rad": 2.2e-4}),
+        FoundEffect("gravity_sag", "joint2", 0.98, 0.01, (0.0, 0.02), (0.0, 0.02), (),
+                    {"sag_size_rad": 2.1e-4}),
+        replace(ECCENTRICITY, where="joint5", probability=0.58),
+    ),
+    indistinguishable=(),
+    components=(
+        part("angle", "joint2", ("joint_curve",), 0.55),
+        part("angle", "joint1", ("joint_curve",), 0.25),
+        part("gravity", "joint3", ("gravity_sag",), 0.10),
+        part("gravity", "joint2", ("gravity_sag",), 0.03),
+        part("angle", "joint5", ("gear_eccentricity",), 0.016),
+    ),
+    groups=(
+        EffectGroup("gear_errors", JOINTS, ("joint_curve", "gear_eccentricity"), 0.82, (0.79, 0.85),
+                    0.54, (0.52, 0.56)),
+        EffectGroup("gravity_sag", ("joint2", "joint3"), ("gravity_sag",), 0.12, (0.09, 0.15),
+                    0.009, (0.002, 0.016)),
+    ),
+    curves=tuple(
+        Curve(f"joint{j} angle", "rad", f"joint{j}", "rad", tuple(X), tuple(3e-4 * np.sin(9 * X)),
+              (2e-5,) * len(X))
+        for j in (1, 2)
+    ),
+    location=replace(LOCATION, shares={"transmission": 0.97, "tracker": 0.05}),
+)  # fmt: skip
+CREEP = FoundEffect(
+    "residual_field", "base", 0.99, 0.05, (0.03, 0.07), (0.02, 0.08), (),
+    {"field_time_size": 4e-5, "field_time_length": 5400.0, "field_time_low": 0.0,
+     "field_time_high": 28800.0},
+)  # fmt: skip
+MANY_AMBIGUOUS = replace(
+    MANY,
+    verdict="ambiguous",
+    indistinguishable=((EffectAt("gear_eccentricity", "joint5"),
+                        EffectAt("gear_second_harmonic", "joint5")),),
+)  # fmt: skip
+MANY_UNKNOWN = replace(
+    MANY,
+    verdict="unknown_effect",
+    budget=(*MANY.budget[:-1], BudgetStep("unknown:base", 90e-6, (80e-6, 100e-6)), MANY.budget[-1]),
+    components=(*MANY.components, part("time", "base", ("residual_field",), 0.11)),
+    fields=(CREEP,),
+)
+
 VERDICTS = {
     "explained": EXPLAINED,
     "two": TWO,
@@ -226,4 +308,7 @@ VERDICTS = {
     "nothing": NOTHING,
     "unknown": UNKNOWN,
     "unlocated": replace(UNKNOWN, location=None, curves=(), structure=()),
+    "many": MANY,
+    "many ambiguous": MANY_AMBIGUOUS,
+    "many unknown": MANY_UNKNOWN,
 }

@@ -70,6 +70,7 @@ def diagnose(
     from elastocal.diagnosis.diagnose import write_extended_cell
     from elastocal.diagnosis.diagnosis import publish
     from elastocal.model.choice import cell_of
+    from elastocal.report.causes_view import added_text
     from elastocal.saving import save_diagnosis
 
     require(
@@ -96,11 +97,11 @@ def diagnose(
             write_page(found, report, [cell, data], repeated(), seed)
             told.append(f"wrote {report}")
         if plan is not None:
-            told.append(_write_extra_poses(plan, found.extra, kinds))
+            told.append(_write_extra_poses(plan, found.extra, kinds, bool(found.groups)))
         if cell_out is not None:
             extra = (*found.effects, *found.fields)
             write_extended_cell(cell, cell_out, extra, found.model_keys)
-            added = ", ".join(f"{f.effect}:{f.where}" for f in extra)
+            added = added_text(extra)
             told.append(f"wrote {cell_out} with {added or 'no further effect'}")
             if added:
                 again = shlex.join(["elastocal", "identify", str(cell_out), str(data)])
@@ -115,10 +116,15 @@ def diagnose(
         typer.echo(line)
 
 
-def _write_extra_poses(path: Path, extra: ExtraPlan | None, kinds: Sequence[str]) -> str:
-    """Write the extra poses, and say so; or why there are none to write."""
+def _write_extra_poses(
+    path: Path, extra: ExtraPlan | None, kinds: Sequence[str], many: bool
+) -> str:
+    """Write the extra poses, and say so; or why there are none to write: `many` causes act at
+    once, or none is left open."""
     from elastocal.saving import save_extra_poses
 
+    if extra is None and many:
+        return f"{path} not written: many causes act at once, and no few poses tell them apart"
     if extra is None:
         return f"{path} not written: there are no rivals to tell apart"
     if extra.plan is None:

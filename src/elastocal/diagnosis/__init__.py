@@ -7,10 +7,15 @@ ROOMS = {
     "baseline": (
         "Baseline Blocks VisitPlaces fit_baseline from_centre made_once prior_deviations thinned"
     ),
+    "component_answer": "SumAnswer",
+    "component_families": "catalogue_components driven_columns joint_curves line_families",
+    "component_search": "compared_score search_components",
+    "components": "Component FittedSum Sizes SumOfComponents fit_sum posed",
     "diagnose": "DiagnosisOptions write_extended_cell",
     "diagnosis": (
-        "Candidate Curve Diagnosis EffectAt ExtraPlan FaultyReading FittedParameter "
-        "FoundEffect Gap Location NearRepeats NoiseFloor RivalPair StructureTest Untested publish"
+        "Candidate ComponentShare Curve Diagnosis EffectAt EffectGroup ExtraPlan FaultyReading "
+        "FittedParameter FoundEffect Gap Location NearRepeats NoiseFloor RivalPair "
+        "StructureTest Untested publish"
     ),
     "diagnosis_data": "DiagnosisData diagnosis_data_of",
     "discrimination": (

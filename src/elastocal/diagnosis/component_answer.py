@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -20,13 +21,15 @@ from elastocal.diagnosis.diagnosis import (
     EffectGroup,
     FittedParameter,
     FoundEffect,
+    Location,
+    StructureTest,
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, covariance, project
 from elastocal.diagnosis.shrinkage import left_out_residual, rms_with_interval
 from elastocal.identification.findings import BudgetStep
-from elastocal.model.effects.base import index
+from elastocal.model.effects.base import Stage, index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray
@@ -235,6 +238,30 @@ class SumAnswer:
         members = [k for k, c in enumerate(self.found.components) if not c.named]
         return max((self._probability(k) for k in members), default=0.0)
 
+    def location(self, tests: Sequence[StructureTest]) -> Location:
+        """Where the largest cause acts, the largest without a name where the verdict is open;
+        what each stage contributes, and how surely anything acts at each stage and place."""
+        members = range(len(self.found.components))
+        at_stage: dict[Stage, list[int]] = {}
+        places: dict[str, float] = {}
+        for k in members:
+            c = self.found.components[k]
+            at_stage.setdefault(_stage_of(c), []).append(k)
+            places[c.where] = max(places.get(c.where, 0.0), self._there(k))
+        stages = {stage: max(map(self._there, own)) for stage, own in at_stage.items()}
+        shares = {
+            stage: float(np.median(self.squares(own) / np.maximum(self.total, 1e-300)))
+            for stage, own in at_stage.items()
+        }
+        open_ones = [k for k in members if not self.found.components[k].named]
+        chosen = open_ones if self.verdict == "unknown_effect" else list(members)
+        largest = max(chosen, key=lambda k: float(np.median(self.squares([k]))))
+        c = self.found.components[largest]
+        return Location(
+            _stage_of(c), c.where, places[c.where], _falling(stages), _falling(places),
+            {t.driver: t.p_value for t in tests}, _falling(shares),
+        )  # fmt: skip
+
     @property
     def verdict(self) -> Verdict:
         if self.unnamed_share > LARGE:
@@ -380,6 +407,18 @@ class SumAnswer:
 
 GEARS = "gear_errors"
 MOST_STEPS = 4
+
+
+def _stage_of(c: Component) -> Stage:
+    """The stage of the chain at which a component acts."""
+    if c.named:
+        return c.effect.stage
+    stages: dict[str, Stage] = {"joint": "transmission", "link": "geometry", "base": "tracker"}
+    return next((s for kind, s in stages.items() if c.where.startswith(kind)), "tool")
+
+
+def _falling(values: Mapping[Any, float]) -> dict[str, float]:
+    return {str(key): v for key, v in sorted(values.items(), key=lambda item: -item[1])}
 
 
 def _of_gear(c: Component) -> bool:

@@ -273,6 +273,8 @@ def _diagnosis_of_sum(
     )  # fmt: skip
     tests = structure_tests(found.first)
     slot, rivals = found.slots[0], judge(found)
+    there = {(f.effect, f.where) for f in answer.effects}
+    small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
     p = found.p_values[0] if found.p_values else exceedance(found.first.flipped, found.first.odds)
     return Diagnosis(
         verdict=answer.verdict,
@@ -281,7 +283,7 @@ def _diagnosis_of_sum(
         effects=answer.effects,
         candidates=candidates(dataset, found, rivals),
         indistinguishable=answer.indistinguishable,
-        location=location(found, tests),
+        location=answer.location(tests),
         noise=noise_floor(answer.dataset, data, answer.found.noise),
         structure=tests,
         probability_nothing=slot.probabilities()[1],
@@ -291,7 +293,7 @@ def _diagnosis_of_sum(
         components=answer.components,
         groups=answer.groups,
         fields=answer.fields,
-        untested=(*untested, *too_small(dataset, found)),
+        untested=(*untested, *small),
         warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),

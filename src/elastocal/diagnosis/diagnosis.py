@@ -240,7 +240,11 @@ class Curve:
 @dataclass(frozen=True)
 class Location:
     """Where the gap lies.  `evidence`: probability of each stage and of each place, and p-values
-    that name no effect."""
+    that name no effect.
+
+    Where many causes act at once, `stage` and `where` are those of the largest, the probabilities
+    are that something acts there at all, and `shares` are those of each stage in the gap.
+    """
 
     stage: Stage
     where: str
@@ -248,6 +252,7 @@ class Location:
     stages: dict[str, float]
     places: dict[str, float]
     drivers: dict[str, float]
+    shares: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -367,8 +372,9 @@ class Diagnosis(Result):
 
     @property
     def open(self) -> bool:
-        """Whether rivals are left that more poses may tell apart."""
-        return self.verdict in ("ambiguous", "unknown_effect")
+        """Whether rivals are left that poses can be designed for: of single causes, not of many
+        that act at once."""
+        return self.verdict in ("ambiguous", "unknown_effect") and not self.groups
 
     @property
     def dependences(self) -> tuple[StructureTest, ...]:
@@ -395,6 +401,8 @@ class Diagnosis(Result):
 
     def __repr__(self) -> str:
         found = ", ".join(f"{f.effect} at {f.where}" for f in self.effects)
+        if self.groups:
+            found = ", ".join(f"{g.name} at {' '.join(g.places)}" for g in self.groups)
         robot = "" if self.model is None else f" {self.model.chain.name}"
         return f"<Diagnosis{robot}: {self.verdict}{', ' + found if found else ''}>"
 
@@ -408,14 +416,25 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
     }
     settled = d.verdict in ("explained", "nothing_significant")
     yield Finding(d.verdict, "good" if settled else "care", numbers, _remedy(d.verdict))
-    if d.verdict == "unknown_effect" and d.effects:
-        names = {"effects": numbers["effects"]}
-        yield Finding(
-            "named_beside_unknown", "care", names,
-            f"The cell that {option('cell_out')} writes has the effects named added, and nothing "
-            "for what has no name: keep it only where it does better on poses kept back (identify "
-            f"with {option('test')}).",
+    if d.groups:
+        shares = tuple(g.share for g in d.groups)
+        low, high = zip(*(g.share_ci90 for g in d.groups), strict=True)
+        names = tuple(f"{g.name}:{'+'.join(g.places)}" for g in d.groups)
+        numbers = {"groups": names, "shares": shares, "shares_low": low, "shares_high": high}
+        remedy = "" if settled else (
+            "More poses, spread over the whole range of every joint, tell many causes apart that "
+            "act at once."
         )  # fmt: skip
+        yield Finding("many_causes", "note", numbers, remedy)
+    if d.verdict == "unknown_effect" and d.effects:
+        names = {"effects": tuple(f"{f.effect}:{f.where}" for f in d.effects)}
+        alone = _kept_back("the effects named added, and nothing for what has no name: keep it")
+        yield Finding("named_beside_unknown", "care", names, "" if d.fields else alone)
+    if d.fields:
+        numbers = {"fields": tuple(f"{f.effect}:{f.where}" for f in d.fields)}
+        beside = "the effects named and " if d.effects else ""
+        smooth = "smooth corrections for what has no name, which explain nothing: keep it"
+        yield Finding("corrected_without_a_name", "care", numbers, _kept_back(beside + smooth))
     if d.open and d.extra is None:
         remedy = f"{option('plan', 'extra.csv')} designs the poses that tell the rivals apart."
         yield Finding("rivals_open", "note", {}, remedy)
@@ -429,6 +448,14 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         worst = max(f.error for f in d.noise.faulty) * MICRO
         numbers = {"left_out": len(d.noise.faulty), "worst_um": worst}
         yield Finding("faulty_readings", "note", numbers)
+
+
+def _kept_back(has: str) -> str:
+    """What to do with a written cell that has more than the data can explain."""
+    return (
+        f"The cell that {option('cell_out')} writes has {has} only where it does better on poses "
+        f"kept back (identify with {option('test')})."
+    )
 
 
 def _remedy(verdict: Verdict) -> str:
@@ -517,7 +544,8 @@ def _component(c: ComponentShare) -> dict[str, Any]:
 
 def _location(location: Location) -> dict[str, Any]:
     out = dict(vars(location))
-    return out | {"evidence": {key: out.pop(key) for key in ("stages", "places", "drivers")}}
+    parts = ("stages", "places", "drivers", "shares")
+    return out | {"evidence": {key: out.pop(key) for key in parts}}
 
 
 def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:

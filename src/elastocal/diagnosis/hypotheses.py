@@ -417,7 +417,7 @@ class StartSearch:
         part, rows = subset(base.observed, chosen), rows_needed(base.observed, chosen)
         whitening = np.linalg.inv(np.linalg.cholesky(base.covariance[chosen]))
         width = prior_deviations(base)
-        X = part.apply(B[np.ix_(rows, range(B.shape[1]), fitted)]) * width
+        X = part.apply(B[rows][:, :, fitted]) * width
         r = base.residual.reshape(-1, size, 1)[chosen]
         r = r + X @ (from_centre(base) / width)[:, None]
         X, r = ((whitening @ each).reshape(-1, each.shape[2]) for each in (X, r))

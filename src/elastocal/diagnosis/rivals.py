@@ -216,6 +216,11 @@ def check_open(diagnosis: Diagnosis) -> None:
             f"the verdict is {diagnosis.verdict}: there are no rivals to tell apart; extra poses "
             "are planned for an ambiguous or unknown_effect verdict"
         )
+    if diagnosis.groups:
+        raise InputError(
+            "many causes act at once: extra poses are planned for rivals of single causes; spread "
+            "more poses over the whole range of every joint instead"
+        )
 
 
 # Rivals that the verdict has no room to name: what one of those named may also be.

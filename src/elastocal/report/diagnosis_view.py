@@ -1,15 +1,13 @@
-"""What a diagnosis says: names and numbers in words, its sentences and its rows."""
+"""What a diagnosis says: its sentences and its rows."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from elastocal.diagnosis.diagnosis import (
-    SMALLEST_P,
     Candidate,
     Curve,
     Diagnosis,
@@ -21,6 +19,29 @@ from elastocal.diagnosis.diagnosis import (
     NoiseFloor,
 )
 from elastocal.identification.findings import BudgetStep
+from elastocal.report.causes_view import (
+    assumed_order,
+    cause_rows,
+    curve_line,
+    field_rows,
+    headline_of_causes,
+    place_rows,
+    share_text,
+)
+from elastocal.report.effect_names import (
+    STAGES,
+    driver_name,
+    effect_at,
+    name_of,
+    p_value,
+    place,
+    places,
+    plain_name,
+    probability,
+    reduction,
+    settings_text,
+    size_of,
+)
 from elastocal.report.formatting import (
     ShownTable,
     capital,
@@ -36,101 +57,6 @@ from elastocal.report.formatting import (
     significant,
     together,
 )
-
-# Places that are the only one their effects have: "base drift", not "base drift at base".
-SINGLE = ("base", "wrist", "load", "tracker")
-STAGES = {
-    "transmission": "transmission",
-    "geometry": "links",
-    "load": "loads",
-    "compliance": "compliance",
-    "tool": "tool and markers",
-    "tracker": "tracker",
-}
-LONG_TIME = 120.0  # s, from which on times are told in minutes
-
-
-def plain_name(name: str) -> str:
-    """ "gear_eccentricity" → "gear eccentricity"."""
-    return printable(name).replace("_", " ")
-
-
-def place(where: str) -> str:
-    """ "joint2" → "joint 2", "marker:M_1" → "marker M_1", "all" → "all links"."""
-    if where.startswith("marker:"):
-        return f"marker {printable(where.removeprefix('marker:'))}"
-    if where == "all":
-        return "all links"
-    return re.sub(r"^([a-z]+)([0-9]+)$", r"\1 \2", printable(where))
-
-
-def effect_at(e: EffectAt | FoundEffect | Candidate) -> str:
-    """ "gear eccentricity at joint 2", "base drift", "marker slip of marker M1"."""
-    name = plain_name(e.effect)
-    if e.where in SINGLE:
-        return name
-    of_what = e.where == "all" or e.where.startswith(("marker:", "link"))
-    return f"{name} {'of' if of_what else 'at'} {place(e.where)}"
-
-
-def name_of(text: str) -> str:
-    """A step of the budget or a rival: "base_frame", "link_bending at link2", "backlash:joint3"."""
-    effect, colon, where = text.replace(" at ", ":", 1).partition(":")
-    return effect_at(EffectAt(effect, where)) if colon else driver_name(plain_name(text))
-
-
-def driver_name(driver: str) -> str:
-    """ "joint2 angle" → "joint 2 angle"."""
-    return re.sub(r"\b(joint|link)([0-9]+)\b", r"\1 \2", printable(driver))
-
-
-def probability(p: float) -> str:
-    """Two decimals, and never a certainty."""
-    if not math.isfinite(p):
-        return "–"
-    if p > 0.995:
-        return "> 0.99"
-    return "< 0.01" if p < 0.005 else f"{p:.2f}"
-
-
-def p_value(p: float) -> str:
-    """Two digits, or that it is below the smallest that is told."""
-    if not math.isfinite(p):
-        return "–"
-    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
-
-
-def size_of(p: float) -> str:
-    """ "p = 0.02", "p < 0.0001"."""
-    text = p_value(p)
-    return f"p {text}" if text.startswith("<") else f"p = {text}"
-
-
-def percent(fraction: float) -> str:
-    """ "75 %"; "none" where there is no number."""
-    return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
-
-
-def reduction(f: FoundEffect) -> str:
-    """ "75 % (63 to 84 %)"."""
-    low, high = f.gap_reduction_ci95
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return percent(f.gap_reduction)
-    return f"{percent(f.gap_reduction)} ({round(100 * low)} to {percent(high)})"
-
-
-def settings_text(settings: Mapping[str, float]) -> str:
-    """Searched constants with their units: "jump time 12.0 min, ripple order 101"."""
-    return ", ".join(_setting(key, value) for key, value in settings.items())
-
-
-def _setting(key: str, value: float) -> str:
-    name, _, unit = key.rpartition("_")
-    if unit != "s":
-        return f"{plain_name(key)} {significant(value, 4)}"
-    if abs(value) < LONG_TIME:
-        return f"{plain_name(name)} {significant(value)} s"
-    return f"{plain_name(name)} {significant(value / 60)} min"
 
 
 def repeatabilities(noise: NoiseFloor, kinds: Iterable[str]) -> str:
@@ -191,6 +117,8 @@ MOST_NAMED = 6
 
 def diagnosis_headline(d: Diagnosis) -> str:
     """The verdict in one sentence."""
+    if d.groups:
+        return capital(headline_of_causes(d))
     if d.verdict == "explained":
         named = together(_likely(d))
         return f"{capital(named)} explain{'s' * (len(d.effects) == 1)} the gap."
@@ -241,6 +169,10 @@ def diagnosis_lines(d: Diagnosis) -> list[tuple[str, str]]:
     lines += [("Error", text) for text in _error_lines(d)]
     if d.verdict == "unknown_effect":
         lines += [("Depends on", text) for text in _dependence(d)]
+    if d.groups:
+        told = (("Curves", curve_line(d)), ("Assumed", assumed_order(d)), ("Chance", _chance(d)))
+        return lines + [(label, text) for label, text in told if text]
+    if d.verdict == "unknown_effect":
         lines += [("Shape", _shape(curve)) for curve in d.curves]
     if d.open:
         lines += [_finding_line(d, f) for f in d.effects]
@@ -265,6 +197,8 @@ def _error_lines(d: Diagnosis) -> list[str]:
         f"On held-out poses the error falls from {calibrated} to {length(d.gap.explained)} rms "
         f"(noise alone: {floor})."
     )
+    if d.groups:  # the table of causes says what each takes away
+        return [text, *rest]
     if len(d.effects) == 1:
         shrinks = f"The noise-free error of new poses shrinks by {reduction(d.effects[0])}."
         return [f"{text} {shrinks}", *rest]
@@ -449,17 +383,24 @@ def untested_rows(d: Diagnosis) -> ShownTable:
     groups: dict[tuple[str, str], dict[str, list[str]]] = {}
     for u in d.untested:
         effects = groups.setdefault((printable(u.reason), printable(u.advice)), {})
-        effects.setdefault(plain_name(u.effect), []).append(place(u.where))
+        effects.setdefault(plain_name(u.effect), []).append(u.where)
     rows = [
-        (", ".join(f"{name} ({', '.join(at)})" for name, at in effects.items()), *reason)
+        (", ".join(f"{name} ({places(at, True)})" for name, at in effects.items()), *reason)
         for reason, effects in groups.items()
     ]
     return ShownTable(("effect", "why", "record or measure"), rows, (0, 1, 2))
 
 
 def alike(d: Diagnosis) -> list[str]:
-    """Sets of effects that these data cannot tell apart."""
-    return [together([effect_at(e) for e in rivals]) for rivals in d.indistinguishable]
+    """Sets of effects that these data cannot tell apart; beside many causes, the one that was
+    taken with its probability."""
+    taken = {(f.effect, f.where): f.probability for f in d.effects} if d.groups else {}
+
+    def told(e: EffectAt) -> str:
+        p = taken.get((e.effect, e.where))
+        return effect_at(e) + ("" if p is None else f" (probability {probability(p)})")
+
+    return [together([told(e) for e in rivals]) for rivals in d.indistinguishable]
 
 
 # What only the page shows.
@@ -483,13 +424,23 @@ class ChainBox:
 
 def chain_boxes(d: Diagnosis) -> list[ChainBox]:
     """The chain from commanded joints to tracker, shaded by the evidence for each link."""
-    stages = {} if d.location is None else d.location.stages
+    stages = {} if d.location is None else d.location.shares or d.location.stages
     named: list[tuple[str, float | None]] = [("commanded joints", None)]
     named += [(name, stages.get(stage, 0.0) if stages else None) for stage, name in STAGES.items()]
     return [
-        ChainBox(name, k * (BOX_WIDTH + GAP), shade, "" if shade is None else probability(shade))
+        ChainBox(
+            name,
+            k * (BOX_WIDTH + GAP),
+            None if shade is None else min(shade, 1.0),
+            "" if shade is None else _evidence(d, shade),
+        )
         for k, (name, shade) in enumerate(named)
     ]
+
+
+def _evidence(d: Diagnosis, value: float) -> str:
+    shared = d.location is not None and d.location.shares
+    return share_text(min(value, 1.0)) if shared else probability(value)
 
 
 def likeliest_places(d: Diagnosis) -> list[tuple[str, str]]:
@@ -537,6 +488,10 @@ def diagnosis_contents(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any]:
         "box": BOX_WIDTH,
         "places": likeliest_places(d),
         "budget": gap_rows(d),
+        "causes": cause_rows(d),
+        "causes_by_place": place_rows(d),
+        "fields": field_rows(d),
+        "shared": bool(d.location and d.location.shares),
         "parameters": added_parameter_rows(d),
         "candidates": hypothesis_rows(d, MOST_CANDIDATES),
         "n_candidates": len(d.candidates),

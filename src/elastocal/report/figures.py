@@ -15,13 +15,9 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.diagnosis import Curve, Diagnosis
 from elastocal.planning.plan import Plan
-from elastocal.report.diagnosis_view import (
-    driver_name,
-    effect_at,
-    error_steps,
-    name_of,
-    probability,
-)
+from elastocal.report.causes_view import causes, family, share_text
+from elastocal.report.diagnosis_view import error_steps
+from elastocal.report.effect_names import driver_name, effect_at, name_of, place, probability
 from elastocal.report.formatting import display, length, short_name, significant
 from elastocal.report.plan_view import removed
 
@@ -244,6 +240,39 @@ def candidate_bars(d: Diagnosis) -> str:
     return drawn(draw, WIDTH, 0.7 + BAR_HEIGHT * len(rows), "Probability of every candidate")
 
 
+def share_bars(d: Diagnosis) -> str:
+    """What the gap is made of: the share of every finding with its 90 % interval, and below it
+    what it does at each of its places."""
+    rows: list[tuple[str, float, tuple[float, float], bool, str]] = []
+    for cause in causes(d):
+        colour = SERIES[0] if cause.named else SERIES[1]
+        rows.append((cause.name, cause.share, cause.share_ci90, True, colour))
+        if len(cause.parts) > 1:
+            rows += [
+                (f"{place(c.where)}, {family(c)}", c.share, c.share_ci90, False, colour)
+                for c in cause.parts
+            ]
+    longest = max((row[2][1] for row in rows if math.isfinite(row[2][1])), default=1.0)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for k, (_, share, ci90, whole, colour) in enumerate(rows):
+            axes.barh(k, 100 * share, height=0.62 if whole else 0.34, facecolor=colour,
+                      edgecolor="none", alpha=1.0 if whole else 0.45)  # fmt: skip
+            ends = [100 * end for end in ci90]
+            axes.plot(ends, [k, k], color=INK, linewidth=1.4, solid_capstyle="butt")
+            axes.plot(ends, [k, k], "|", color=INK, markersize=7 if whole else 5)
+            axes.annotate(share_text(share), (max(100 * share, ends[1]), k), (6, 0),
+                          textcoords="offset points", va="center", fontsize=8)  # fmt: skip
+        _name_rows(axes, [_axis_name(name) for name, *_ in rows])
+        for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
+            tick.set_fontsize(9 if row[3] else 8)
+        axes.set_xlim(0, 112 * max(longest, 0.01))
+        axes.set_xlabel("share of the gap in %, with 90 % interval")
+
+    return drawn(draw, WIDTH, 0.7 + 0.8 * BAR_HEIGHT * len(rows), "What the gap is made of")
+
+
 def unknown_curves(d: Diagnosis) -> str:
     """How the unknown effect depends on what drives it: smooth curves with bands of 2 sd."""
     across = min(2, len(d.curves))
@@ -258,7 +287,8 @@ def unknown_curves(d: Diagnosis) -> str:
         handles = grid[0].get_legend_handles_labels()
         figure.legend(*handles, loc="outside upper right", ncols=2, fontsize=8)
 
-    return drawn(draw, WIDTH, 0.4 + 2.6 * down, "Shape of the unknown dependence")
+    title = "Error curves of the joints" if d.groups else "Shape of the unknown dependence"
+    return drawn(draw, WIDTH, 0.4 + 2.6 * down, title)
 
 
 def _curve(axes: Axes, curve: Curve) -> None:

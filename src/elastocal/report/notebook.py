@@ -22,16 +22,17 @@ from elastocal.compensation.compensate import (
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import InputError
 from elastocal.identification.result import Calibration
+from elastocal.model.effects import effect_of
 from elastocal.planning.plan import Plan
+from elastocal.report.causes_view import cause_rows, causes, field_rows, place_rows
 from elastocal.report.diagnosis_view import (
     diagnosis_lines,
     diagnosis_steps,
-    effect_at,
     error_steps,
     gap_rows,
     hypothesis_rows,
-    name_of,
 )
+from elastocal.report.effect_names import effect_at, name_of
 from elastocal.report.formatting import display, length, minus, printable
 from elastocal.report.identification_view import (
     combination_rows,
@@ -142,6 +143,16 @@ def candidates(d: Diagnosis, interactive: bool) -> Any:
     names = [*map(effect_at, best), "an effect outside the catalogue", "no further effect"]
     value = np.array([*(c.probability for c in best), d.probability_unknown, d.probability_nothing])
     return _bars(names, value, "probability", interactive)
+
+
+def shares(d: Diagnosis, interactive: bool) -> Any:
+    """What the gap is made of, where many causes act at once: each one's share with its 90 %
+    interval."""
+    found = causes(d)
+    value = np.array([c.share for c in found]) * 100
+    ends = np.array([c.share_ci90 for c in found]).reshape(-1, 2) * 100
+    axis = "share of the gap in %"
+    return _bars([c.name for c in found], value, axis, interactive, ends)
 
 
 def errors(c: Compensation, interactive: bool) -> Any:
@@ -325,12 +336,16 @@ def _plan_html(plan: Plan) -> str:
 
 
 def _diagnosis_html(d: Diagnosis) -> str:
-    budget, best = gap_rows(d), hypothesis_rows(d, MOST_CANDIDATES_SHOWN)
-    return (
-        _lines(diagnosis_lines(d) + [("Next", step) for step in diagnosis_steps(d)])
-        + _table("Gap budget (3-D rms error on held-out poses)", budget.heads, budget.rows)
-        + _table("Candidates", best.heads, best.rows)
-    )
+    tables = {
+        "What the gap is made of": cause_rows(d),
+        "Place by place": place_rows(d),
+        "Corrections without a name": field_rows(d),
+        "Gap budget (3-D rms error on held-out poses)": gap_rows(d),
+    }
+    if not d.groups:
+        tables["Candidates"] = hypothesis_rows(d, MOST_CANDIDATES_SHOWN)
+    lines = _lines(diagnosis_lines(d) + [("Next", step) for step in diagnosis_steps(d)])
+    return lines + "".join(_table(title, t.heads, t.rows) for title, t in tables.items() if t.rows)
 
 
 def _compensation_html(c: Compensation) -> str:
@@ -423,11 +438,22 @@ def _plan_frame(plan: Plan) -> pd.DataFrame:
 
 
 def _candidates(d: Diagnosis) -> pd.DataFrame:
-    """One row per hypothesis, best first; whether it is held to be real; `score` in nats."""
+    """One row per hypothesis, best first; whether it is held to be real; `score` in nats.
+
+    What was found only where all causes are judged together comes first, without a score.
+    """
     import pandas as pd
 
     found = {(f.effect, f.where): f for f in d.effects}
-    rows = []
+    tried = {(c.effect, c.where) for c in d.candidates}
+    rows = [
+        {
+            "effect": f.effect, "where": f.where, "stage": effect_of(f.effect).stage,
+            "probability": f.probability, "score": np.nan, "detectable": np.nan, "found": True,
+            "gap_reduction": f.gap_reduction,
+        }
+        for key, f in found.items() if key not in tried
+    ]  # fmt: skip
     for c in d.candidates:
         f = found.get((c.effect, c.where))
         rows.append(
@@ -464,6 +490,9 @@ VIEWS: dict[type, View] = {
         {"errors": errors, "uncertainty": uncertainties},
     ),
     Diagnosis: View(
-        diagnosis_text, _diagnosis_html, _candidates, {"budget": budget, "candidates": candidates}
+        diagnosis_text,
+        _diagnosis_html,
+        _candidates,
+        {"budget": budget, "candidates": candidates, "shares": shares},
     ),
 }

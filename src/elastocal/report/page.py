@@ -42,6 +42,7 @@ from elastocal.report.figures import (
     plan_curve,
     plan_intervals,
     plan_removed,
+    share_bars,
     unknown_curves,
 )
 from elastocal.report.formatting import minus, printable
@@ -213,6 +214,7 @@ def _diagnosis(d: Diagnosis) -> dict[str, Any]:
     model, base = d.model, d.calibrated
     assert model is not None  # `diagnose` states it
     figures = {
+        "causes": share_bars(d) if d.components else "",
         "waterfall": diagnosis_waterfall(d) if d.budget else "",
         "candidates": candidate_bars(d),
         "curves": unknown_curves(d) if d.curves else "",

@@ -16,6 +16,7 @@ from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.identification.findings import ALONE
 from elastocal.identification.result import Calibration
 from elastocal.planning.plan import Plan
+from elastocal.report.causes_view import cause_rows, field_rows, place_rows
 from elastocal.report.diagnosis_view import (
     added_parameter_rows,
     alike,
@@ -260,11 +261,14 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> Non
     """The whole answer for an engineer; `kinds` of the joints ("revolute" or "prismatic")."""
     _print_told(console, diagnosis_lines(d))
     console.print()
+    for told in _tables_of_causes(console, d):
+        console.print(told)
     console.print(table_of("Gap budget (3-D rms error on held-out poses)", gap_rows(d)))
     if (parameters := added_parameter_rows(d)).rows:
         console.print(table_of("Parameters of the effects found", parameters))
     best = hypothesis_rows(d, MOST_CANDIDATES_PRINTED)
-    title = f"Candidates, the best {len(best.rows) - 2} of {len(d.candidates)}"
+    alone = " one at a time" if d.groups else ""
+    title = f"Candidates{alone}, the best {len(best.rows) - 2} of {len(d.candidates)}"
     if console.width < NARROW_FOR_SETTINGS or not any(row[-1] for row in best.rows):
         best = ShownTable(best.heads[:-1], [row[:-1] for row in best.rows])
     console.print(table_of(title, best))
@@ -280,10 +284,32 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> Non
         if table.rows:
             console.print(table_of(title, table))
     console.print()
-    told = [("Alike here", f"{text}: these data cannot tell them apart.") for text in alike(d)]
-    told += [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
-    told += [("Next", text) for text in diagnosis_steps(d)]
-    _print_told(console, [*told, *(("Warning", printable(text)) for text in d.warnings)])
+    lines = [("Alike here", f"{text}: these data cannot tell them apart.") for text in alike(d)]
+    lines += [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
+    lines += [("Next", text) for text in diagnosis_steps(d)]
+    _print_told(console, [*lines, *(("Warning", printable(text)) for text in d.warnings)])
+
+
+def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
+    """What the gap is made of, place by place, and the corrections without a name."""
+    found, at, fields = cause_rows(d), place_rows(d), field_rows(d)
+    if found.rows:
+        yield table_of("What the gap is made of", found, whole=True)
+        yield Text(
+            "share: of the mean square error of the calibrated arm, by itself; shares of causes "
+            "that go together do not add up to 100 %. error falls by: of new poses, once this and "
+            "nothing else joins the model.\n",
+            style="dim",
+        )
+    if at.rows:
+        # What it is as effects stands in the table of parameters too.
+        narrow = console.width < WIDE
+        kept = [k for k in range(len(at.heads)) if not (narrow and k == 2)]
+        rows = [tuple(row[k] for k in kept) for row in at.rows]
+        words = tuple(n for n, k in enumerate(kept) if k in at.words)
+        yield table_of("Place by place", ShownTable(tuple(at.heads[k] for k in kept), rows, words))
+    if fields.rows:
+        yield table_of("Corrections without a name", fields)
 
 
 def _print_told(console: Console, lines: Iterable[tuple[str, str]]) -> None:

@@ -1,0 +1,183 @@
+"""Names and numbers of a diagnosis in words: effects, places, drivers, probabilities, settings."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+
+from elastocal.diagnosis.diagnosis import SMALLEST_P, Candidate, EffectAt, FoundEffect
+from elastocal.report.formatting import printable, significant, together
+
+# Places that are the only one their effects have: "base drift", not "base drift at base".
+SINGLE = ("base", "wrist", "load", "tracker")
+STAGES = {
+    "transmission": "transmission",
+    "geometry": "links",
+    "load": "loads",
+    "compliance": "compliance",
+    "tool": "tool and markers",
+    "tracker": "tracker",
+}
+LONG_TIME = 120.0  # s, from which on times are told in minutes
+
+
+def plain_name(name: str) -> str:
+    """ "gear_eccentricity" → "gear eccentricity"."""
+    return printable(name).replace("_", " ")
+
+
+def place(where: str) -> str:
+    """ "joint2" → "joint 2", "marker:M_1" → "marker M_1", "all" → "all links"."""
+    if where.startswith("marker:"):
+        return f"marker {printable(where.removeprefix('marker:'))}"
+    if where == "all":
+        return "all links"
+    return re.sub(r"^([a-z]+)([0-9]+)$", r"\1 \2", printable(where))
+
+
+def effect_at(e: EffectAt | FoundEffect | Candidate) -> str:
+    """ "gear eccentricity at joint 2", "base drift", "marker slip of marker M1"."""
+    name = plain_name(e.effect)
+    if e.where in SINGLE:
+        return name
+    of_what = e.where == "all" or e.where.startswith(("marker:", "link"))
+    return f"{name} {'of' if of_what else 'at'} {place(e.where)}"
+
+
+KINDS_OF_PLACE = re.compile(r"(joint|link)([0-9]+)")
+# Steps of a budget that are no effects.
+STEPS = {"unknown": "what has no name", "rest": "the smaller causes"}
+
+
+def places(where: Iterable[str], runs: bool = False) -> str:
+    """ "joints 1, 2 and 5", "link 3 and base"; with `runs` "joints 1 to 4 and 6"."""
+    numbers: dict[str, list[int]] = {}
+    others = []
+    for one in where:
+        if match := KINDS_OF_PLACE.fullmatch(one):
+            numbers.setdefault(match[1], []).append(int(match[2]))
+        else:
+            others.append(place(one))
+    counted = [
+        f"{kind}{'s' * (len(found) > 1)} "
+        + together(_in_runs(sorted(found)) if runs else [str(n) for n in sorted(found)])
+        for kind, found in numbers.items()
+    ]
+    return together([*counted, *others])
+
+
+def _in_runs(numbers: Sequence[int]) -> list[str]:
+    """[1, 2, 3, 5] → "1 to 3", "5"; two in a row stay two."""
+    found: list[list[int]] = []
+    for n in numbers:
+        if found and n == found[-1][-1] + 1:
+            found[-1].append(n)
+        else:
+            found.append([n])
+    short = ([f"{run[0]} to {run[-1]}"] if len(run) > 2 else map(str, run) for run in found)
+    return [text for texts in short for text in texts]
+
+
+def effect_at_places(effect: str, where: Sequence[str]) -> str:
+    """ "gear errors at joints 1, 2 and 5", "thermal expansion of links 2 and 3"."""
+    if effect not in STEPS and len(where) == 1:
+        return effect_at(EffectAt(effect, where[0]))
+    of_what = all(w == "all" or w.startswith(("marker:", "link")) for w in where)
+    name = STEPS.get(effect, plain_name(effect))
+    return f"{name} {'of' if of_what and effect not in STEPS else 'at'} {places(where)}"
+
+
+def name_of(text: str) -> str:
+    """A step of the budget or a rival: "base_frame", "link_bending at link2", "backlash:joint3",
+    "gear_errors:joint1+joint2"."""
+    effect, colon, where = text.replace(" at ", ":", 1).partition(":")
+    if not colon:
+        return STEPS.get(text) or driver_name(plain_name(text))
+    several = where.split("+")
+    # A marker may be called "M+1".
+    known = all(
+        KINDS_OF_PLACE.fullmatch(w) or w in ("all", *SINGLE) or w.startswith("marker:")
+        for w in several
+    )
+    return effect_at_places(effect, several if known else [where])
+
+
+def driver_name(driver: str) -> str:
+    """ "joint2 angle" → "joint 2 angle"."""
+    return re.sub(r"\b(joint|link)([0-9]+)\b", r"\1 \2", printable(driver))
+
+
+def probability(p: float) -> str:
+    """Two decimals, and never a certainty."""
+    if not math.isfinite(p):
+        return "–"
+    if p > 0.995:
+        return "> 0.99"
+    return "< 0.01" if p < 0.005 else f"{p:.2f}"
+
+
+def p_value(p: float) -> str:
+    """Two digits, or that it is below the smallest that is told."""
+    if not math.isfinite(p):
+        return "–"
+    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
+
+
+def size_of(p: float) -> str:
+    """ "p = 0.02", "p < 0.0001"."""
+    text = p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def percent(fraction: float) -> str:
+    """ "75 %"; "none" where there is no number."""
+    return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
+
+
+def reduction(f: FoundEffect) -> str:
+    """ "75 % (63 to 84 %)"."""
+    low, high = f.gap_reduction_ci95
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return percent(f.gap_reduction)
+    return f"{percent(f.gap_reduction)} ({round(100 * low)} to {percent(high)})"
+
+
+SMALL = 0.01  # rad, below which angles are told in mrad
+
+
+def settings_text(settings: Mapping[str, float]) -> str:
+    """Searched constants with their units: "jump time 12.0 min, ripple order 101"."""
+    ends = {key: key.replace("_low_", "_high_") for key in settings if "_low_" in key}
+    pairs = {low: high for low, high in ends.items() if high in settings}
+    # What all names begin with says nothing.
+    first = {key.partition("_")[0] + "_" for key in settings}
+    begin = first.pop() if len(first) == 1 < len(settings) else ""
+    texts = []
+    for key, value in settings.items():
+        if key in pairs:
+            high = setting_value(pairs[key], settings[pairs[key]])
+            texts.append(f"from {setting_value(key, value)} to {high}")
+        elif key not in pairs.values():
+            name = plain_name(_name_and_unit(key)[0].removeprefix(begin))
+            texts.append(f"{name} {setting_value(key, value)}")
+    return ", ".join(texts)
+
+
+def _name_and_unit(key: str) -> tuple[str, str]:
+    name, _, unit = key.rpartition("_")
+    return (name, unit) if unit in ("s", "rad") and name else (key, "")
+
+
+def setting_value(key: str, value: float) -> str:
+    """A searched constant in the unit that its key ends with: "12.0 min", "0.210 mrad", "5.7°"."""
+    unit = _name_and_unit(key)[1]
+    if unit == "rad":
+        if "size" in key or 0 < abs(value) < SMALL:
+            return f"{significant(value * 1e3)} mrad"
+        return f"{significant(math.degrees(value))}°".replace("-", "−")
+    if unit != "s":
+        return significant(value, 4)
+    if abs(value) < LONG_TIME:
+        return f"{significant(value)} s"
+    return f"{significant(value / 60)} min"

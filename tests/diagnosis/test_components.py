@@ -1,0 +1,138 @@
+"""Many causes at once: the likelihood of a sum, what each earns, lines, shares, and answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+from support.diagnosis_data import campaign, dense_noise, diagnosed, random_data, used_rows
+
+from elastocal.diagnosis import Component, NoiseValues, NoisyData, Sizes, fit_sum, posed
+from elastocal.model.effects.gears import EncoderScale
+from elastocal.model.effects.smooth import JointCurve, Waves
+
+Array = np.ndarray
+NOISE = NoiseValues(1.1, np.array([2e-6, 4e-6, 3e-6]), 0.4)
+
+
+def component(data: NoisyData, seed: int, k: int, smooth: bool = False) -> Component:
+    """Random columns that move the readings by some 1e-5 m."""
+    rng = np.random.default_rng((seed, 11))
+    columns = 1e-5 * rng.normal(size=(*data.r.shape, k))
+    if not smooth:
+        return Component("angle", EncoderScale(), f"joint{seed}", columns)
+    waves = Waves(0.0, np.arange(1.0, k // 2 + 1), 6.0, 1.0)
+    return Component(
+        "angle", JointCurve(), f"joint{seed}", columns, waves=waves, lengths=(-2.0, 1.0)
+    )
+
+
+def some(seed: int = 3) -> tuple[NoisyData, list[Component], Sizes]:
+    data = random_data(seed)
+    components = [component(data, 1, 2), component(data, 2, 6, smooth=True), component(data, 3, 1)]
+    sizes = Sizes(0.2, np.array([0.3, -0.4, 0.1]), np.array([0.0, -0.7, 0.0]))
+    return data, components, sizes
+
+
+def rows_of(data: NoisyData, packed: Array) -> Array:
+    return packed.reshape(-1, packed.shape[2])[used_rows(data)]
+
+
+def test_the_likelihood_is_that_of_a_normal_distribution() -> None:
+    data, components, at = some()
+    problem = posed(data, components, NOISE)
+    V = np.exp(2 * at.factor) * dense_noise(data, NOISE)
+    X = rows_of(data, data.X)
+    V += X @ np.diag(1 / data.precision) @ X.T
+    for c, s, length in zip(components, at.size, at.length, strict=True):
+        C = rows_of(data, c.columns)
+        V += C @ np.diag(np.exp(2 * s) * c.shares(length)[0]) @ C.T
+    r = data.r.ravel()[used_rows(data)]
+    expected = multivariate_normal(np.zeros(len(r)), V).logpdf(r)
+    assert -problem.factored(at)[3] / 2 == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_slope_is_that_of_the_value() -> None:
+    data, components, at = some()
+    problem = posed(data, components, NOISE)
+    theta = np.concatenate([[at.factor], at.size, at.length])
+    slope = problem.objective(theta)[1]
+    for k in range(len(theta)):
+        if slope[k] == 0.0:  # the length of what has none
+            continue
+        step = 1e-5 * np.eye(len(theta))[k]
+        ends = [problem.objective(theta + sign * step)[0] for sign in (1, -1)]
+        assert slope[k] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4, abs=1e-5)
+
+
+def test_what_a_component_earns_is_what_the_likelihood_loses_without_it() -> None:
+    data, components, at = some()
+    problem = posed(data, components, NOISE)
+    whole, earned = problem.factored(at)[3], problem.earned(at)
+    for k in range(len(components)):
+        kept = [i for i in range(len(components)) if i != k]
+        fewer = posed(data, [components[i] for i in kept], NOISE)
+        lost = (fewer.factored(at.chosen(kept))[3] - whole) / 2
+        assert earned[k] == pytest.approx(lost, abs=1e-6)
+
+
+def test_of_causes_only_those_at_work_are_left() -> None:
+    """Readings that two of ten components make: these are found, at their sizes."""
+    data = random_data(5, p=2)
+    rng = np.random.default_rng(8)
+    data = replace(data, left_out=data.left_out & False, r=0 * data.r)
+    components = [component(data, k, 3) for k in range(1, 11)]
+    # Readings without padding: noise of the usual size.
+    noise = 1e-7
+    data = replace(
+        data, covariance=np.tile(np.eye(data.r.shape[1]), (len(data.r), 1, 1)) * noise**2
+    )
+    true = {1: np.array([1.5, -1.0, 0.8]), 4: np.array([-0.7, 1.2, 2.0])}
+    r = noise * rng.normal(size=data.r.shape)
+    for k, w in true.items():
+        r = r + components[k].columns @ w
+    found = fit_sum(replace(data, r=r), components, NoiseValues.usual(3).of_instrument(),
+                    refit_noise=False)  # fmt: skip
+    assert {id(c) for c in found.components} == {id(components[k]) for k in true}
+    assert np.exp(found.sizes.size) == pytest.approx([1.1, 1.4], rel=0.5)
+
+
+def test_nothing_is_found_in_noise() -> None:
+    count = 0
+    for seed in range(6):
+        data = random_data(seed, p=2)
+        rng = np.random.default_rng((seed, 3))
+        V = data.covariance
+        K = np.linalg.cholesky(V + 1e-30 * np.eye(V.shape[1]))
+        data = replace(data, r=(K @ rng.normal(size=(*data.r.shape, 1)))[:, :, 0])
+        components = [component(data, k, 2) for k in range(1, 9)]
+        quiet = NoiseValues.usual(3).of_instrument()
+        count += len(fit_sum(data, components, quiet, refit_noise=False).components)
+    assert count <= 2
+
+
+MANY = (
+    "gear_eccentricity:joint2",
+    "gear_eccentricity:joint4",
+    "gear_ripple:joint5",
+    "encoder_scale:joint3",
+    "off_axis_compliance:joint3",
+    "tracker_distortion:tracker",
+)
+
+
+@pytest.mark.long
+def test_many_effects_at_once_are_one_sum() -> None:
+    d = diagnosed(*MANY, n=60)
+    assert len(d.components) >= 4
+    assert sum(c.share for c in d.components) == pytest.approx(1.0, abs=0.05)
+    assert {"joint2", "joint4", "joint5"} <= {c.where for c in d.components if c.family == "angle"}
+    assert d.gap.explained < 0.5 * d.gap.calibrated
+    assert d.groups[0].share == max(g.share for g in d.groups)
+
+
+def test_the_campaign_of_many_has_their_model() -> None:
+    model, table = campaign(*MANY, n=20)
+    assert len(table) == 20 * 2 * 3 and not any(p.shrunk for p in model.parameters)
