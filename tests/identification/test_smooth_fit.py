@@ -252,6 +252,15 @@ def test_bounds_on_ordinary_parameters_do_not_profile_the_curves():
     assert fit["joint2.compliance"].held >= 0
 
 
+def test_a_bounded_fit_holds_what_ends_beyond_its_bound():
+    _, _, table, _test, plain = campaign()
+    elastic = arm(*EFFECTS, "joint_compliance:joint2")
+    force = np.tile([0.0, 0.0, -50.0], (len(table), 1))
+    fit = identify(elastic, replace(table, force=force), Options(bounded=True))
+    assert fit["joint2.compliance"].held >= 0
+    assert fit.heldout_rms < 1.3 * plain.heldout_rms
+
+
 def test_functions_may_be_fixed():
     model, _x, table, *_ = campaign()
     fit = identify(model, table, Options(fixed=("joint_curve",)))

@@ -499,7 +499,8 @@ class _Course:
             if same and np.array_equal(after, fitted) and np.array_equal(before, judged):
                 break
             fitted = after
-            if noise is not None:
+            if noise is not None:  # in units of which rows are whitened next
+                scales = replace(scales, variance=1.0)
                 self.progress(f"fitting with the noise found ({noise.kind})")
         return fit, noise, judged
 
@@ -521,10 +522,10 @@ class _Course:
         if not self.estimating:
             e = self.every.problem.weights.apply(self.standard.ravel())
             squared = (e.reshape(self.standard.shape) ** 2).sum(axis=1)
-            n, size = self.standard.shape
+            n, size = len(self.standard), self.observed.size
             s2 = squared[good].mean() / size
             dof = max(int(good.sum()) * size, 1)
-            return None, squared <= size * s2 * stats.f.isf(FALSE_ALARM / n, size, dof)
+            return None, np.asarray(squared <= size * s2 * stats.f.isf(FALSE_ALARM / n, size, dof))
         readings = self.readings.moved(self.standard)
         if first:
             good = outlier_screening(readings, readings.e, good)
@@ -592,8 +593,9 @@ class _Course:
                 at_bound=np.concatenate([r.at_bound, kept[at]]),
             )  # fmt: skip
             fit = joint_fit(
-                fit.problem, self.every.sizes, fit.functions, x, inner, fit.scales, held=True
-            )
+                fit.problem, self.every.sizes, fit.functions, x, inner, fit.scales,
+                choosing=False, sizing=False,
+            )  # fmt: skip
         return fit
 
     def wider(self, fit: JointFit) -> tuple[JointFit, Crossed]:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import linalg, optimize
 
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # Scales λ beyond these are no longer told apart: nothing is left of the group, or of its prior.
 LEAST, MOST = 1e-6, 1e6
@@ -29,8 +29,8 @@ SMALL = 0.05
 PRICE = 0.75
 # Noise as shares of the variance that ordinary parameters leave, from which the search starts.
 SHARES = (1.0, 0.1, 0.01, 0.001)
-STEPS = 40
-TOLERANCE = 1e-2  # of the log-likelihood per row, relative
+STEPS = 60
+TOLERANCE = 2e-4  # of the log-likelihood per row, relative
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class ShrunkProblem:
         q the least |e|² + |b|²/T, of which σ² is the mean.
         """
         G = self.n_groups
-        alive = np.ones(G, dtype=bool) if start is None else start.scale > 0
+        alive: BoolArray = np.ones(G, dtype=bool) if start is None else start.scale > 0
         whole = max(self.total / self.spare, 1e-300)
         limits = np.log(LEAST / whole), np.log(MOST / whole) - np.log(SHARES[-1])
 
@@ -162,10 +162,10 @@ class ShrunkProblem:
                 guesses = [np.clip(none - np.log(whole * share), *limits) for share in SHARES]
                 begin = min(guesses, key=lambda guess: criterion(guess)[0])
             else:
-                known = np.maximum(start.scale[alive], LEAST)
+                # From nothing the likelihood shows no way back: what is small begins anew.
+                known = np.where(start.scale[alive] < SMALL, 1.0, start.scale[alive])
                 begin = np.clip(np.log(known / start.variance), *limits)
             value, free = least(begin)
-            # From nothing the likelihood shows no way back: those there start once more.
             variance = self._terms(np.exp(self._spread(free, alive))).q / self.spare
             small = free < np.log(SMALL / variance)
             if start is None and small.any():
@@ -179,7 +179,7 @@ class ShrunkProblem:
         return Scales(ratio * variance, variance, gain)
 
     @staticmethod
-    def _spread(free: Array, alive: Array) -> Array:
+    def _spread(free: Array, alive: BoolArray) -> Array:
         every = np.full(len(alive), -np.inf)
         every[alive] = free
         return every
@@ -208,8 +208,10 @@ class ShrunkProblem:
         if not slopes:
             return _Terms(value, zero, q, zero)
         inverse, _ = linalg.lapack.dpotri(L, lower=1, overwrite_c=1)
-        squares = np.bincount(self.group[own], b**2, self.n_groups)
-        known = np.bincount(self.group[own], 1 - np.diag(inverse), self.n_groups)
+        squares, known = (
+            np.asarray(np.bincount(self.group[own], each, self.n_groups), dtype=np.float64)
+            for each in (b**2, 1 - np.diag(inverse))
+        )
         return _Terms(value, known - self.spare / q * squares, q, squares)
 
     def posterior(self, scales: Scales) -> ShrunkPosterior:
