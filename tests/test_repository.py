@@ -61,8 +61,14 @@ DATASET_TABLES = {
     "load_1p25kg.csv",
     "load_2p5kg.csv",
     "link_masses_from_repo_iiwa7_m.csv",
+    "series_A_6000.csv",
 }
-DATASET_FOLDERS = {"ur5_wam_tsinghua", "iiwa7_payload_torque", "robotcali_irb120_cable"}
+DATASET_FOLDERS = {
+    "ur5_wam_tsinghua",
+    "iiwa7_payload_torque",
+    "robotcali_irb120_cable",
+    "ur10_ipa_leica",
+}
 
 GENERATED = {"__pycache__", "build", "dist", "demo_out", "node_modules", "site"}
 
