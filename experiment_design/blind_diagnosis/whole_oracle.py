@@ -215,7 +215,12 @@ class Gap:
     rms: float
 
     def share(self, parts: Sequence[tuple[str, str]]) -> float:
-        """Mean square of these parts together over that of the whole."""
+        """What these parts add to the mean square of the whole, over that: shares sum to one."""
+        at = [self.parts.index(p) for p in parts]
+        return float(self.products[at].sum() / self.rms**2)
+
+    def strength(self, parts: Sequence[tuple[str, str]]) -> float:
+        """Mean square of what these parts do together, over that of the whole: never negative."""
         at = [self.parts.index(p) for p in parts]
         return float(self.products[np.ix_(at, at)].sum() / self.rms**2)
 
