@@ -233,7 +233,7 @@ def _whole(poses: str, found: Sequence[Record], median: float, most: float) -> I
     yield share(name, "wrong among what is named", [not n["right"] for n in names], at_most=0.05)
     small = [not n["right"] or n["true"] < SMALL for n in names]
     yield share(name, "… or below a hundredth of the mean square", small)
-    parts = [p for w in scored for p in w["parts"] if w["parts"][p] >= SMALL]
+    parts = [p for w in scored for p in w["strengths"] if w["strengths"][p] >= SMALL]
     missed = [p for w in scored for p in w["missed"]]
     yield share(name, "parts above that which nothing stands for",
                 [True] * len(missed) + [False] * (len(parts) - len(missed)))  # fmt: skip

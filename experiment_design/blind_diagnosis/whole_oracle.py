@@ -69,7 +69,21 @@ def second_moment(bounds: tuple[float, float]) -> float:
 def oracle_errors(sights: Sights) -> tuple[float, float]:
     """Rms length (m) of the oracle's errors at the other poses, and that which its posterior
     covariance lets expect."""
-    blocks = [*geometry(sights), *effects(sights)]
+    error, factor, other = _fit(sights, [*geometry(sights), *effects(sights)], ())
+    variance = (other.T * cho_solve(factor, other.T)).sum() / len(other)
+    return rms_length(error), float(np.sqrt(3 * variance))
+
+
+def error_of(sights: Sights, blocks: Sequence[Block], hidden: Sequence[Block]) -> float:
+    """Rms length (m) at the other poses where `blocks` are fitted and `hidden` are not known."""
+    return rms_length(_fit(sights, blocks, hidden)[0])
+
+
+def _fit(
+    sights: Sights, blocks: Sequence[Block], hidden: Sequence[Block]
+) -> tuple[Array, tuple, Array]:
+    """Errors at the other poses, the factor of the information, and columns there, in units of
+    the priors."""
     X, other = (
         np.concatenate([getattr(b, side) * b.deviation for b in blocks], axis=2)
         for side in ("here", "there")
@@ -78,14 +92,16 @@ def oracle_errors(sights: Sights) -> tuple[float, float]:
     world = sights.world
     truth = world.noise_free(world.visits)
     r = (world.readings() - truth).reshape(len(truth), -1)
+    unknown = np.zeros(other.shape[:2])
+    for b in hidden:
+        r, unknown = r + b.here @ b.away, unknown + b.there @ b.away
     root = np.linalg.cholesky(covariance(sights, truth))
     X, r = np.linalg.solve(root, X), np.linalg.solve(root, r[:, :, None])
     X, other = (x.reshape(-1, x.shape[2]) for x in (X, other))
-    # In units of the priors: |r − X u|² + |u + away|².
+    # |r − X u|² + |u + away|².
     factor = cho_factor(X.T @ X + np.eye(X.shape[1]))
-    error = other @ cho_solve(factor, X.T @ r.ravel() - away)
-    variance = (other.T * cho_solve(factor, other.T)).sum() / len(other)
-    return rms_length(error), float(np.sqrt(3 * variance))
+    u = cho_solve(factor, X.T @ r.ravel() - away)
+    return other @ u - unknown.ravel(), factor, other
 
 
 def oracle_error(sights: Sights) -> float:
@@ -218,6 +234,11 @@ class Gap:
         """What these parts add to the mean square of the whole, over that: shares sum to one."""
         at = [self.parts.index(p) for p in parts]
         return float(self.products[at].sum() / self.rms**2)
+
+    def strength(self, parts: Sequence[tuple[str, str]]) -> float:
+        """Mean square of what these parts do together, over that of the whole: never negative."""
+        at = [self.parts.index(p) for p in parts]
+        return float(self.products[np.ix_(at, at)].sum() / self.rms**2)
 
 
 def gap_of(sights: Sights) -> Gap:

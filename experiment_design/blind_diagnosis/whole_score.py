@@ -1,8 +1,9 @@
 """What counts as right of a whole arm: shares of the gap, and names.
 
 The diagnosis lists `components`, each a family of errors at a place with its share of the gap
-and 90 % interval.  Families that act by the same load, and the error against a joint's angle
-under any name, are one *kind* here; a place without a number stands for all places of its kind.
+(what it adds to the mean square of all, so that shares sum to one) and 90 % interval.  Families
+that act by the same load, and the error against a joint's angle under any name, are one *kind*
+here; a place without a number stands for all places of its kind.
 """
 
 from __future__ import annotations
@@ -26,12 +27,13 @@ KIND = {"torque": "load", "gravity": "load", "load": "load"}
 FAMILY = {
     "gear_eccentricity": "angle", "gear_ripple": "angle", "link_mass_error": "load",
     "hysteresis": "move", "backlash": "move", "base_drift": "time", "joint_drift": "time",
+    "gear_spectrum": "angle", "gravity_sag": "load", "move_lag": "move",
 }  # fmt: skip
 ABSENT = (
     "encoder_scale", "gear_second_harmonic", "wrist_coupling", "joint_hardening",
     "off_axis_compliance", "link_bending", "base_compliance", "gravity_compensator",
     "payload_error", "thermal_expansion", "encoder_jump", "frame_jump", "marker_slip",
-    "tracker_distortion",
+    "tracker_distortion", "torque_coupling", "torque_tilt",
 )  # fmt: skip
 NAMELESS = ("joint_curve", "residual_field")  # correct the arm, explain nothing
 
@@ -54,8 +56,8 @@ class Share:
 
 @dataclass(frozen=True)
 class Name:
-    """What is claimed to be there, "name:where", the true share of its kind at that place, and
-    whether an arm of this kind has such a thing at all."""
+    """What is claimed to be there, "name:where", the mean square of what its kind truly does at
+    that place over that of the gap, and whether an arm of this kind has such a thing at all."""
 
     name: str
     true: float
@@ -84,14 +86,14 @@ def score_parts(gap: Gap, answer: Json) -> Scored:
         if own:
             shares.append(_share(kind, where, own, true_share(gap, (kind, where))))
     names = [
-        Name(name, true_share(gap, part), name.partition(":")[0] not in ABSENT)
+        Name(name, strength(gap, part), name.partition(":")[0] not in ABSENT)
         for name, part in named_parts(answer, stated)
     ]
     covered = [p for key in stated for p in matching(gap, key)]
     missed = [
         f"{family}:{where}"
         for family, where in gap.parts
-        if (family, where) not in covered and gap.share([(family, where)]) >= SMALL
+        if (family, where) not in covered and gap.strength([(family, where)]) >= SMALL
     ]
     return Scored(tuple(shares), tuple(names), tuple(missed))
 
@@ -150,6 +152,11 @@ def imitated(where: str) -> tuple[str, ...]:
 def true_share(gap: Gap, part: Part) -> float:
     true = matching(gap, part)
     return gap.share(true) if true else 0.0
+
+
+def strength(gap: Gap, part: Part) -> float:
+    true = matching(gap, part)
+    return gap.strength(true) if true else 0.0
 
 
 def _share(kind: str, where: str, found: Sequence[Json], true: float) -> Share:

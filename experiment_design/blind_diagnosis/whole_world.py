@@ -31,7 +31,8 @@ def judged(
 
     Rms lengths in mm of the errors at new poses: geometry_mm of the cell as it is, tool_mm of the
     `extended` one, both as `identify --test` has them, None where it fails; oracle_mm; gap_um: rms
-    of a coordinate of what geometry leaves of the effects; parts: its shares; and `Scored`.
+    of a coordinate of what geometry leaves of the effects; parts: its shares, strengths: mean
+    squares of each over that of all; and `Scored`.
     """
     sights = Sights.of(world)
     shutil.copyfile(fresh, visible / NEW)
@@ -43,6 +44,7 @@ def judged(
         "oracle_mm": 1e3 * oracle_error(sights),
         "gap_um": 1e6 * gap.rms,
         "parts": {":".join(part): gap.share([part]) for part in gap.parts},
+        "strengths": {":".join(part): gap.strength([part]) for part in gap.parts},
         "shares": [asdict(s) | {"held": s.held} for s in found.shares],
         "names": [asdict(n) | {"right": n.right} for n in found.names],
         "missed": list(found.missed),

@@ -20,11 +20,13 @@ from support.calibration import (
     z_scores,
 )
 from support.cells import choices, kr270_chain, random_poses
+from support.parts import SIGMA, arm, solved
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.identification import reduce
+from elastocal.identification import solve as solving
 from elastocal.identification.identify import identify
-from elastocal.identification.solve import STRUCTURAL
+from elastocal.identification.solve import STRUCTURAL, solve
 from elastocal.model import Chain, Joint, Model, Parameter
 
 DOWN = ((0.0, 0.0, -300.0),)
@@ -346,3 +348,24 @@ def test_what_another_effect_explains_completely_is_reported_with_it():
     assert result.combination("base.rz").terms == pytest.approx(
         {"base.rz": 1.0, "joint1.offset": 1.0}, abs=1e-2
     )
+
+
+def test_a_wider_set_that_is_singular_where_it_comes_to_rest_is_not_preferred(monkeypatch):
+    model, plan, truth, rng = arm(GEOMETRY, 1, 20)
+    problem = solved(model, measured(model, plan, truth, 1000 * SIGMA, rng)).problem
+    before, asked = solve(problem, try_wider=False), []
+
+    def promising(problem, sizes, x, wider, r_factor):
+        return x, np.zeros_like(before.heldout)
+
+    def once(problem, found):
+        asked.append(found)
+        if len(asked) > 1:
+            raise np.linalg.LinAlgError("singular matrix")
+        return before.heldout
+
+    monkeypatch.setattr(solving, "_linear_step", promising)
+    monkeypatch.setattr(solving, "heldout_of", once)
+    after = solve(problem)
+    assert len(asked) > 1
+    np.testing.assert_array_equal(after.reduction.kept, before.reduction.kept)

@@ -24,6 +24,7 @@ from arm_data import ARMS
 from whole_columns import components, moments, scene_of
 from whole_draw import RANGES, draw_whole
 from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error
+from whole_losses import losses, units
 from whole_oracle import Gap, Sights, gap_of, geometry_error, oracle_error, oracle_errors
 from whole_score import Name, score_parts
 from whole_search import Search, true_orders
@@ -131,13 +132,30 @@ def test_an_oracle_who_searches_for_the_orders_stands_between_knowing_and_leavin
         assert gains[0] > 10.0 > gains[1]
 
 
-def test_shares_of_the_gap_sum_to_about_one(sights):
+def test_what_is_left_out_costs_what_it_would_have_brought():
+    """With all that there is named, an oracle with sags of each joint's own is left; without the
+    lines of joint 1, they are the worst loss."""
+    sights = Sights.of(draw_whole((8, 9), "w", 60, arm="medium"))
+    names = {"lines": "gear_spectrum", "eccentricity": "gear_eccentricity", "sag": "gravity_sag",
+             "move": "move_lag", "creep": "base_drift"}  # fmt: skip
+    every = [{"effect": names[kind], "where": where} for kind, where in units(sights)]
+    all_named, nothing = losses(sights, {"effects": every})
+    assert not nothing and all_named < 1.5 * oracle_error(sights)
+    first = {"effect": "gear_spectrum", "where": "joint1"}
+    error, left = losses(sights, {"effects": [e for e in every if e != first]})
+    ((fall, unit),) = left
+    assert unit == ("lines", "joint1") and error > all_named
+    assert fall == pytest.approx(np.sqrt(error**2 - all_named**2))
+
+
+def test_shares_of_the_gap_sum_to_one_and_its_strengths_nearly(sights):
     gap = gap_of(sights)
     assert gap.share(gap.parts) == pytest.approx(1.0)
-    assert sum(gap.share([part]) for part in gap.parts) == pytest.approx(1.0, abs=0.5)
+    assert sum(gap.share([part]) for part in gap.parts) == pytest.approx(1.0)
+    assert sum(gap.strength([part]) for part in gap.parts) == pytest.approx(1.0, abs=0.5)
     J = sights.world.spec.skeleton.n_joints
     assert len(gap.parts) == 3 * J + 1
-    assert gap.share([("gravity", "joint1")]) < 1e-3  # its axis is vertical
+    assert gap.strength([("gravity", "joint1")]) < 1e-3  # its axis is vertical
 
 
 def test_the_creep_is_correlated_over_its_length_and_as_large_as_drawn():

@@ -246,9 +246,11 @@ def prefer_wider(
             continue
         try:
             wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
+            wide_heldout = heldout_of(problem, wide)
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
-            continue  # along an undetermined direction the wide set may leave every valid arm
-        wide_heldout = heldout_of(problem, wide)
+            # Along an undetermined direction the wide set may leave every valid arm, or come to
+            # rest where it is singular.
+            continue
         if wide.converged and rms_3d(wide_heldout, size) < rms_3d(heldout, size):
             found, reduction, heldout = wide, wider, wide_heldout
             r_factor = free_r_factor(problem, found)
