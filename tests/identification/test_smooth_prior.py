@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from elastocal.identification.smooth_prior import LinearRows, Scales
+from elastocal.identification.smooth_prior import LinearRows, Scales, Sums
 from elastocal.identification.weighted_problem import RFactor
 
 ROWS, FREE, SHRUNK = 80, 4, 15
@@ -35,6 +35,19 @@ def marginal(B, e, scales: Scales, kept: np.ndarray) -> tuple[np.ndarray, float]
     N = Bf.T @ W @ Bf
     P = W - W @ Bf @ np.linalg.inv(N) @ Bf.T @ W
     return V, np.linalg.slogdet(V)[1] + np.linalg.slogdet(N)[1] + e @ P @ e
+
+
+def test_sums_over_rows_say_the_same_as_their_factor():
+    B, e, *_ = drawn(0)
+    B[:, 3] = B[:, 0] - B[:, 1]  # columns that depend on each other
+    away = np.random.default_rng(5).normal(size=SHRUNK)
+    halves = [Sums.of(B[rows], e[rows], FREE) for rows in (slice(0, 30), slice(30, None))]
+    summed = LinearRows.summed(halves[0].merged(halves[1]), away, STD, GROUP)
+    whole, kept = linear(B, e, away), np.array([0, 1, 2])
+    scales = Scales(np.array([1.0, 0.3, 0.0]), 0.2, np.zeros(3))
+    one, other = (rows.only(kept).posterior(scales) for rows in (summed, whole))
+    assert np.allclose(one.step, other.step) and np.allclose(one.cofactor, other.cofactor)
+    assert np.isclose(summed.only(kept).total, whole.only(kept).total)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +45,7 @@ from elastocal.identification.smooth_prior import (
     Scales,
     ShrunkPosterior,
     ShrunkProblem,
+    Sums,
 )
 from elastocal.identification.solve import (
     WIDER,
@@ -54,11 +56,11 @@ from elastocal.identification.solve import (
     choose,
 )
 from elastocal.identification.weighted_problem import (
+    Part,
     Partition,
-    RFactor,
     Span,
     Weights,
-    evaluate,
+    each,
     in_order,
     partition,
     regressor,
@@ -187,19 +189,26 @@ def joint_fit(
     columns = np.concatenate([problem.free, functions.columns])
     parts = partition(problem.observations, problem.weights, len(columns))
 
-    def at(x: Array) -> tuple[Array, RFactor]:
-        found = evaluate(problem.model, parts, x, columns)
-        return found.residual, found.r_factor
+    def at(x: Array) -> tuple[Array, Sums]:
+        residual = np.empty(len(problem.observations.value))
+
+        def summed(part: Part) -> Sums:
+            found = regressor(problem.model, part, x, columns)
+            residual[part.rows] = found.residual
+            apply = part.weights.apply
+            return Sums.of(apply(found.B), apply(found.residual), len(problem.free))
+
+        return residual, reduce(Sums.merged, each(parts, summed))
 
     x = _started(problem, functions, x, reduction)
     if scales is not None:
         gone = functions.columns[(scales.scale == 0)[functions.group]]
         x[gone] = problem.model.nominal[gone]
-    residual, r_factor = at(x)
+    residual, sums = at(x)
     rounds = 0 if not sizing else CHOICES if scales is None else 1
     steps = 0
     while True:
-        free = _from_nominal(problem, functions, x, r_factor)
+        free = _from_nominal(problem, functions, x, sums)
         while rounds > 0:
             rounds -= 1
             scales = _shrunk(problem, free, reduction.kept).scales(scales)
@@ -209,8 +218,8 @@ def joint_fit(
             if np.array_equal(again.kept, reduction.kept):
                 break
             reduction, x = again, _started(problem, functions, x, again)
-            residual, r_factor = at(x)
-            free = _from_nominal(problem, functions, x, r_factor)
+            residual, sums = at(x)
+            free = _from_nominal(problem, functions, x, sums)
         assert scales is not None
         posterior = _shrunk(problem, free, reduction.kept).posterior(scales)
         now = JointFit(
@@ -219,7 +228,7 @@ def joint_fit(
         moved, gain = _moved(now, posterior)
         if gain <= SETTLED or steps >= most:
             return replace(now, converged=gain <= SETTLED)
-        cost = _cost(now, x, r_factor)
+        cost = _cost(now, x, sums)
         for _ in range(HALVINGS):
             steps += 1
             try:
@@ -231,7 +240,7 @@ def joint_fit(
             moved = (x + moved) / 2
         else:
             return replace(now, converged=gain <= ROUGH)
-        x, (residual, r_factor) = moved, there
+        x, (residual, sums) = moved, there
 
 
 def _chosen(
@@ -247,12 +256,10 @@ def _shrunk(problem: Problem, free: LinearRows, kept: IntArray) -> ShrunkProblem
     return free.only(np.searchsorted(problem.free, kept))
 
 
-def _from_nominal(
-    problem: Problem, functions: Functions, x: Array, r_factor: RFactor
-) -> LinearRows:
+def _from_nominal(problem: Problem, functions: Functions, x: Array, sums: Sums) -> LinearRows:
     """The linear problem whose residual is that of nominal functions."""
     away = x[functions.columns] - functions.nominal
-    return LinearRows.of(r_factor, len(problem.free), away, functions.std, functions.group)
+    return LinearRows.summed(sums, away, functions.std, functions.group)
 
 
 def _started(problem: Problem, functions: Functions, x: Array, reduction: Reduction) -> Array:
@@ -282,11 +289,11 @@ def _moved(now: JointFit, posterior: ShrunkPosterior) -> tuple[Array, float]:
     return x, float(way @ way) / posterior.variance
 
 
-def _cost(now: JointFit, x: Array, r_factor: RFactor) -> float:
+def _cost(now: JointFit, x: Array, sums: Sums) -> float:
     """Sum of squares of readings and prior at x."""
     f, posterior = now.functions, now.posterior
     b = (x[f.columns] - f.nominal)[posterior.own]
-    return r_factor.rss + float(np.sum((posterior.prior * b) ** 2))
+    return sums.own.rss + float(np.sum((posterior.prior * b) ** 2))
 
 
 # What each configuration says beside the others: one pass over the table.

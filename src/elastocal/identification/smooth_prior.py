@@ -24,6 +24,7 @@ from elastocal.units import Array, BoolArray, IntArray
 # Scales λ beyond these are no longer told apart: nothing is left of the group, or of its prior.
 LEAST, MOST = 1e-6, 1e6
 SMALL = 0.05
+DEPENDENT = 1e-11  # singular value of unit columns, of the largest
 # Of log λ above 0: a function may be smaller than stated at no price, but ten times the size costs
 # what a likelihood ratio of 1e8 gains.  Data that hardly show a function know no upper limit.
 PRICE = 0.75
@@ -41,6 +42,30 @@ class Scales:
     scale: Array
     variance: float
     gain: Array
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over whitened rows: the R factor of [B_f e], `cross` B_fᵀB_s, `gram` B_sᵀB_s and
+    `right` B_sᵀe."""
+
+    own: RFactor
+    cross: Array
+    gram: Array
+    right: Array
+
+    @classmethod
+    def of(cls, B: Array, e: Array, ordinary: int) -> Sums:
+        """Of the rows [B_f B_s] and e."""
+        Bf, Bs = B[:, :ordinary], np.ascontiguousarray(B[:, ordinary:])
+        return cls(RFactor.of(Bf, e), Bf.T @ Bs, Bs.T @ Bs, Bs.T @ e)
+
+    def merged(self, other: Sums) -> Sums:
+        """Of the rows of both."""
+        return Sums(
+            self.own.merged(other.own), self.cross + other.cross, self.gram + other.gram,
+            self.right + other.right,
+        )  # fmt: skip
 
 
 class _Terms(NamedTuple):
@@ -83,6 +108,26 @@ class LinearRows:
         return cls(
             R[:k, :k], R[:k, k:], z[:k], lower.T @ lower, lower.T @ z[k:], total, r_factor.rows,
             std, group,
+        )  # fmt: skip
+
+    @classmethod
+    def summed(cls, sums: Sums, away: Array, std: Array, group: IntArray) -> LinearRows:
+        """The same from sums over the rows, which take a third of the time of a QR of all."""
+        R = sums.own.R
+        # Directions in which the ordinary columns hold nothing but rounding take nothing.
+        norms = np.linalg.norm(R, axis=0)
+        norms[norms == 0] = 1.0
+        U, size, Vt = linalg.svd(R / norms)
+        known = size > DEPENDENT * size.max(initial=0.0)
+        turned = Vt[known] @ (sums.cross / norms[:, None]) / size[known, None]
+        across = U[:, known] @ turned
+        gram = sums.gram - turned.T @ turned
+        z = sums.own.projected
+        right = sums.right - across.T @ z
+        total = sums.own.rest**2 + 2 * float(right @ away) + float(away @ (gram @ away))
+        return cls(
+            R, across, z + across @ away, gram, right + gram @ away, max(total, 0.0),
+            sums.own.rows, std, group,
         )  # fmt: skip
 
     def only(self, kept: IntArray) -> ShrunkProblem:
