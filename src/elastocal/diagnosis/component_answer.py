@@ -179,10 +179,17 @@ class SumAnswer:
     def _rivals(self) -> dict[int, dict[tuple[str, str], float]]:
         """Of each named component that has a hypothesis the probability of what it may be."""
         out = {}
+        angular = {(c.effect.name, c.where) for c in self.found.components if _of_gear(c)}
         for k, c in enumerate(self.found.components):
             if c.hypothesis is None or c.settings:
                 continue
             own, others = rivals_of(self.dataset, self.found, k)
+            if _of_gear(c):
+                # Which harmonic of one joint's error it is decides nothing.
+                others = {
+                    key: evidence for key, evidence in others.items()
+                    if key[1] != c.where and key not in angular
+                }  # fmt: skip
             keys = [c.hypothesis.key, *others]
             p = softmax(np.array([own, *others.values()]))
             known = {key: float(v) for key, v in zip(keys, p, strict=True) if v >= CHANCE}
@@ -197,17 +204,6 @@ class SumAnswer:
             assert own is not None
             if abs(float(np.median(self.shares([k])))) < TOLD:
                 continue
-            if _of_gear(c):
-                # Which harmonic of one joint's error it is decides nothing.
-                angular = {(e.effect.name, e.where) for e in self.found.components if _of_gear(e)}
-                rivals = {
-                    key: p for key, p in rivals.items() if key == own.key or key[1] != c.where
-                }
-                rivals = {
-                    key: p for key, p in rivals.items() if key not in angular or key == own.key
-                }
-                whole = sum(rivals.values())
-                rivals = {key: p / whole for key, p in rivals.items()}
             if rivals.get(own.key, 0.0) < NAMED:
                 keys = [own.key, *(key for key in rivals if key != own.key)][:3]
                 sets.append(tuple(EffectAt(*key) for key in keys))
