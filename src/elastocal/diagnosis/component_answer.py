@@ -26,15 +26,15 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.noise_floor import NoisyData, Projection, covariance, project
+from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import left_out_residual, rms_with_interval
 from elastocal.identification.findings import BudgetStep
 from elastocal.model.effects.base import Stage, index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
-DRAWS = 400
+DRAWS, PARTS = 400, 10
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
@@ -83,17 +83,44 @@ class SumAnswer:
 
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
-        index = np.concatenate([np.r_[self._span(k)] for k in members])
-        w = self.draws[index]
+        w = self.draws[index := self._index(members)]
         return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
+
+    def _index(self, members: Sequence[int]) -> IntArray:
+        return np.concatenate([np.r_[self._span(k)] for k in members])
 
     def shares(self, members: Sequence[int]) -> Array:
         """What these components add to the mean square of the whole, over that (draws,): shares
-        sum to one, and one that cancels a part of others is negative."""
-        index = np.concatenate([np.r_[self._span(k)] for k in members])
-        w = self.draws
-        with_all = np.einsum("kd,kd->d", w[index], self.gram[index] @ w)
-        return np.asarray(with_all / np.maximum(self.total, 1e-300))
+        sum to one, and one that cancels a part of others is negative.
+
+        The draws are as wide as a jackknife over PARTS of the configurations says, where that is
+        wider than the posterior, which takes model and sizes for true.
+        """
+        drawn = self._shares(members, self.draws)
+        apart = self._shares(members, self.deleted)
+        spread = np.sqrt((PARTS - 1) * np.mean((apart - apart.mean()) ** 2))
+        middle = np.median(drawn)
+        return np.asarray(middle + max(1.0, spread / max(drawn.std(), 1e-300)) * (drawn - middle))
+
+    def _shares(self, members: Sequence[int], w: Array) -> Array:
+        """Of each of the coefficients w (Σ k, n)."""
+        index, moved = self._index(members), self.gram @ w
+        whole = np.einsum("kd,kd->d", w, moved)
+        return np.einsum("kd,kd->d", w[index], moved[index]) / np.maximum(whole, 1e-300)
+
+    @cached_property
+    def deleted(self) -> Array:
+        """The coefficients (Σ k, PARTS) without one part of the configurations after the other."""
+        data = self.found.data
+        all_ = Weighted.of(data, self.found.noise)
+        prior = np.diag(all_.prior(data.precision))
+        part, out = np.random.default_rng(0).permutation(len(data.r)) % PARTS, []
+        for g in range(PARTS):
+            X, r = all_.X[part == g], all_.r[part == g]
+            X = X.reshape(-1, X.shape[2])
+            factor = linalg.cho_factor(all_.M - X.T @ X + prior)
+            out.append(linalg.cho_solve(factor, all_.z - X.T @ r.ravel())[self._own :])
+        return np.array(out).T
 
     @cached_property
     def total(self) -> Array:
@@ -200,7 +227,7 @@ class SumAnswer:
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         sets = []
         for k, rivals in self._rivals.items():
-            c, own = self.found.components[k], self.found.components[k].hypothesis
+            own = self.found.components[k].hypothesis
             assert own is not None
             if abs(float(np.median(self.shares([k])))) < TOLD:
                 continue
