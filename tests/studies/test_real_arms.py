@@ -53,7 +53,7 @@ def test_ur10_is_split_into_poses_for_training_and_others_for_test(folder):
 def test_ur10_keeps_times_in_order_and_temperatures(folder):
     rows = poses_of(folder, "ur10_600.csv")
     times = [float(row[9]) for row in rows]
-    assert times == sorted(times) and 0 <= times[0] and times[-1] / 3600 < 100
+    assert times == sorted(times) and times[0] >= 0 and times[-1] / 3600 < 100
     assert all(15 < float(row[10]) < 35 for row in rows)
 
 
