@@ -26,7 +26,7 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     return f" (did you mean '{near}'?)" if near else ""
 
 
-def listed(names: Iterable[str], limit: int = 30) -> str:
+def listed(names: Iterable[str], limit: int = 40) -> str:
     """Names joined by commas, cut after `limit` with the number left off."""
     names = list(names)
     more = f", … ({len(names) - limit} more)" if len(names) > limit else ""

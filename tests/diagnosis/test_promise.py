@@ -53,9 +53,9 @@ def crooked(q: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_what_stays_unexplained_is_not_promised_away(seed: int) -> None:
-    """An eccentricity beside error curves that fit like scatter of their joints: what new poses
-    gain by naming it is what is promised, to three per cent of the error."""
+def test_what_curves_make_is_not_promised_away(seed: int) -> None:
+    """An eccentricity beside error curves of joints, which go into the sum: what new poses gain by
+    naming it alone is inside the 95 % interval that is promised."""
     chain, plain = kr270_chain(), cell(RIGID, link_gravity=False, nominal=Nominal())
     fault = FAULTS["gear_eccentricity:joint4"]
     fault = replace(fault, values={k: 4 * v for k, v in fault.values.items()})
@@ -69,7 +69,8 @@ def test_what_stays_unexplained_is_not_promised_away(seed: int) -> None:
     model = Model.assembled(chain, plain)
     d = diagnose(model, train)
     assert fault.key in {(f.effect, f.where) for f in d.effects}
-    assert d.gap.unexplained > d.gap.noise_floor > SIGMA
+    assert {f"joint{j + 1}" for j in CURVES} <= {c.where for c in d.components}
+    assert SIGMA < d.gap.noise_floor < d.gap.explained < 0.1 * d.gap.calibrated
     found = next(f for f in d.effects if (f.effect, f.where) == fault.key)
     items = [
         Item(h, np.array(list(f.settings.values())), 0.0)
@@ -84,4 +85,5 @@ def test_what_stays_unexplained_is_not_promised_away(seed: int) -> None:
         return float(np.sqrt((e**2).sum(axis=1).mean()))
 
     shown = 1 - rms(items) / rms([i for i in items if i.key != fault.key])
-    assert found.gap_reduction == pytest.approx(shown, abs=0.03)
+    low, high = found.gap_reduction_ci95
+    assert low <= shown <= high and high - low < 0.2

@@ -41,6 +41,7 @@ def diagnosis_of(
     return SimpleNamespace(
         verdict="ambiguous",
         effects=(EffectAt(*next(iter(rivals))),),
+        groups=(),
         candidates=tuple(
             Candidate(effect, where, "transmission", p, 0.0, 5.0, settings.get((effect, where), {}))
             for (effect, where), p in rivals.items()

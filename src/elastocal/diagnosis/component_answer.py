@@ -27,7 +27,7 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
-from elastocal.diagnosis.shrinkage import left_out_residual, rms_with_interval
+from elastocal.diagnosis.shrinkage import NEW_POSES, left_out_residual, rms_with_interval
 from elastocal.identification.findings import BudgetStep
 from elastocal.model.effects.base import Stage, index
 from elastocal.model.effects.gears import GearSpectrum
@@ -35,6 +35,7 @@ from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
 
 DRAWS, PARTS = 400, 10
+MOST_POSES = 1500  # that a set of new poses is drawn from
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
@@ -66,16 +67,44 @@ class SumAnswer:
         return np.asarray((at.beta[:, None] + at.beta_deviation.T @ normal)[self._own :])
 
     @cached_property
-    def gram(self) -> Array:
-        """G (Σ k, Σ k): w'Gw is the mean square in m² per reading that coefficients w leave once
-        the fitted parameters have followed them, at equal weights."""
+    def moved(self) -> Array:
+        """C (rows, Σ k) in m: C w is what coefficients w leave of the positions once the fitted
+        parameters have followed them, at equal weights."""
         data, own = self.found.data, self._own
         X = data.X[_position_rows(data)]
         size = np.maximum(np.linalg.norm(X[:, :own], axis=0), 1e-300)
         Q, R = linalg.qr(X[:, :own] / size, mode="economic")
         Q = Q[:, np.abs(np.diag(R)) > 1e-9]
-        C = X[:, own:] - Q @ (Q.T @ X[:, own:])
-        return np.asarray(C.T @ C / (len(X) / min(data.blocks.size, 3)))
+        return np.asarray(X[:, own:] - Q @ (Q.T @ X[:, own:]))
+
+    @cached_property
+    def gram(self) -> Array:
+        """G (Σ k, Σ k): w'Gw is the mean square in m² per reading that coefficients w leave."""
+        readings = len(self.moved) / min(self.found.data.blocks.size, 3)
+        return np.asarray(self.moved.T @ self.moved / readings)
+
+    @cached_property
+    def _poses(self) -> tuple[IntArray, Array, Array]:
+        """Rows that show what new poses may be like, how often each of their configurations is
+        drawn among NEW_POSES (configurations, draws), and what the draws of all components leave
+        of them (rows, draws)."""
+        data = self.found.data
+        rows = np.nonzero(_position_rows(data))[0]
+        known = np.unique(rows)
+        some = known[np.linspace(0, len(known) - 1, min(MOST_POSES, len(known))).astype(int)]
+        kept = np.flatnonzero(np.isin(rows, some))
+        # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
+        share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
+        return kept, self.rng.multinomial(NEW_POSES, share).T, self.moved[kept] @ self.draws
+
+    def _of_new_poses(self, left: Array) -> Array:
+        """Mean square (draws,) per reading in a set of new poses of what is left (rows, draws)."""
+        kept, drawn, _ = self._poses
+        rows = np.nonzero(_position_rows(self.found.data))[0][kept]
+        starts = np.flatnonzero(np.diff(rows, prepend=-1))
+        each = np.add.reduceat(left**2, starts, axis=0)
+        count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
+        return np.asarray((drawn * each).sum(axis=0) / (drawn * count[:, None]).sum(axis=0))
 
     def _span(self, k: int) -> slice:
         span = self.found.spans[k]
@@ -187,14 +216,15 @@ class SumAnswer:
         Before, the error is all that is not in the model; after, what is left of it beside the
         estimate of these components, and the error of the whole fit in proportion to their part.
         """
-        index = np.concatenate([np.r_[self._span(k)] for k in members])
-        w = self.draws.copy()
-        w[index] -= self.at.beta[self._own :][index, None]
-        after = np.einsum("kd,kd->d", w, self.gram @ w)
+        index = self._index(members)
+        kept, _, whole = self._poses
+        before = self._of_new_poses(whole)
+        estimate = self.moved[np.ix_(kept, index)] @ self.at.beta[self._own :][index]
+        after = self._of_new_poses(whole - estimate[:, None])
         part = np.median(self.squares(members)) / np.maximum(np.median(self.total), 1e-300)
         # Draws about the mean already hold the error at the poses measured; at others it is more.
         after = after + min(part, 1.0) * self._excess
-        fall = 1 - np.sqrt(after / np.maximum(self.total, 1e-300))
+        fall = 1 - np.sqrt(after / np.maximum(before, 1e-300))
         low95, low90, middle, high90, high95 = np.quantile(
             fall, [0.025, 0.05, 0.5, 0.95, 0.975]
         ).tolist()

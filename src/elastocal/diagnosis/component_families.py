@@ -302,11 +302,13 @@ def fields(
     follow = [w for w in turning_joints(chain) if np.ptp(dataset.table.q[:, index(w)]) > MOVED]
     if recorded(dataset.table, "time"):
         follow.append("time")
-    grams, found = _grams(dataset, data, noise), []
+    at, found = project(data, noise), []
     known = {(c.where, c.follows) for c in taken}
     for where in effect.places(chain, cell):
         if where.startswith("marker") and "time" not in follow:
             continue
+        # Of one place at a time: what a large table's entries sum up to would fill the memory.
+        grams = Grams(dataset, data, at)
         for name in follow:
             own = where == name and where.startswith("joint")
             if own or (where, name) in known or (where.startswith("marker") and name != "time"):

@@ -229,8 +229,8 @@ class Calibration(Result):
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
         """The estimates of all parameters but those of smooth functions."""
-        both = zip(self.estimates, self.model.shrunk, strict=True)
-        return tuple(e for e, shrunk in both if not shrunk)
+        shrunk = {p.name for p in self.model.parameters if p.shrunk}
+        return tuple(e for e in self.estimates if e.name not in shrunk)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
