@@ -92,7 +92,7 @@ class SumAnswer:
         rows = np.nonzero(_position_rows(data))[0]
         known = np.unique(rows)
         some = known[np.linspace(0, len(known) - 1, min(MOST_POSES, len(known))).astype(int)]
-        kept = np.flatnonzero(np.isin(rows, some)).astype(np.int64)
+        kept: IntArray = np.flatnonzero(np.isin(rows, some))
         # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
         share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
         return kept, self.rng.multinomial(NEW_POSES, share).T, self.moved[kept] @ self.draws
