@@ -95,7 +95,8 @@ class SumAnswer:
         kept: IntArray = np.flatnonzero(np.isin(rows, some))
         # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
         share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
-        return kept, self.rng.multinomial(NEW_POSES, share).T, self.moved[kept] @ self.draws
+        times = self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
+        return kept, times, self.moved[kept] @ self.draws
 
     def _of_new_poses(self, left: Array) -> Array:
         """Mean square (draws,) per reading in a set of new poses of what is left (rows, draws)."""
