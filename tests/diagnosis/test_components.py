@@ -9,7 +9,15 @@ import pytest
 from scipy.stats import multivariate_normal
 from support.diagnosis_data import campaign, dense_noise, diagnosed, random_data, used_rows
 
-from elastocal.diagnosis import Component, NoiseValues, NoisyData, Sizes, fit_sum, posed
+from elastocal.diagnosis import (
+    Component,
+    NoiseValues,
+    NoisyData,
+    Sizes,
+    fit_sum,
+    posed,
+    with_returned,
+)
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 
@@ -136,3 +144,18 @@ def test_many_effects_at_once_are_one_sum() -> None:
 def test_the_campaign_of_many_has_their_model() -> None:
     model, table = campaign(*MANY, n=20)
     assert len(table) == 20 * 2 * 3 and not any(p.shrunk for p in model.parameters)
+
+
+def test_what_went_under_a_larger_noise_comes_back() -> None:
+    """A small cause beside a large one that was not known yet."""
+    data = random_data(5, p=2)
+    data = replace(data, left_out=data.left_out & False, r=0 * data.r)
+    each = 1e-14 * np.eye(data.r.shape[1])
+    data = replace(data, covariance=np.tile(each, (len(data.r), 1, 1)))
+    large, small = component(data, 1, 3), component(data, 2, 1)
+    r = 1e-7 * np.random.default_rng(8).normal(size=data.r.shape)
+    r = r + large.columns @ np.array([30.0, -20.0, 25.0]) + small.columns @ np.array([0.1])
+    data, quiet = replace(data, r=r), NoiseValues.usual(3).of_instrument()
+    found = fit_sum(data, [large], quiet, refit_noise=False)
+    again = with_returned(data, found, [large, small])
+    assert {id(c) for c in again.components} == {id(large), id(small)}

@@ -16,7 +16,7 @@ from elastocal.diagnosis.component_families import (
     line_families,
     tuned_family,
 )
-from elastocal.diagnosis.components import COST, Component, FittedSum, fit_sum
+from elastocal.diagnosis.components import COST, PRESENT, Component, FittedSum, fit_sum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, Grams, Prior, direct
 from elastocal.diagnosis.hypotheses import Hypothesis
@@ -60,6 +60,11 @@ def search_components(
     if not lined:
         progress("families of lines beside the components")
         found = _with_lines(full, data, found)
+    progress("what shows now that the noise is smaller")
+    again = with_returned(data, found, others)
+    if again is not found and len(full.blocks.member) <= FEW_POSES:
+        again = with_returned(data, _with_lines(full, data, again), others)
+    found = again
     for _ in range(FIELD_SEARCHES):
         progress("fields beside the components")
         more = fields(full, found.data, found.noise, found.components, MOST_FIELDS)
@@ -98,6 +103,28 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
             break
         found = wider if many else _tuned(dataset, data, wider)
     return found
+
+
+def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
+    """The sum with components that went under a larger noise and show under this one."""
+    for _ in range(RETURNS):
+        at = project(found.data, found.noise)
+        taken = {id(c) for c in found.components}
+        away = [c for c in components if id(c) not in taken]
+        evidence = [
+            float(direct(found.data.masked(c.columns), at).evidence(WIDE)[0]) - c.cost + COST
+            for c in away
+        ]
+        order = np.argsort(evidence)[::-1][:MOST_RETURNED]
+        wider = _wider(data, found, [away[k] for k in order if evidence[k] > WORTH])
+        if wider is None:
+            break
+        found = wider
+    return found
+
+
+RETURNS, MOST_RETURNED = 4, 6
+WORTH = float(np.log(1 / PRESENT - 1))  # log evidence, sizes mixed, that outweighs the prior odds
 
 
 def _tuned(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
