@@ -260,7 +260,8 @@ class GravityCompensator(Effect):
         turned = -1.0 if arm < 0 else 1.0  # the other end of the arm, seen from the other side
         table = {
             "joint": place,
-            "stiffness_N_per_m": values["compensator_stiffness"],
+            # Of a spring that the readings would have push the other way a fit starts from none.
+            "stiffness_N_per_m": max(values["compensator_stiffness"], 0.0),
             "anchor_m": [turned * x, turned * y],
             "arm_m": turned * arm,
             "free_length_m": free,
