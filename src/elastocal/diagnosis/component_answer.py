@@ -397,18 +397,13 @@ class SumAnswer:
         c = self.found.components[k]
         if c.hypothesis is None or any(p.shrunk for p in c.hypothesis.parameters):
             return
-        span, sizes = self.found.spans[k], self.dataset_sizes(c)
+        span, sizes = self.found.spans[k], self.dataset.sizes[c.hypothesis.key]
         mean = self.at.beta[span]
         std = np.linalg.norm(self.at.beta_deviation[:, span], axis=0)
         for p, size, m, s in zip(c.hypothesis.parameters, sizes, mean, std, strict=True):
             yield FittedParameter(
                 f"{c.where}.{p.key}", float(p.nominal + m * size), p.unit, float(s * size)
             )
-
-    def dataset_sizes(self, c: Component) -> Array:
-        """What one unit of each coefficient stands for."""
-        assert c.hypothesis is not None
-        return self.dataset.sizes[c.hypothesis.key]
 
     # The budget, and shapes.
 
@@ -446,8 +441,7 @@ class SumAnswer:
                 continue
             settings = dict(c.settings)
             x = np.linspace(settings["curve_low_rad"], settings["curve_high_rad"], 400)
-            phase = c.waves.frequency * (x[:, None] - c.waves.low)
-            F = np.concatenate([np.cos(phase), np.sin(phase)], axis=1) * c.unit
+            F = c.waves.at(x) * c.unit
             span = self.found.spans[k]
             y = F @ self.at.beta[span]
             sd = np.linalg.norm(F @ self.at.beta_deviation.T[span], axis=1)

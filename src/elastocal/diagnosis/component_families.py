@@ -129,7 +129,8 @@ def judged_together(model: Model, table: object) -> list[Hypothesis]:
 MULTIPLES = (1, 2, 3)  # lines of a family, up to so many times the lowest order
 LOWEST, HIGHEST = 2.5, 250.0  # orders
 STEP = 1.5  # of the highest order of a family, in units of 1/range(q)
-MANY_POSES = 300  # from so many on single lines show by themselves
+# Up to so many poses lines are sought by families, and before curves; in more, single lines show.
+FEW_POSES = 300
 LINE = 5e-5  # rad, a typical line
 LINE_SCALES = np.array([0.3, 1.0, 3.0, 10.0])
 PIECE = 4_000_000  # numbers of directions that are held at a time
@@ -204,7 +205,7 @@ def _best(
 
 
 def _multiples(dataset: DiagnosisData) -> tuple[int, ...]:
-    return MULTIPLES[:1] if len(dataset.blocks.member) > MANY_POSES else MULTIPLES
+    return MULTIPLES[:1] if len(dataset.blocks.member) > FEW_POSES else MULTIPLES
 
 
 def _best_family(dataset: DiagnosisData, grams: Grams, h: Hypothesis, m: int) -> LineFamily:
@@ -314,8 +315,6 @@ def fields(
             if own or (where, name) in known or (where.startswith("marker") and name != "time"):
                 continue
             coarse = _field(dataset, effect, where, name, FIELD_LENGTHS[0] * 2)
-            if coarse is None:
-                continue
             evidence = float(grams.of_block(coarse).evidence()[0])
             if evidence > 3.0:
                 found.append((evidence, where, name))
@@ -339,7 +338,7 @@ def _field_settings(dataset: DiagnosisData, name: str, length: float) -> dict[st
 
 def _field(
     dataset: DiagnosisData, effect: ResidualField, where: str, name: str, length: float
-) -> Generic | None:
+) -> Generic:
     """A field as a block, for a search: its direction at every visit."""
     settings = _field_settings(dataset, name, length)
     constants = Constants.of(dataset.base.model, where, settings)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from elastocal.diagnosis.component_families import (
+    FEW_POSES,
     catalogue_components,
     family_of,
     fields,
@@ -28,7 +29,6 @@ from elastocal.units import Progress
 
 # Searches for more beside what has been found.
 LINE_SEARCHES, FIELD_SEARCHES = 16, 3
-FEW_POSES = 300  # up to which lines may be sought before curves
 MOST_FIELDS = 4  # that one search adds
 
 
@@ -86,16 +86,14 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
         wider = None
         many = len(dataset.blocks.member) > FEW_POSES
         for chosen in [stand_out] if many else [[family] for family in stand_out[:TRIED]]:
-            without = {id(c) for family in chosen for c in family.instead_of}
-            kept = [k for k, c in enumerate(found.components) if id(c) not in without]
-            start = found.sizes.chosen(kept)
-            for family in chosen:
-                start = start.and_one(family.component)
-            components = [*(found.components[k] for k in kept), *(f.component for f in chosen)]
             joint = found.noise.joint.copy()
             for family in chosen:
                 joint[index(family.where)] = family.scatter
-            fitted = fit_sum(data, components, replace(found.noise, joint=joint), start)
+            fitted = _exchanged(
+                data, replace(found, noise=replace(found.noise, joint=joint)),
+                [c for family in chosen for c in family.instead_of],
+                [family.component for family in chosen],
+            )  # fmt: skip
             if fitted.score > found.score + GAINED:
                 wider = fitted
                 break
@@ -151,12 +149,9 @@ def _spared(data: NoisyData, found: FittedSum) -> FittedSum:
     spared = 0
     order = np.argsort(found.earned - [c.cost for c in found.components])
     for c in [found.components[k] for k in order[:SPARED]]:
-        kept = [k for k, other in enumerate(found.components) if other is not c]
-        if len(kept) == len(found.components):
+        if not any(c is other for other in found.components):
             continue
-        fewer = [found.components[k] for k in kept]
-        start = found.sizes.chosen(kept)
-        fitted = fit_sum(data, fewer, found.noise, start, refit_noise=False)
+        fitted = _exchanged(data, found, [c], refit_noise=False)
         if fitted.score > found.score:
             found, spared = fitted, spared + 1
     return fit_sum(data, found.components, found.noise, found.sizes) if spared else found
@@ -170,11 +165,21 @@ def _wider(data: NoisyData, found: FittedSum, more: Sequence[Component]) -> Fitt
     """The sum with these as well, or what is left of them; None where it is no better."""
     if not more:
         return None
-    start = found.sizes
+    wider = _exchanged(data, found, [], more)
+    return wider if wider.score > found.score + GAINED else None
+
+
+def _exchanged(
+    data: NoisyData, found: FittedSum, gone: Sequence[Component],
+    more: Sequence[Component] = (), refit_noise: bool = True,
+) -> FittedSum:  # fmt: skip
+    """The sum with `more` components in the place of those `gone`, fitted from where it is."""
+    kept = [k for k, c in enumerate(found.components) if not any(c is other for other in gone)]
+    start = found.sizes.chosen(kept)
     for component in more:
         start = start.and_one(component)
-    wider = fit_sum(data, [*found.components, *more], found.noise, start)
-    return wider if wider.score > found.score + GAINED else None
+    components = [*(found.components[k] for k in kept), *more]
+    return fit_sum(data, components, found.noise, start, refit_noise)
 
 
 GAINED = 0.5  # nats that a search must bring for another one
@@ -248,11 +253,7 @@ def _swapped(
             break
         _, k, key = best
         tried.add(key)
-        kept = [i for i in range(len(found.components)) if i != k]
-        start = found.sizes.chosen(kept).and_one(known[key])
-        other = fit_sum(
-            data, [*(found.components[i] for i in kept), known[key]], found.noise, start
-        )
+        other = _exchanged(data, found, [found.components[k]], [known[key]])
         if other.score > found.score:
             found = other
     return found
@@ -264,6 +265,8 @@ def _with_together(dataset: DiagnosisData) -> DiagnosisData:
     more = judged_together(base.model, base.observed.table)
     if not more:
         return dataset
+    if all(h.driven for h in more):  # by entries that the data have; nothing to evaluate anew
+        return dataset.changed(hypotheses=(*dataset.hypotheses, *more))
     full = diagnosis_data_of(base, [*dataset.hypotheses, *more])
     return full.without(dataset.data.faulty)
 

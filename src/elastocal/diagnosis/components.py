@@ -24,6 +24,7 @@ import numpy as np
 from scipy import linalg, optimize
 
 from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
@@ -145,10 +146,7 @@ class SumOfComponents:
 
     @cached_property
     def spans(self) -> tuple[slice, ...]:
-        ends = len(self.own) + np.cumsum([c.width for c in self.components], dtype=np.int64)
-        return tuple(
-            slice(int(e) - c.width, int(e)) for e, c in zip(ends, self.components, strict=True)
-        )
+        return spans_of(self.components, self.weighted.X.shape[2])
 
     def variances(self, at: Sizes) -> Array:
         """Prior variances of all coefficients (p + Σ k,)."""
@@ -228,15 +226,15 @@ class SumOfComponents:
         return out
 
 
+def _joined(data: NoisyData, columns: Sequence[Array]) -> Array:
+    """Columns (C, m, Σ k) side by side; none where there are none."""
+    return np.concatenate([np.zeros((*data.r.shape, 0)), *columns], axis=2)
+
+
 def posed(data: NoisyData, components: Sequence[Component], noise: NoiseValues) -> SumOfComponents:
     """The sum of these components beside the data's own columns, under one noise."""
-    columns = [data.masked(c.columns) for c in components]
-    wide = replace(
-        data,
-        X=np.concatenate([data.X, *columns], axis=2),
-        precision=np.concatenate([data.precision, np.ones(sum(c.width for c in components))]),
-    )
-    weighted = Weighted.of(wide, noise)
+    columns = _joined(data, [data.masked(c.columns) for c in components])
+    weighted = Weighted.of(data.with_columns(columns, np.ones(columns.shape[2])), noise)
     return SumOfComponents(weighted, data.precision, tuple(components), data.stated, data.n_rows)
 
 
@@ -257,9 +255,7 @@ class FittedSum:
     @property
     def spans(self) -> tuple[slice, ...]:
         """Where each component's coefficients stand among those of the data, last of all."""
-        widths = [c.width for c in self.components]
-        ends = self.data.X.shape[2] - sum(widths) + np.cumsum(widths, dtype=np.int64)
-        return tuple(slice(int(e) - w, int(e)) for e, w in zip(ends, widths, strict=True))
+        return spans_of(self.components, self.data.X.shape[2])
 
     def without(self, k: int) -> NoisyData:
         """The data without the columns of component k."""
@@ -306,10 +302,8 @@ def fit_sum(
     prior = -float((at.size**2).sum()) / 2 / SPREAD**2
     score = -value / 2 + prior - sum(c.cost for c in components)
     score -= 0.5 * log_prior(data.stated, noise)[0]
-    with_all = replace(
-        data, X=np.concatenate([data.X, *(data.masked(c.columns) for c in components)], axis=2),
-        precision=1 / variances,
-    )  # fmt: skip
+    columns = _joined(data, [data.masked(c.columns) for c in components])
+    with_all = data.with_columns(columns, 1 / variances[len(data.precision) :])
     return FittedSum(tuple(components), at, noise, problem.earned(at), score, with_all)
 
 
@@ -356,10 +350,8 @@ def _noise_beside(
         )
         for c, s, length in zip(components, at.size, at.length, strict=True)
     ]
-    wide = some.with_columns(
-        np.concatenate([np.zeros((*some.r.shape, 0)), *columns], axis=2),
-        np.ones(sum(c.shape[2] for c in columns)),
-    )
+    joined = _joined(some, columns)
+    wide = some.with_columns(joined, np.ones(joined.shape[2]))
     # From next to nothing the likelihood is flat in a joint's logarithm, and no climb leaves.
     usual = NoiseValues.usual(len(noise.joint)).joint
     return fit_noise(wide, replace(noise, joint=np.maximum(noise.joint, usual)))

@@ -178,6 +178,12 @@ class DiagnosisData:
         D = self.directions[h.key](self.table, settings[None])[:, 0]
         return self.pack(self.columns.entry(h.entry_key(self.base.model)) @ D) * size
 
+    @cached_property
+    def moment(self) -> Array:
+        """When each observation (N,) was made; its row in the table where no times are recorded."""
+        time = self.table.time
+        return self.lead.astype(float) if time is None else time[self.lead]
+
     def changed(self, **changes: Any) -> DiagnosisData:
         """The same readings with other columns: their noise beside the fitted parameters stays."""
         other = replace(self, **changes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
@@ -101,7 +102,14 @@ class ModelSet:
         return self.items[:k] + self.items[k + 1 :]
 
 
-def spans_of(items: tuple[Item, ...], total: int) -> tuple[slice, ...]:
+class HasWidth(Protocol):
+    """Something with columns, `width` of them."""
+
+    @property
+    def width(self) -> int: ...
+
+
+def spans_of(items: Sequence[HasWidth], total: int) -> tuple[slice, ...]:
     """Where the coefficients of `items` stand, the last of `total`."""
     ends = total - sum(item.width for item in items) + np.cumsum([i.width for i in items])
     return tuple(

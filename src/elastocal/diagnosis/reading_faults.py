@@ -265,7 +265,7 @@ def left_out_errors(
 
 def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
     """Whether the faulty readings (N,) spread over markers, load states and time as all do."""
-    table, lead, moment = dataset.table, dataset.lead, _moments(dataset)
+    table, lead, moment = dataset.table, dataset.lead, dataset.moment
     loaded = np.any(table.force != 0, axis=1)[lead]
     for label in (table.marker[lead], loaded, moment > np.median(moment)):
         groups = np.unique(label)
@@ -288,7 +288,7 @@ def reading_errors(dataset: DiagnosisData, at: Projection) -> Array:
 
 def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
     """Suspects (N,) that stand in a row of RUN or more readings of the same marker in time."""
-    marker_of, moment = dataset.table.marker[dataset.lead], _moments(dataset)
+    marker_of, moment = dataset.table.marker[dataset.lead], dataset.moment
     out = np.zeros(len(suspect), dtype=bool)
     for marker in np.unique(marker_of):
         mine = np.flatnonzero(marker_of == marker)
@@ -298,9 +298,3 @@ def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
             if stop - start >= RUN:
                 out[mine[start:stop]] = True
     return out
-
-
-def _moments(dataset: DiagnosisData) -> Array | IntArray:
-    """When each observation (N,) was made; its row in the table where no times are recorded."""
-    time = dataset.table.time
-    return dataset.lead if time is None else time[dataset.lead]

@@ -90,7 +90,7 @@ def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Nea
     size = min(dataset.blocks.size, 3)
     e = dataset.blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :size, 0]
     squares = ((e[pairs[:, 0]] - e[pairs[:, 1]]) ** 2).mean(axis=1) / 2
-    moment = _order(dataset)
+    moment = dataset.moment
     apart = np.abs(moment[pairs[:, 0]] - moment[pairs[:, 1]]) > SOON * np.ptp(moment)
 
     def scatter(chosen: BoolArray) -> float | None:
@@ -145,12 +145,6 @@ def _independent(pairs: IntArray) -> int:
     return joined
 
 
-def _order(dataset: DiagnosisData) -> Array:
-    """When each observation (N,) was made; its row in the table where no times are recorded."""
-    time = dataset.table.time
-    return dataset.lead.astype(float) if time is None else time[dataset.lead]
-
-
 # Repeats to which the arm came back: it was elsewhere in between, in the order of times or rows.
 
 
@@ -160,7 +154,7 @@ def returned(dataset: DiagnosisData) -> tuple[float, int]:
     Readings one after the other, the arm standing still, show the tracker's noise alone.
     """
     observed, table, good = dataset.base.observed, dataset.table, ~dataset.data.faulty
-    rows, moment = observed.lead[good], _order(dataset)[good]
+    rows, moment = observed.lead[good], dataset.moment[good]
     order = np.argsort(moment, kind="stable")
     moved = np.diff(table.configuration[rows][order], prepend=-1) != 0
     stay = np.empty(len(rows), dtype=np.int64)
@@ -211,7 +205,7 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
     J = of.G.shape[2]
     out = np.zeros(J)
     first = dataset.lead[dataset.blocks.member[:, 0]]
-    q, moment = dataset.table.q[first], _order(dataset)[dataset.blocks.member[:, 0]]
+    q, moment = dataset.table.q[first], dataset.moment[dataset.blocks.member[:, 0]]
     limit = float(stats.norm.isf(FALSE_SMOOTH / (J * (J + 2))))
     h = np.einsum("cmj,cmj->cj", of.G, at.P @ of.G)
     a = np.einsum("cmj,cm->cj", of.G, at.u)

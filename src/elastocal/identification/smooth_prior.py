@@ -143,18 +143,8 @@ class LinearRows:
 
 
 @dataclass(frozen=True)
-class ShrunkProblem:
+class ShrunkProblem(LinearRows):
     """`LinearRows` of the ordinary columns that are fitted."""
-
-    R: Array
-    across: Array
-    z: Array
-    gram: Array
-    right: Array
-    total: float
-    rows: int
-    std: Array
-    group: IntArray
 
     @property
     def ordinary(self) -> int:
