@@ -12,7 +12,7 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
-from elastocal.diagnosis.component_search import rivals_of
+from elastocal.diagnosis.component_search import Rivals
 from elastocal.diagnosis.components import Component, FittedSum
 from elastocal.diagnosis.diagnosis import (
     ComponentShare,
@@ -236,12 +236,12 @@ class SumAnswer:
     @cached_property
     def _rivals(self) -> dict[int, dict[tuple[str, str], float]]:
         """Of each named component that has a hypothesis the probability of what it may be."""
-        out = {}
+        out, sums = {}, Rivals(self.dataset, self.found)
         angular = {(c.effect.name, c.where) for c in self.found.components if _of_gear(c)}
         for k, c in enumerate(self.found.components):
             if c.hypothesis is None or c.settings:
                 continue
-            own, others = rivals_of(self.dataset, self.found, k)
+            own, others = sums.of(k)
             if _of_gear(c):
                 # Which harmonic of one joint's error it is decides nothing.
                 others = {

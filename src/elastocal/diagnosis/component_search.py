@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import linalg
 
 from elastocal.diagnosis.component_families import (
     FEW_POSES,
@@ -19,10 +20,10 @@ from elastocal.diagnosis.component_families import (
 )
 from elastocal.diagnosis.components import COST, PRESENT, Component, FittedSum, fit_sum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, Grams, Prior, direct
+from elastocal.diagnosis.evidence import ANOTHER, Prior, direct, spectrum
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import ModelSet, packed_columns
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
+from elastocal.diagnosis.model_set import ModelSet, packed_columns, spans_of
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Weighted, project
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.units import Progress
@@ -212,20 +213,46 @@ WIDE = np.exp(np.linspace(-3.0, 5.0, 9))
 BETTER, SWAPS = 1.0, 6
 
 
-def rivals_of(
-    dataset: DiagnosisData, found: FittedSum, k: int
-) -> tuple[float, dict[tuple[str, str], float]]:
-    """Log evidence of component k over none in its place, and that of every other hypothesis."""
-    at = project(found.without(k), found.noise)
-    grams = Grams(dataset, found.data, at)
-    own = direct(found.data.masked(found.components[k].columns), at)
-    taken = {id(c.hypothesis) for c in found.components}
-    others = {
-        h.key: float(grams.of_hypothesis(h).evidence(WIDE)[0])
-        for h in dataset.hypotheses
-        if not h.settings and id(h) not in taken
-    }
-    return float(own.evidence(WIDE)[0]), others
+class Rivals:
+    """What else could stand in a component's place, by the sums over the rows that all columns
+    have under the noise of the sum: they are whitened once for all places."""
+
+    def __init__(self, dataset: DiagnosisData, found: FittedSum) -> None:
+        self.found = found
+        taken = {id(c.hypothesis) for c in found.components}
+        untaken = [h for h in dataset.hypotheses if not h.settings and id(h) not in taken]
+        columns = [dataset.packed(h, np.zeros(0)) for h in untaken]
+        joined = np.concatenate([found.data.X[:, :, :0], *columns], axis=2)
+        data = found.data.with_columns(joined, np.ones(joined.shape[2]))
+        sums = Weighted.of(data, found.noise)
+        self.M, self.z = sums.M, sums.z
+        self.prior = sums.prior(data.precision)
+        self.spans = dict(zip((h.key for h in untaken), spans_of(untaken, len(self.z)), strict=True))
+
+    def of(self, k: int) -> tuple[float, dict[tuple[str, str], float]]:
+        """Log evidence of component k over none in its place, and that of every other hypothesis.
+
+        With M the normal matrix of all columns, those of the others (x) integrated out,
+        A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc, and b the same of z.
+        """
+        span, p = self.found.spans[k], self.found.data.X.shape[2]
+        x = np.r_[0 : span.start, span.stop : p]
+        c = np.r_[span, p : len(self.z)]
+        M = self.M[np.ix_(x, x)]
+        M[np.diag_indices_from(M)] += self.prior[x]
+        L = linalg.cholesky(M, lower=True, overwrite_a=True, check_finite=False)
+        right = np.column_stack([self.M[np.ix_(x, c)], self.z[x]])
+        half = linalg.solve_triangular(L, right, lower=True, overwrite_b=True, check_finite=False)
+        A = self.M[np.ix_(c, c)] - half[:, :-1].T @ half[:, :-1]
+        b = self.z[c] - half[:, :-1].T @ half[:, -1]
+
+        def evidence(at: slice) -> float:
+            found = spectrum(A[None, at, at], b[None, at], np.zeros((0, 1, at.stop - at.start)))
+            return float(found.evidence(WIDE)[0])
+
+        width = span.stop - span.start
+        moved = {key: slice(s.start - p + width, s.stop - p + width) for key, s in self.spans.items()}
+        return evidence(slice(0, width)), {key: evidence(s) for key, s in moved.items()}
 
 
 def _swapped(
@@ -239,11 +266,11 @@ def _swapped(
     known = {(c.effect.name, c.where): c for c in components if c.hypothesis is not None}
     tried: set[tuple[str, str]] = set()
     for _ in range(SWAPS):
-        best = None
+        best, rivals = None, Rivals(dataset, found)
         for k, c in enumerate(found.components):
             if c.hypothesis is None or c.settings:
                 continue
-            own, others = rivals_of(dataset, found, k)
+            own, others = rivals.of(k)
             for key, evidence in others.items():
                 if key in tried or key not in known or evidence <= own + BETTER:
                     continue

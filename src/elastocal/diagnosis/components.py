@@ -29,8 +29,10 @@ from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
     Weighted,
+    balanced,
     fit_noise,
     log_prior,
+    posterior,
 )
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import ResidualField, Waves
@@ -354,9 +356,14 @@ def _noise_beside(
     wide = some.with_columns(joined, np.ones(joined.shape[2]))
     # From next to nothing the likelihood is flat in a joint's logarithm, and no climb leaves.
     usual = NoiseValues.usual(len(noise.joint)).joint
-    return fit_noise(wide, replace(noise, joint=np.maximum(noise.joint, usual)))
+    found = fit_noise(wide, replace(noise, joint=np.maximum(noise.joint, usual)))
+    if data.stated or (found.joint > STANDS_OUT * usual).any():
+        return found
+    # Nor from there where nothing is stated and the instrument has taken the joints' scatter.
+    return min(found, fit_noise(wide, balanced(wide)), key=lambda end: posterior(wide, end))
 
 
+STANDS_OUT = 2.0  # times its usual scatter: a joint that the data show
 FAINT = 1e-2  # of the noise's variance: what a direction of a component may add and be left out
 
 

@@ -345,11 +345,11 @@ def fit_noise(data: NoisyData, start: NoiseValues | None = None) -> NoiseValues:
         return _climbed(data, start)
     if len(data.r) >= 2 * SOME:
         return _climbed(data, fit_noise(data.every(len(data.r) // SOME)))
-    starts = [NoiseValues.usual(data.G.shape[2]), *([] if data.stated else [_balanced(data)])]
+    starts = [NoiseValues.usual(data.G.shape[2]), *([] if data.stated else [balanced(data)])]
     return min((_climbed(data, s) for s in starts), key=lambda end: posterior(data, end))
 
 
-def _balanced(data: NoisyData) -> NoiseValues:
+def balanced(data: NoisyData) -> NoiseValues:
     """Instrument and joints share the scatter of the data equally.
 
     From far below it the likelihood is flat in a joint's logarithm, and no climb leaves.
