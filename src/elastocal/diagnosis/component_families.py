@@ -164,8 +164,8 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
     What is not found yet counts as scatter of its joint, or as its curve: so a family is tried
     beside these, and in their place.
     """
-    out, now = [], project(found.data, found.noise).marginal
-    beside = _grams(dataset, found.data, found.noise)
+    beside = _grams(dataset, found.without_these(), found.noise)
+    out, now = [], beside.at.marginal
     for h in dataset.hypotheses:
         if not isinstance(h.effect, GearRipple):
             continue

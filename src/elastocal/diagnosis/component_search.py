@@ -18,15 +18,15 @@ from elastocal.diagnosis.component_families import (
     line_families,
     tuned_family,
 )
-from elastocal.diagnosis.components import COST, PRESENT, Component, FittedSum, fit_sum
+from elastocal.diagnosis.components import COST, PRESENT, Component, FittedSum, crossed, fit_sum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, Prior, direct, spectrum
+from elastocal.diagnosis.evidence import ANOTHER, Prior, spectrum
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import ModelSet, packed_columns, spans_of
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Weighted, project
+from elastocal.diagnosis.model_set import ModelSet, packed_columns
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearSpectrum
-from elastocal.units import Progress
+from elastocal.units import Array, Progress
 
 # Searches for more beside what has been found.
 LINE_SEARCHES, FIELD_SEARCHES = 16, 3
@@ -68,7 +68,7 @@ def search_components(
     found = again
     for _ in range(FIELD_SEARCHES):
         progress("fields beside the components")
-        more = fields(full, found.data, found.noise, found.components, MOST_FIELDS)
+        more = fields(full, found.without_these(), found.noise, found.components, MOST_FIELDS)
         wider = _wider(data, found, more)
         if wider is None:
             break
@@ -107,13 +107,11 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
 def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
     """The sum with components that went under a larger noise and show under this one."""
     for _ in range(RETURNS):
-        at = project(found.data, found.noise)
         taken = {id(c) for c in found.components}
         away = [c for c in components if id(c) not in taken]
-        evidence = [
-            float(direct(found.data.masked(c.columns), at).evidence(WIDE)[0]) - c.cost + COST
-            for c in away
-        ]
+        beside = Beside(found, [c.columns for c in away])
+        each = beside.evidence(slice(0, 0), beside.spans)
+        evidence = [own - c.cost + COST for own, c in zip(each, away, strict=True)]
         order = np.argsort(evidence)[::-1][:MOST_RETURNED]
         wider = _wider(data, found, [away[k] for k in order if evidence[k] > WORTH])
         if wider is None:
@@ -180,7 +178,7 @@ def _exchanged(
     for component in more:
         start = start.and_one(component)
     components = [*(found.components[k] for k in kept), *more]
-    return fit_sum(data, components, found.noise, start, refit_noise)
+    return fit_sum(data, components, found.noise, start, refit_noise, found.sums)
 
 
 GAINED = 0.5  # nats that a search must bring for another one
@@ -213,46 +211,67 @@ WIDE = np.exp(np.linspace(-3.0, 5.0, 9))
 BETTER, SWAPS = 1.0, 6
 
 
-class Rivals:
-    """What else could stand in a component's place, by the sums over the rows that all columns
-    have under the noise of the sum: they are whitened once for all places."""
+class Beside:
+    """Log evidence of other columns beside a sum, by sums over the rows."""
 
-    def __init__(self, dataset: DiagnosisData, found: FittedSum) -> None:
-        self.found = found
-        taken = {id(c.hypothesis) for c in found.components}
-        untaken = [h for h in dataset.hypotheses if not h.settings and id(h) not in taken]
-        columns = [dataset.packed(h, np.zeros(0)) for h in untaken]
-        joined = np.concatenate([found.data.X[:, :, :0], *columns], axis=2)
-        data = found.data.with_columns(joined, np.ones(joined.shape[2]))
-        sums = Weighted.of(data, found.noise)
-        self.M, self.z = sums.M, sums.z
-        self.prior = sums.prior(data.precision)
-        self.spans = dict(zip((h.key for h in untaken), spans_of(untaken, len(self.z)), strict=True))
+    def __init__(self, found: FittedSum, columns: Sequence[Array]) -> None:
+        sums, data, root = found.sums.weighted, found.plain, found.sums.weighted.root
+        p, self.spans, end = len(sums.z), [], len(sums.z)
+        for c in columns:
+            self.spans.append(slice(end, end := end + c.shape[2]))
+        pairs = [crossed(data, found.components, root, c) for c in columns]
+        cross = np.concatenate([np.zeros((p, 0)), *(M for M, _ in pairs)], axis=1)
+        self.z = np.concatenate([sums.z, *(z for _, z in pairs)])
+        self.M = np.zeros((len(self.z), len(self.z)))
+        self.M[:p, :p], self.M[:p, p:], self.M[p:, :p] = sums.M, cross, cross.T
+        for c, span in zip(columns, self.spans, strict=True):
+            white = (root @ data.masked(c)).reshape(-1, c.shape[2])
+            self.M[span, span] = white.T @ white
+        precision = np.concatenate([data.precision, 1 / found.variances])
+        self.prior = sums.prior(precision)
 
-    def of(self, k: int) -> tuple[float, dict[tuple[str, str], float]]:
-        """Log evidence of component k over none in its place, and that of every other hypothesis.
+    def evidence(self, gone: slice, tried: Sequence[slice]) -> list[float]:
+        """Of each of the columns `tried`, over none, beside all of the sum but those that are
+        `gone`.
 
         With M the normal matrix of all columns, those of the others (x) integrated out,
         A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc, and b the same of z.
         """
-        span, p = self.found.spans[k], self.found.data.X.shape[2]
-        x = np.r_[0 : span.start, span.stop : p]
-        c = np.r_[span, p : len(self.z)]
-        M = self.M[np.ix_(x, x)]
-        M[np.diag_indices_from(M)] += self.prior[x]
-        L = linalg.cholesky(M, lower=True, overwrite_a=True, check_finite=False)
+        p = len(self.prior)
+        x = np.r_[0 : gone.start, gone.stop : p]
+        L = self.M[np.ix_(x, x)]
+        L[np.diag_indices_from(L)] += self.prior[x]
+        L = linalg.cholesky(L, lower=True, overwrite_a=True, check_finite=False)
+        c = np.r_[(slice(0, 0), *tried)]
         right = np.column_stack([self.M[np.ix_(x, c)], self.z[x]])
-        half = linalg.solve_triangular(L, right, lower=True, overwrite_b=True, check_finite=False)
-        A = self.M[np.ix_(c, c)] - half[:, :-1].T @ half[:, :-1]
-        b = self.z[c] - half[:, :-1].T @ half[:, -1]
+        half = linalg.solve_triangular(L, right, lower=True, check_finite=False)
+        out, start = [], 0
+        for span in tried:
+            k = span.stop - span.start
+            own = half[:, start : start + k]
+            A = self.M[span, span] - own.T @ own
+            b = self.z[span] - own.T @ half[:, -1]
+            found = spectrum(A[None], b[None], np.zeros((0, 1, k)))
+            out.append(float(found.evidence(WIDE)[0]))
+            start += k
+        return out
 
-        def evidence(at: slice) -> float:
-            found = spectrum(A[None, at, at], b[None, at], np.zeros((0, 1, at.stop - at.start)))
-            return float(found.evidence(WIDE)[0])
 
-        width = span.stop - span.start
-        moved = {key: slice(s.start - p + width, s.stop - p + width) for key, s in self.spans.items()}
-        return evidence(slice(0, width)), {key: evidence(s) for key, s in moved.items()}
+class Rivals:
+    """What else could stand in a component's place."""
+
+    def __init__(self, dataset: DiagnosisData, found: FittedSum) -> None:
+        taken = {id(c.hypothesis) for c in found.components}
+        others = [h for h in dataset.hypotheses if not h.settings and id(h) not in taken]
+        self.keys = [h.key for h in others]
+        self.beside = Beside(found, [dataset.packed(h, np.zeros(0)) for h in others])
+        self.own = found.spans
+
+    def of(self, k: int) -> tuple[float, dict[tuple[str, str], float]]:
+        """Log evidence of component k over none in its place, and of every other hypothesis."""
+        span = self.own[k]
+        own, *others = self.beside.evidence(span, [span, *self.beside.spans])
+        return own, dict(zip(self.keys, others, strict=True))
 
 
 def _swapped(

@@ -133,7 +133,8 @@ class Sizes:
 class SumOfComponents:
     """Components beside fitted columns, under a noise whose factor is free: −2ℓ and its slope.
 
-    `weighted` is the data whitened by that noise, with the components' columns last.
+    `weighted` is the data whitened by that `noise`; its M and z hold the components last, which
+    are not kept as rows.
     """
 
     weighted: Weighted
@@ -141,6 +142,7 @@ class SumOfComponents:
     components: tuple[Component, ...]
     stated: bool
     rows: int
+    noise: NoiseValues
 
     @cached_property
     def squares(self) -> float:
@@ -148,7 +150,14 @@ class SumOfComponents:
 
     @cached_property
     def spans(self) -> tuple[slice, ...]:
-        return spans_of(self.components, self.weighted.X.shape[2])
+        return spans_of(self.components, len(self.weighted.z))
+
+    def scaled(self, factor: float) -> SumOfComponents:
+        """The same under e^factor times the noise."""
+        w, a = self.weighted, float(np.exp(factor))
+        alone = w.alone - self.squares + self.squares / a**2 + 2 * self.rows * factor
+        weighted = Weighted(w.root / a, w.X / a, w.r / a, w.M / a**2, w.z / a**2, alone)
+        return replace(self, weighted=weighted, noise=_scaled(self.noise, factor))
 
     def variances(self, at: Sizes) -> Array:
         """Prior variances of all coefficients (p + Σ k,)."""
@@ -233,18 +242,61 @@ def _joined(data: NoisyData, columns: Sequence[Array]) -> Array:
     return np.concatenate([np.zeros((*data.r.shape, 0)), *columns], axis=2)
 
 
-def posed(data: NoisyData, components: Sequence[Component], noise: NoiseValues) -> SumOfComponents:
-    """The sum of these components beside the data's own columns, under one noise."""
-    columns = _joined(data, [data.masked(c.columns) for c in components])
-    weighted = Weighted.of(data.with_columns(columns, np.ones(columns.shape[2])), noise)
-    return SumOfComponents(weighted, data.precision, tuple(components), data.stated, data.n_rows)
+def posed(
+    data: NoisyData, components: Sequence[Component], noise: NoiseValues,
+    known: SumOfComponents | None = None,
+) -> SumOfComponents:  # fmt: skip
+    """The sum of these components beside the data's own columns, under one noise.
+
+    What a sum that is `known` of the same data has summed up under this noise is not summed anew.
+    """
+    own, p = Weighted.of(data, noise), data.X.shape[2]
+    total = p + sum(c.width for c in components)
+    spans = spans_of(components, total)
+    old = {} if known is None or known.noise is not noise else dict(
+        zip(map(id, known.components), known.spans, strict=True)
+    )  # fmt: skip
+    if old and known is not None:
+        M, z = np.empty((total, total)), np.empty(total)
+        there = [k for k, c in enumerate(components) if id(c) in old]
+        at = np.r_[(slice(0, p), *(spans[k] for k in there))]
+        before = np.r_[(slice(0, p), *(old[id(components[k])] for k in there))]
+        M[np.ix_(at, at)] = known.weighted.M[np.ix_(before, before)]
+        z[at] = known.weighted.z[before]
+        for c, span in zip(components, spans, strict=True):
+            if id(c) not in old:
+                M[:, span], z[span] = crossed(data, components, own.root, c.columns)
+                M[span] = M[:, span].T
+    else:
+        X = np.empty((*data.r.shape, total))
+        X[:, :, :p] = own.X
+        for c, span in zip(components, spans, strict=True):
+            np.matmul(own.root, data.masked(c.columns), out=X[:, :, span])
+        flat = X.reshape(-1, total)
+        M, z = flat.T @ flat, flat.T @ own.r.ravel()
+    weighted = replace(own, M=M, z=z)
+    return SumOfComponents(
+        weighted, data.precision, tuple(components), data.stated, data.n_rows, noise
+    )
+
+
+def crossed(
+    data: NoisyData, components: Sequence[Component], root: Array, columns: Array
+) -> tuple[Array, Array]:
+    """XᵀV⁻¹C (p + Σ k, n) of the data's own columns and the components', and CᵀV⁻¹r (n,), of other
+    columns C (C, m, n); `root` is K⁻¹ of V = KKᵀ."""
+    white = root.transpose(0, 2, 1) @ (root @ data.masked(columns))
+    flat = white.reshape(-1, white.shape[2])
+    parts = [X.reshape(-1, X.shape[2]).T @ flat for X in (data.X, *(c.columns for c in components))]
+    return np.concatenate(parts), flat.T @ data.r.ravel()
 
 
 @dataclass(frozen=True)
 class FittedSum:
     """The components that are left, their sizes, the noise beside them and the log posterior.
 
-    `earned` (K,) nats of each; `data` holds their columns with their prior precisions.
+    `earned` (K,) nats of each; `sums` are those over the rows of `plain`, the data without their
+    columns, `variances` (Σ k,) their coefficients' prior.
     """
 
     components: tuple[Component, ...]
@@ -252,39 +304,60 @@ class FittedSum:
     noise: NoiseValues
     earned: Array
     score: float
-    data: NoisyData
+    plain: NoisyData
+    sums: SumOfComponents
+    variances: Array
+
+    @cached_property
+    def data(self) -> NoisyData:
+        """The data with the components' columns and their prior precisions."""
+        columns = _joined(self.plain, [self.plain.masked(c.columns) for c in self.components])
+        return self.plain.with_columns(columns, 1 / self.variances)
+
+    @cached_property
+    def _shown(self) -> tuple[Array, ...]:
+        """The directions (C, m, k) of each component that these data show."""
+        plain, first = self.plain, self.plain.X.shape[2]
+        return tuple(
+            _compressed(
+                plain.masked(c.columns), self.variances[span.start - first : span.stop - first],
+                plain, self.noise, HARDLY,
+            )
+            for c, span in zip(self.components, self.spans, strict=True)
+        )  # fmt: skip
 
     @property
     def spans(self) -> tuple[slice, ...]:
         """Where each component's coefficients stand among those of the data, last of all."""
-        return spans_of(self.components, self.data.X.shape[2])
+        return self.sums.spans
 
-    def without(self, k: int) -> NoisyData:
-        """The data without the columns of component k."""
-        return self.without_these((self.components[k],))
-
-    def without_these(self, some: Sequence[Component]) -> NoisyData:
-        """The data without the columns of some of the components."""
-        kept = np.ones(self.data.X.shape[2], dtype=bool)
-        for c, span in zip(self.components, self.spans, strict=True):
-            kept[span] &= not any(c is other for other in some)
-        return replace(self.data, X=self.data.X[:, :, kept], precision=self.data.precision[kept])
+    def without_these(self, some: Sequence[Component] = ()) -> NoisyData:
+        """The data beside all but some of the components, these by the directions that show: half
+        as many columns, for searches."""
+        columns = [
+            shown for c, shown in zip(self.components, self._shown, strict=True)
+            if not any(c is other for other in some)
+        ]  # fmt: skip
+        joined = _joined(self.plain, columns)
+        return self.plain.with_columns(joined, np.ones(joined.shape[2]))
 
 
 STEPS, ROUNDS = 30, 12
 MOST_AT_ONCE = 0.5  # nats: components that earn less go together
-SOME = 1000  # configurations from which the noise is estimated
+SOME = 400  # configurations from which the noise is estimated
 
 
 def fit_sum(
     data: NoisyData, components: Sequence[Component], noise: NoiseValues,
-    start: Sizes | None = None, refit_noise: bool = True,
+    start: Sizes | None = None, refit_noise: bool = True, known: SumOfComponents | None = None,
 ) -> FittedSum:  # fmt: skip
-    """Maximise over all sizes; leave out, one after the other, what does not earn its cost."""
+    """Maximise over all sizes; leave out, one after the other, what does not earn its cost.
+
+    `known` are the sums of a fit to the same data, which are not summed anew."""
     components, at = list(components), start or Sizes.start(components)
     rounds = 2 if refit_noise else 1
     for last in range(rounds):
-        problem = posed(data, components, noise)
+        problem = posed(data, components, noise, known)
         for _ in range(ROUNDS * 4):
             at = problem.climbed(at, STEPS)
             kept = _kept(problem, at, strict=last == rounds - 1)
@@ -292,21 +365,23 @@ def fit_sum(
                 break
             components, at = [components[k] for k in kept], at.chosen(kept)
             problem = replace(problem, **_narrowed(problem, kept))
-        noise = _scaled(noise, at.factor)
-        at = replace(at, factor=0.0)
+        problem = problem.scaled(at.factor)
+        noise, at = problem.noise, replace(at, factor=0.0)
         if refit_noise:
             noise = _noise_beside(data, components, at, noise)
             if last == rounds - 1 or not components:
                 break
-    problem = posed(data, components, noise)
+    if refit_noise:
+        problem = posed(data, components, noise)
     variances = problem.variances(at)
     value = problem.factored(at)[3]
     prior = -float((at.size**2).sum()) / 2 / SPREAD**2
     score = -value / 2 + prior - sum(c.cost for c in components)
     score -= 0.5 * log_prior(data.stated, noise)[0]
-    columns = _joined(data, [data.masked(c.columns) for c in components])
-    with_all = data.with_columns(columns, 1 / variances[len(data.precision) :])
-    return FittedSum(tuple(components), at, noise, problem.earned(at), score, with_all)
+    return FittedSum(
+        tuple(components), at, noise, problem.earned(at), score, data, problem,
+        variances[len(data.precision) :],
+    )  # fmt: skip
 
 
 def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
@@ -331,7 +406,7 @@ def _narrowed(problem: SumOfComponents, kept: list[int]) -> dict:
     p = len(problem.own)
     index = np.concatenate([np.arange(p), *(np.r_[problem.spans[k]] for k in kept)]).astype(int)
     w = problem.weighted
-    narrow = replace(w, X=w.X[:, :, index], M=w.M[np.ix_(index, index)], z=w.z[index])
+    narrow = replace(w, M=w.M[np.ix_(index, index)], z=w.z[index])
     return {"weighted": narrow, "components": tuple(problem.components[k] for k in kept)}
 
 
@@ -364,14 +439,18 @@ def _noise_beside(
 
 
 STANDS_OUT = 2.0  # times its usual scatter: a joint that the data show
-FAINT = 1e-2  # of the noise's variance: what a direction of a component may add and be left out
+# Of the noise's variance: what a direction of a component may add and be left out, where the noise
+# is fitted, and where more is searched for.
+FAINT, HARDLY = 1e-2, 1e-4
 
 
-def _compressed(columns: Array, variances: Array, data: NoisyData, noise: NoiseValues) -> Array:
+def _compressed(
+    columns: Array, variances: Array, data: NoisyData, noise: NoiseValues, faint: float = FAINT
+) -> Array:
     """The few directions (C, m, k) of a component that show beside the noise, of unit variance."""
     scaled = columns * np.sqrt(variances)
     flat = scaled.reshape(-1, scaled.shape[2])
     noisy = noise.factor**2 * np.diagonal(data.covariance, axis1=1, axis2=2)
     white = flat / np.sqrt(np.maximum(noisy.ravel(), 1e-300))[:, None]
     values, vectors = np.linalg.eigh(white.T @ white)
-    return np.asarray(scaled @ vectors[:, values > FAINT])
+    return np.asarray(scaled @ vectors[:, values > faint])
