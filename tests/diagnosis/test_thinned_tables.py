@@ -8,8 +8,8 @@ import numpy as np
 from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import thinned
-from elastocal.diagnosis.baseline import MOST_IN_ONE, MOST_ROWS
-from elastocal.measurements import Measurements
+from elastocal.diagnosis.baseline import MOST_CONFIGURATIONS, MOST_IN_ONE, MOST_ROWS
+from elastocal.measurements import Measurements, with_moves
 from elastocal.model import observe
 
 
@@ -40,6 +40,17 @@ def test_configurations_stay_whole_and_evenly_spaced() -> None:
     times = np.unique(kept.time)
     assert np.ptp(times) > 0.99 * np.ptp(table.time)
     assert np.diff(times).max() < 10 * np.ptp(table.time) / len(times)
+
+
+def test_of_many_poses_a_part_is_enough_and_keeps_its_moves() -> None:
+    table = repeated(100)
+    single = with_moves(table.take(np.unique(table.configuration, return_index=True)[1]))
+    kept, said = thinned(single)
+    assert len(kept) == MOST_CONFIGURATIONS < len(single) < MOST_ROWS
+    assert said is not None
+    assert kept.move is not None and single.move is not None
+    moves = dict(zip(single.row, single.move, strict=True))
+    assert all((moves[row] == own).all() for row, own in zip(kept.row, kept.move, strict=True))
 
 
 def test_many_readings_of_one_configuration_are_thinned_alike() -> None:

@@ -252,6 +252,9 @@ def prior_deviations(base: Baseline) -> Array:
 
 # Evidence grows with the readings, and an effect worth finding has hundreds of nats in so many.
 MOST_ROWS = 12_000
+# The same of poses: curves and fields have a thousand columns.  Identified from all poses, a cell
+# that was found from half of 3000 predicts others within 1 % as well as one found from all (UR10).
+MOST_CONFIGURATIONS = 2_000
 # Within one configuration noise is dense: its cost grows with the square of what it holds.
 MOST_IN_ONE = 60
 
@@ -266,7 +269,7 @@ def thinned(table: Measurements) -> tuple[Measurements, str | None]:
     part = table.take(_first_of_each(table))
     labels, first, rows = np.unique(part.configuration, return_index=True, return_counts=True)
     order = labels[np.argsort(first)]
-    wanted = int(MOST_ROWS / rows.mean())
+    wanted = min(int(MOST_ROWS / rows.mean()), MOST_CONFIGURATIONS)
     if len(order) > wanted:
         chosen = order[np.linspace(0, len(order) - 1, wanted).round().astype(int)]
         part = part.take(np.isin(part.configuration, chosen))
