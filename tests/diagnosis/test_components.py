@@ -18,6 +18,10 @@ from elastocal.diagnosis import (
     posed,
     with_returned,
 )
+from elastocal.diagnosis.baseline import Blocks
+from elastocal.diagnosis.component_search import WIDE, Beside
+from elastocal.diagnosis.evidence import direct
+from elastocal.diagnosis.noise_floor import project
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 
@@ -84,6 +88,52 @@ def test_what_a_component_earns_is_what_the_likelihood_loses_without_it() -> Non
         fewer = posed(data, [components[i] for i in kept], NOISE)
         lost = (fewer.factored(at.chosen(kept))[3] - whole) / 2
         assert earned[k] == pytest.approx(lost, abs=1e-6)
+
+
+def test_sums_that_are_known_serve_another_fit() -> None:
+    """A component more and one less, and the noise larger by a factor, as if summed anew."""
+    data, components, at = some()
+    known = posed(data, components, NOISE)
+    other = [components[2], component(data, 4, 3), components[0]]
+    twice, anew = posed(data, other, NOISE, known), posed(data, other, NOISE)
+    assert twice.weighted.M == pytest.approx(anew.weighted.M, rel=1e-9, abs=1e-12)
+    assert twice.weighted.z == pytest.approx(anew.weighted.z, rel=1e-9, abs=1e-12)
+    larger = known.scaled(0.3)
+    expected = posed(data, components, larger.noise)
+    assert larger.weighted.M == pytest.approx(expected.weighted.M, rel=1e-9)
+    assert larger.factored(at)[3] == pytest.approx(expected.factored(at)[3], abs=1e-6)
+
+
+def test_evidence_beside_a_sum_is_that_of_the_rows() -> None:
+    data, components, _ = some()
+    r = data.r + sum(c.columns @ np.full(c.width, 20.0) for c in components)
+    found = fit_sum(replace(data, r=r), components, NOISE, refit_noise=False)
+    assert len(found.components) == 3
+    more = [component(data, 4, 2).columns, component(data, 5, 3).columns]
+    beside = Beside(found, more)
+    for k, gone in enumerate(found.spans):
+        kept = np.r_[0 : gone.start, gone.stop : found.data.X.shape[2]]
+        rest = replace(found.data, X=found.data.X[:, :, kept], precision=found.data.precision[kept])
+        at = project(rest, found.noise)
+        tried = [found.components[k].columns, *more]
+        expected = [float(direct(data.masked(C), at).evidence(WIDE)[0]) for C in tried]
+        assert beside.evidence(gone, [gone, *beside.spans]) == pytest.approx(expected, rel=1e-6)
+    # Without directions that hardly show the rest of the readings is as probable.
+    shown = project(found.without_these(), found.noise).marginal
+    assert shown == pytest.approx(project(found.data, found.noise).marginal, abs=1e-3)
+
+
+def test_scatter_of_joints_that_the_instrument_has_taken_is_found() -> None:
+    """Nothing is stated: beside so much noise of the instrument the likelihood is flat where joints
+    repeat well."""
+    blocks = Blocks.of(np.repeat(np.arange(80), 2), np.arange(160), 3)
+    data = random_data(6, blocks, p=2, stated=False)
+    rng = np.random.default_rng(2)
+    scatter = data.same_visit @ (2e-4 * rng.normal(size=(*data.r.shape, 3)))
+    r = 2e-5 * rng.normal(size=data.r.shape) + (data.G * scatter).sum(axis=2)
+    start = NoiseValues(30.0, np.full(3, 1e-9), 0.2)
+    found = fit_sum(replace(data, r=r), [component(data, 1, 2)], start)
+    assert (found.noise.joint > 1e-4).all()
 
 
 def test_of_causes_only_those_at_work_are_left() -> None:
