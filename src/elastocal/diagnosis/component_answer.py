@@ -342,9 +342,13 @@ class SumAnswer:
             parameters = tuple(p for k in members for p in self._parameters(k))
             yield FoundEffect(name, where, probability, reduction, ci90, ci95, parameters, settings)
 
+    @cached_property
+    def _present(self) -> Array:
+        return np.asarray(expit(self.found.earned - self.found.costs))
+
     def _there(self, k: int) -> float:
         """Probability that there is anything at a component's place."""
-        return float(expit(self.found.earned[k] - self.found.components[k].cost))
+        return float(self._present[k])
 
     def _probability(self, k: int) -> float:
         there = self._there(k)

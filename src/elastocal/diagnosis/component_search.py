@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,25 +11,34 @@ import numpy as np
 from elastocal.diagnosis.component_families import (
     FEW_POSES,
     catalogue_components,
+    drifts,
     family_of,
     fields,
     joint_curves,
     judged_together,
     line_families,
-    tuned_family,
+    sharpened,
+    with_multiples,
 )
-from elastocal.diagnosis.components import COST, PRESENT, Component, FittedSum, fit_sum
+from elastocal.diagnosis.components import (
+    Component,
+    FittedSum,
+    Pool,
+    fit_sum,
+    log_odds,
+    presence_cost,
+)
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, Grams, Prior, direct
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.model.effects.base import index
-from elastocal.model.effects.gears import GearSpectrum
+from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Progress
 
 # Searches for more beside what has been found.
-LINE_SEARCHES, FIELD_SEARCHES = 16, 3
+LINE_SEARCHES, FIELD_SEARCHES, TWICE = 16, 3, 2
 MOST_FIELDS = 4  # that one search adds
 
 
@@ -43,7 +53,7 @@ def search_components(
     data = with_equal_noise(full)
     instrument = chosen.noise.of_instrument() if data.stated else _started(data)
     curves = list(joint_curves(full))
-    others = [*catalogue_components(full), *_searched(full, chosen)]
+    others = [*drifts(full), *catalogue_components(full), *_searched(full, chosen)]
     progress(f"sizes of {len(curves) + len(others)} components at once")
     both = [*curves, *others]
     found = _swapped(full, data, fit_sum(data, both, instrument), both)
@@ -53,7 +63,12 @@ def search_components(
         # none of them stands out.
         progress("families of lines before curves")
         first = _swapped(full, data, fit_sum(data, others, instrument), others)
-        first = _with_lines(full, data, first)
+        first = _spared(data, _completed(data, first, others))
+        for _ in range(TWICE):
+            before = first
+            first = _completed(data, _with_lines(full, data, first), both)
+            if first.score <= before.score + GAINED:
+                break
         other = _wider(data, first, curves) or first
         lined = other.score > found.score
         found = other if lined else found
@@ -100,7 +115,7 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
         if wider is None:
             break
         found = wider if many else _tuned(dataset, data, wider)
-    return found
+    return found if many else _multiplied(dataset, data, found)
 
 
 def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
@@ -110,11 +125,12 @@ def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Compon
         taken = {id(c) for c in found.components}
         away = [c for c in components if id(c) not in taken]
         evidence = [
-            float(direct(found.data.masked(c.columns), at).evidence(WIDE)[0]) - c.cost + COST
+            float(direct(found.data.masked(c.columns), at).evidence(WIDE)[0])
+            + log_odds(found.components, c)
             for c in away
         ]
         order = np.argsort(evidence)[::-1][:MOST_RETURNED]
-        wider = _wider(data, found, [away[k] for k in order if evidence[k] > WORTH])
+        wider = _wider(data, found, [away[k] for k in order if evidence[k] > 0])
         if wider is None:
             break
         found = wider
@@ -122,32 +138,40 @@ def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Compon
 
 
 RETURNS, MOST_RETURNED = 4, 6
-WORTH = float(np.log(1 / PRESENT - 1))  # log evidence, sizes mixed, that outweighs the prior odds
 
 
 def _tuned(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
-    """The sum with the orders of its lines sought anew, close by, beside what else is in it now."""
-    for c in found.components:
-        if not isinstance(c.effect, GearSpectrum):
-            continue
-        near = tuned_family(dataset, found, c)
-        if abs(near.settings[0][1] - c.settings[0][1]) < TUNED * c.settings[1][1]:
-            continue
-        start = found.sizes
-        tuned = [near if other is c else other for other in found.components]
-        fitted = fit_sum(data, tuned, found.noise, start, refit_noise=False)
-        if fitted.score > found.score:
-            found = fitted
+    """The sum with the orders of all its lines where they fit best, each beside the others."""
+    for _ in range(TUNINGS):
+        components = sharpened(dataset, found)
+        if all(new is old for new, old in zip(components, found.components, strict=True)):
+            break
+        fitted = fit_sum(data, components, found.noise, found.sizes, refit_noise=False)
+        if fitted.score <= found.score:
+            break
+        found = fitted
     return found
 
 
-TUNED = 0.2  # standard deviations of an order that are worth another fit
+def _multiplied(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum with one multiple more or less of every family of lines where that is better."""
+    changed = False
+    for c in found.components:
+        for other in with_multiples(dataset, c):
+            fitted = _exchanged(data, found, [c], [other], refit_noise=False)
+            if fitted.score > found.score:
+                found, changed = fitted, True
+                break
+    return _tuned(dataset, data, found) if changed else found
+
+
+TUNINGS = 3
 
 
 def _spared(data: NoisyData, found: FittedSum) -> FittedSum:
     """The sum without what the others can stand in for, once their sizes have followed."""
     spared = 0
-    order = np.argsort(found.earned - [c.cost for c in found.components])
+    order = np.argsort(found.earned - found.costs)
     for c in [found.components[k] for k in order[:SPARED]]:
         if not any(c is other for other in found.components):
             continue
@@ -189,19 +213,27 @@ def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -
     """Log posterior of a sum under the priors that the forward search's sets have.
 
     Within a sum many causes are expected, so that each costs little; to be believed instead of a
-    few, each has to pay what one more effect of the catalogue pays there, and a line or what has
-    no name what its search costs.
+    few, the first of each kind has to pay what one more effect of the catalogue pays there, and a
+    line or what has no name what its search costs.
     """
     prior = Prior.of(dataset.hypotheses, [], ANOTHER)
     odds = {h.key: float(w) for h, w in zip(dataset.hypotheses, prior.hypotheses, strict=True)}
-    usual = min(odds.values(), default=-COST)
+    usual = min(odds.values(), default=0.0)
     known = {item.key: item.log_prior for item in chosen.items if item.known}
-    score = found.score
-    for c in found.components:
-        price = odds.get(c.hypothesis.key, usual) if c.hypothesis is not None else usual
-        if c.hypothesis is not None and c.settings:
-            price = known.get(c.hypothesis.key, price)
-        score += c.cost - c.search + price
+
+    def price(c: Component) -> float:
+        if c.hypothesis is None:
+            return usual
+        own = odds.get(c.hypothesis.key, usual)
+        return known.get(c.hypothesis.key, own) if c.settings else own
+
+    pool = Pool(found.components)
+    score = found.score + pool.cost - sum(c.search for c in found.components)
+    for n, own in zip(pool.places, pool.kinds, strict=True):
+        for before, k in enumerate(own):
+            fellow = presence_cost(n, before + 1) - presence_cost(n, before)
+            paid = -price(found.components[k])
+            score -= max(min(paid, fellow), 0.0) if before else paid
     return score
 
 
@@ -257,6 +289,41 @@ def _swapped(
         if other.score > found.score:
             found = other
     return found
+
+
+def _completed(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
+    """The sum with a kind of cause at all its places, or in the place of another kind, where that
+    is more probable.
+
+    What acts at every joint, a little at each, comes in together or not at all; and a single one of
+    another kind that stands in its place goes with it.
+    """
+    kinds: dict[str, list[Component]] = {}
+    for c in components:
+        if c.fellows > 1 and (not c.settings or isinstance(c.effect, JointCurve)):
+            kinds.setdefault(c.effect.name, []).append(c)
+    for _ in range(COMPLETED):
+        present = Counter(c.effect.name for c in found.components)
+        better = None
+        for name, own in kinds.items():
+            away = [c for c in own if not any(c is other for other in found.components)]
+            if not away:
+                continue
+            for instead in (None, *(n for n in kinds if n != name and present[n])):
+                gone = [c for c in found.components if c.effect.name == instead]
+                alike = {c.family for c in gone} & {c.family for c in own}
+                if (instead is None and not present[name]) or (gone and not alike):
+                    continue
+                fitted = _exchanged(data, found, gone, away, refit_noise=False)
+                if fitted.score > (found if better is None else better).score + GAINED:
+                    better = fitted
+        if better is None:
+            break
+        found = fit_sum(data, better.components, better.noise, better.sizes)
+    return found
+
+
+COMPLETED = 3
 
 
 def _with_together(dataset: DiagnosisData) -> DiagnosisData:
