@@ -35,6 +35,7 @@ from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
 
 DRAWS, PARTS = 400, 10
+DETERMINED = 1e-4  # of the largest, singular value of columns of unit length
 MOST_POSES = 1500  # that a set of new poses is drawn from
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
@@ -69,12 +70,21 @@ class SumAnswer:
     @cached_property
     def moved(self) -> Array:
         """C (rows, Σ k) in m: C w is what coefficients w leave of the positions once the fitted
-        parameters have followed them, at equal weights."""
+        parameters have followed them, at equal weights.
+
+        They follow in the directions that the readings determine, not in what rounding leaves of
+        parallel axes; what is only uncertain of the load's point is no fitted parameter.
+        """
         data, own = self.found.data, self._own
         X = data.X[_position_rows(data)]
-        size = np.maximum(np.linalg.norm(X[:, :own], axis=0), 1e-300)
-        Q, R = linalg.qr(X[:, :own] / size, mode="economic")
-        Q = Q[:, np.abs(np.diag(R)) > 1e-9]
+        fitted = np.isin(
+            self.dataset.fitted, [p.effect for p in self.dataset.base.model.parameters]
+        )
+        B = X[:, :own][:, fitted]
+        U, size, _ = linalg.svd(
+            B / np.maximum(np.linalg.norm(B, axis=0), 1e-300), full_matrices=False
+        )
+        Q = U[:, size > DETERMINED * size.max(initial=0.0)]
         return np.asarray(X[:, own:] - Q @ (Q.T @ X[:, own:]))
 
     @cached_property

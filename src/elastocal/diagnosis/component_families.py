@@ -248,42 +248,54 @@ def _best_family(dataset: DiagnosisData, grams: Grams, h: Hypothesis, m: int) ->
     return LineFamily(h.where, order, m, evidence - search, sd, search)
 
 
-def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component]:
-    """The components of a sum with the orders of all lines moved to where they fit best together.
+def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | None:
+    """The components of a sum with the orders of all lines where they fit best together; None
+    where they are there already.
 
-    One Gauss–Newton step in the orders N of all families at once: with amplitudes a_k, b_k at
-    their posterior mean, a family's column is Σ_k k (q − q₀)(a_k cos kNq − b_k sin kNq), which is
-    that of the amplitudes' shifts.  The posterior says how well each order is known.
+    Gauss–Newton in the orders N of all families at once, sizes and noise as they are: with
+    amplitudes a_k, b_k at their posterior mean, a family's column is
+    Σ_k k (q − q₀)(a_k cos kNq − b_k sin kNq), which is that of the amplitudes' shifts.  The
+    posterior says how well each order is known.
     """
-    out = list(found.components)
-    families = [k for k, c in enumerate(out) if isinstance(c.effect, GearSpectrum)]
+    families = [k for k, c in enumerate(found.components) if isinstance(c.effect, GearSpectrum)]
     if not families:
-        return out
+        return None
+    now, moved = found, False
     lines, shifts = zip(*(_lines_and_shifts(found.spans[k]) for k in families), strict=True)
     kept = np.ones(found.data.X.shape[2], dtype=bool)
     kept[np.concatenate(shifts)] = False
-    alone = replace(found.data, X=found.data.X[:, :, kept], precision=found.data.precision[kept])
-    amplitude = np.zeros(len(kept))
-    amplitude[kept] = project(alone, found.noise).beta
-    sd = [dict(out[k].settings)["order_sd_1"] for k in families]
-    turned = [
-        found.data.X[:, :, shift] @ amplitude[line] / d
-        for line, shift, d in zip(lines, shifts, sd, strict=True)
-    ]
-    spans = [np.ptp(dataset.table.q[:, index(out[k].where)]) for k in families]
-    most = STEP / np.maximum(np.array(spans), 1e-3)
-    at = project(alone.with_columns(np.stack(turned, axis=2), 1 / most**2), found.noise)
-    F = len(families)
-    steps = np.clip(at.beta[-F:], -most, most)
-    spread = np.linalg.norm(at.beta_deviation[:, -F:], axis=0)
-    for k, step, known in zip(families, steps, spread, strict=True):
-        given = dict(out[k].settings)
-        family = LineFamily(
-            out[k].where, given["order_1"] + float(step), len(given) // 2, 0.0, float(known),
-            out[k].search,
-        )  # fmt: skip
-        out[k] = _family_component(dataset, family)
-    return out
+    places = [found.components[k].where for k in families]
+    most = STEP / np.array([max(float(np.ptp(dataset.table.q[:, index(w)])), 1e-3) for w in places])
+    best = -np.inf
+    for _ in range(SHARPENINGS):
+        X, sums = now.data.X, now.data
+        alone = replace(sums, X=X[:, :, kept], precision=sums.precision[kept])
+        at = project(alone, now.noise)
+        if at.marginal < best + SHARP:
+            break
+        best, moved, found = at.marginal, now is not found or moved, now
+        amplitude = np.zeros(len(kept))
+        amplitude[kept] = at.beta
+        sd = [dict(now.components[k].settings)["order_sd_1"] for k in families]
+        turned = [
+            X[:, :, shift] @ amplitude[line] / d
+            for line, shift, d in zip(lines, shifts, sd, strict=True)
+        ]
+        at = project(alone.with_columns(np.stack(turned, axis=2), 1 / most**2), now.noise)
+        steps = np.clip(at.beta[-len(families) :], -most, most)
+        spread = np.linalg.norm(at.beta_deviation[:, -len(families) :], axis=0)
+        components, X = list(now.components), X.copy()
+        for k, step, known in zip(families, steps, spread, strict=True):
+            c = components[k]
+            order = dict(c.settings)["order_1"] + float(step)
+            family = LineFamily(c.where, order, c.width // 4, 0.0, float(known), c.search)
+            components[k] = _family_component(dataset, family)
+            X[:, :, now.spans[k]] = now.data.masked(components[k].columns)
+        now = replace(now, components=tuple(components), data=replace(sums, X=X))
+    return list(found.components) if moved else None
+
+
+SHARPENINGS, SHARP = 6, 0.05  # nats that another step must gain
 
 
 def with_multiples(dataset: DiagnosisData, c: Component) -> list[Component]:

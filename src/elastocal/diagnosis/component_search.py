@@ -100,7 +100,10 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
         stand_out = line_families(dataset, found)
         wider = None
         many = len(dataset.blocks.member) > FEW_POSES
-        for chosen in [stand_out] if many else [[family] for family in stand_out[:TRIED]]:
+        # Where none pays by itself, some do together: what one joint's lines do hides another's.
+        some = [[family] for family in stand_out[:TRIED]]
+        some += [stand_out[:n] for n in range(2, min(TRIED, len(stand_out)) + 1)]
+        for chosen in [stand_out] if many else some:
             joint = found.noise.joint.copy()
             for family in chosen:
                 joint[index(family.where)] = family.scatter
@@ -142,15 +145,10 @@ RETURNS, MOST_RETURNED = 4, 6
 
 def _tuned(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
     """The sum with the orders of all its lines where they fit best, each beside the others."""
-    for _ in range(TUNINGS):
-        components = sharpened(dataset, found)
-        if all(new is old for new, old in zip(components, found.components, strict=True)):
-            break
-        fitted = fit_sum(data, components, found.noise, found.sizes, refit_noise=False)
-        if fitted.score <= found.score:
-            break
-        found = fitted
-    return found
+    components = sharpened(dataset, found)
+    if components is None:
+        return found
+    return fit_sum(data, components, found.noise, found.sizes, refit_noise=False)
 
 
 def _multiplied(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
@@ -163,9 +161,6 @@ def _multiplied(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
                 found, changed = fitted, True
                 break
     return _tuned(dataset, data, found) if changed else found
-
-
-TUNINGS = 3
 
 
 def _spared(data: NoisyData, found: FittedSum) -> FittedSum:

@@ -45,10 +45,10 @@ Family = Literal[
     "angle", "gravity", "torque", "load", "move", "time", "temperature", "pose", "tool"
 ]  # fmt: skip
 
-# Prior probability that a component is there, worth FELLOWS components seen; the logarithms of
-# sizes, of typical ones, spread by SPREAD, of which ALONE is each component's own and the rest that
-# of its kind.  Afterwards a size is known to about a third of itself, a length likewise.
-PRESENT, FELLOWS = 0.2, 2.0
+# Prior probability that a kind of component is there.  The logarithms of sizes, of typical ones,
+# spread by SPREAD, of which ALONE is each component's own and the rest that of its kind.
+# Afterwards a size is known to about a third of itself, a length likewise.
+PRESENT = 0.2
 SPREAD, ALONE, AFTERWARDS = 1.5, 1.0, 0.3
 COMMON = float(np.sqrt(SPREAD**2 - ALONE**2))
 # Below GONE, the log of a size in typical sizes, a component is as good as absent.
@@ -136,10 +136,10 @@ class Sizes:
 class Pool:
     """The prior of which components are there, and of the logarithms of their sizes.
 
-    A kind has n places, the k-th family of lines of a joint as one of the k-th ones.  The share of
-    them at which it is present has a beta prior of mean PRESENT, so that k of them cost
-    log B(a, n + b) / B(k + a, n − k + b), a and b of sum FELLOWS.  Sizes of a kind have the
-    covariance ALONE² I + COMMON² 11ᵀ.
+    A kind has n places, the k-th family of lines of a joint as one of the k-th ones.  It is there
+    with probability PRESENT, then at any number of them with equal probability, and at any k of
+    them (Scott and Berger 2010, Annals of Statistics 38, 2587): k cost log (1/PRESENT − 1) n (n
+    over k) nats.  Sizes of a kind have the covariance ALONE² I + COMMON² 11ᵀ.
     """
 
     def __init__(self, components: Sequence[Component]) -> None:
@@ -201,8 +201,10 @@ def _cost(n: int, k: int) -> float:
 
 def presence_cost(n: int, k: int) -> float:
     """Nats of k components of a kind being there at n places, over none."""
-    a, b = FELLOWS * PRESENT, FELLOWS * (1 - PRESENT)
-    return float(special.betaln(a, n + b) - special.betaln(k + a, n - k + b))
+    if k == 0:
+        return 0.0
+    ways = special.gammaln(n + 1) - special.gammaln(k + 1) - special.gammaln(n - k + 1)
+    return float(np.log((1 / PRESENT - 1) * n) + ways)
 
 
 def log_odds(components: Sequence[Component], another: Component) -> float:
