@@ -13,18 +13,18 @@ from elastocal.diagnosis.component_families import (
     family_of,
     fields,
     joint_curves,
-    judged_together,
     line_families,
     tuned_family,
 )
 from elastocal.diagnosis.components import COST, PRESENT, Component, FittedSum, fit_sum
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import ANOTHER, Grams, Prior, direct
-from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.model_set import ModelSet, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearSpectrum
+from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
 from elastocal.units import Progress
 
 # Searches for more beside what has been found.
@@ -43,7 +43,8 @@ def search_components(
     data = with_equal_noise(full)
     instrument = chosen.noise.of_instrument() if data.stated else _started(data)
     curves = list(joint_curves(full))
-    others = [*catalogue_components(full), *_searched(full, chosen)]
+    every = [*catalogue_components(full), *_searched(full, chosen)]
+    others = _first(every)
     progress(f"sizes of {len(curves) + len(others)} components at once")
     both = [*curves, *others]
     found = _swapped(full, data, fit_sum(data, both, instrument), both)
@@ -61,9 +62,9 @@ def search_components(
         progress("families of lines beside the components")
         found = _with_lines(full, data, found)
     progress("what shows now that the noise is smaller")
-    again = with_returned(data, found, others)
+    again = with_returned(data, found, every)
     if again is not found and len(full.blocks.member) <= FEW_POSES:
-        again = with_returned(data, _with_lines(full, data, again), others)
+        again = with_returned(data, _with_lines(full, data, again), every)
     found = again
     for _ in range(FIELD_SEARCHES):
         progress("fields beside the components")
@@ -74,6 +75,13 @@ def search_components(
         found = wider
     progress("what can be left out")
     return full, _spared(data, found)
+
+
+def _first(components: Sequence[Component]) -> list[Component]:
+    """Those that are judged from the start: each joint's sag by itself only where the weights of
+    all links are not one component, and else if these leave something to it."""
+    shared = any(isinstance(c.effect, LinkWeights) for c in components)
+    return [c for c in components if not (shared and isinstance(c.effect, GravitySag))]
 
 
 def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
@@ -260,15 +268,10 @@ def _swapped(
 
 
 def _with_together(dataset: DiagnosisData) -> DiagnosisData:
-    """The data with the columns of effects that are judged in the sum alone."""
+    """The data with the effects that are judged in the sum alone, whose columns they have."""
     base = dataset.base
     more = judged_together(base.model, base.observed.table)
-    if not more:
-        return dataset
-    if all(h.driven for h in more):  # by entries that the data have; nothing to evaluate anew
-        return dataset.changed(hypotheses=(*dataset.hypotheses, *more))
-    full = diagnosis_data_of(base, [*dataset.hypotheses, *more])
-    return full.without(dataset.data.faulty)
+    return dataset.changed(hypotheses=(*dataset.hypotheses, *more)) if more else dataset
 
 
 def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:

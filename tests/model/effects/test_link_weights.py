@@ -71,9 +71,7 @@ def test_they_are_as_large_as_a_rod_of_the_density_that_the_cell_states() -> Non
     settings = {"arm": {"weights_kg_per_m": 8.0}}
     cell = kr270_cell(["link_weights"], nominal=Nominal(settings=settings))
     found = Model.assembled(stick("yy", (1.0, 0.5)), cell).parameters
-    assert [(p.name, p.unit, p.shrunk) for p in found[:1]] == [
-        ("arm.link1_moment_x", "kg*m", True)
-    ]
+    assert [(p.name, p.unit, p.shrunk) for p in found[:1]] == [("arm.link1_moment_x", "kg*m", True)]
     assert [p.typical for p in found] == pytest.approx([4.0 * 1.6**2] * 2 + [4.0 * 0.6**2] * 2)
 
 
