@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.component_families import (
     FEW_POSES,
     catalogue_components,
@@ -18,9 +19,10 @@ from elastocal.diagnosis.component_families import (
 )
 from elastocal.diagnosis.components import COST, PRESENT, Component, FittedSum, fit_sum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, Grams, Prior, direct
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
-from elastocal.diagnosis.model_set import ModelSet, packed_columns
+from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearSpectrum
@@ -40,14 +42,20 @@ def search_components(
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
     full = _with_together(dataset)
-    data = with_equal_noise(full)
-    instrument = chosen.noise.of_instrument() if data.stated else _started(data)
-    curves = list(joint_curves(full))
-    every = [*catalogue_components(full), *_searched(full, chosen)]
-    others = _first(every)
-    progress(f"sizes of {len(curves) + len(others)} components at once")
-    both = [*curves, *others]
-    found = _swapped(full, data, fit_sum(data, both, instrument), both)
+    for about_weights in (False, True):
+        data = with_equal_noise(full)
+        instrument = chosen.noise.of_instrument() if data.stated else _started(data)
+        curves = list(joint_curves(full))
+        every = [*catalogue_components(full), *_searched(full, chosen)]
+        others = _first(every)
+        progress(f"sizes of {len(curves) + len(others)} components at once")
+        both = [*curves, *others]
+        found = _swapped(full, data, fit_sum(data, both, instrument), both)
+        weights = [c for c in found.components if isinstance(c.effect, LinkWeights)]
+        if about_weights or not weights:
+            break
+        # A compliance that was fitted without weights is wrong, and so are their columns by it.
+        full = _about(full, weights)
     lined = False
     if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
@@ -75,6 +83,16 @@ def search_components(
         found = wider
     progress("what can be left out")
     return full, _spared(data, found)
+
+
+def _about(dataset: DiagnosisData, components: Sequence[Component]) -> DiagnosisData:
+    """The data about a fit of the model with the effects of these components in it."""
+    added = [c.hypothesis for c in components if c.hypothesis is not None]
+    base = dataset.base
+    model = extended(base.model, [Item(h, np.zeros(0), 0.0) for h in added])
+    start = dict(zip(base.model.names, base.x, strict=True))
+    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
+    return about(dataset, fit_baseline(model, base.observed.table, x0=x0), added)
 
 
 def _first(components: Sequence[Component]) -> list[Component]:
