@@ -16,12 +16,10 @@ from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Constants, Hypothesis, RegressorDirection, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.diagnosis.unknown import Generic
-from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
 from elastocal.model.effects.driven import DrivenEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
-from elastocal.model.manipulator import Model
 from elastocal.units import Array, IntArray
 
 # Lengths in rad of a joint's curve that are tried; what the poses do not resolve is left to lines.
@@ -113,23 +111,6 @@ def drifts(dataset: DiagnosisData) -> Iterator[Component]:
     places = effect.places(model.chain, model.cell)
     if recorded(dataset.table, "time") and time is not None and np.ptp(time) > 0:
         yield from (_field_component(dataset, effect, w, "time") for w in places if w == "base")
-
-
-def judged_together(model: Model, table: object) -> list[Hypothesis]:
-    """Effects that are judged in the sum alone, but for the smooth ones, which have their own
-    searches, at every place where the table can test them."""
-    chain, cell = model.chain, model.cell
-    active = {(p.effect, p.where) for p in model.parameters}
-    return [
-        Hypothesis(effect, where, parameters, ())
-        for effect in CATALOGUE.values()
-        if effect.together
-        and not isinstance(effect, JointCurve | ResidualField | GearSpectrum)
-        and all(recorded(table, need) for need in effect.needed(cell))  # type: ignore[arg-type]
-        for where in effect.places(chain, cell)
-        if (effect.name, where) not in active
-        and (parameters := effect.parameters(where, chain, cell))
-    ]
 
 
 # What is looked for beside those: families of lines of a joint's error, and smooth fields.

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.component_families import (
     FEW_POSES,
     catalogue_components,
@@ -15,7 +16,6 @@ from elastocal.diagnosis.component_families import (
     family_of,
     fields,
     joint_curves,
-    judged_together,
     line_families,
     sharpened,
     with_multiples,
@@ -28,12 +28,14 @@ from elastocal.diagnosis.components import (
     log_odds,
     presence_cost,
 )
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, Grams, Prior, direct
-from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import ModelSet, packed_columns
+from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
+from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.model.effects.base import index
+from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Progress
 
@@ -50,13 +52,20 @@ def search_components(
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
     full = _with_together(dataset)
-    data = with_equal_noise(full)
-    instrument = chosen.noise.of_instrument() if data.stated else _started(data)
-    curves = list(joint_curves(full))
-    others = [*drifts(full), *catalogue_components(full), *_searched(full, chosen)]
-    progress(f"sizes of {len(curves) + len(others)} components at once")
-    both = [*curves, *others]
-    found = _swapped(full, data, fit_sum(data, both, instrument), both)
+    for about_weights in (False, True):
+        data = with_equal_noise(full)
+        instrument = chosen.noise.of_instrument() if data.stated else _started(data)
+        curves = list(joint_curves(full))
+        every = [*drifts(full), *catalogue_components(full), *_searched(full, chosen)]
+        others = _first(every)
+        progress(f"sizes of {len(curves) + len(others)} components at once")
+        both = [*curves, *others]
+        found = _swapped(full, data, fit_sum(data, both, instrument), both)
+        weights = [c for c in found.components if isinstance(c.effect, LinkWeights)]
+        if about_weights or not weights:
+            break
+        # A compliance that was fitted without weights is wrong, and so are their columns by it.
+        full = _about(full, weights)
     lined = False
     if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
@@ -76,9 +85,9 @@ def search_components(
         progress("families of lines beside the components")
         found = _with_lines(full, data, found)
     progress("what shows now that the noise is smaller")
-    again = with_returned(data, found, others)
+    again = with_returned(data, found, every)
     if again is not found and len(full.blocks.member) <= FEW_POSES:
-        again = with_returned(data, _with_lines(full, data, again), others)
+        again = with_returned(data, _with_lines(full, data, again), every)
     found = again
     for _ in range(FIELD_SEARCHES):
         progress("fields beside the components")
@@ -89,6 +98,23 @@ def search_components(
         found = wider
     progress("what can be left out")
     return full, _spared(data, found)
+
+
+def _about(dataset: DiagnosisData, components: Sequence[Component]) -> DiagnosisData:
+    """The data about a fit of the model with the effects of these components in it."""
+    added = [c.hypothesis for c in components if c.hypothesis is not None]
+    base = dataset.base
+    model = extended(base.model, [Item(h, np.zeros(0), 0.0) for h in added])
+    start = dict(zip(base.model.names, base.x, strict=True))
+    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
+    return about(dataset, fit_baseline(model, base.observed.table, x0=x0), added)
+
+
+def _first(components: Sequence[Component]) -> list[Component]:
+    """Those that are judged from the start: each joint's sag by itself only where the weights of
+    all links are not one component, and else if these leave something to it."""
+    shared = any(isinstance(c.effect, LinkWeights) for c in components)
+    return [c for c in components if not (shared and isinstance(c.effect, GravitySag))]
 
 
 def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
@@ -322,15 +348,10 @@ COMPLETED = 3
 
 
 def _with_together(dataset: DiagnosisData) -> DiagnosisData:
-    """The data with the columns of effects that are judged in the sum alone."""
+    """The data with the effects that are judged in the sum alone, whose columns they have."""
     base = dataset.base
     more = judged_together(base.model, base.observed.table)
-    if not more:
-        return dataset
-    if all(h.driven for h in more):  # by entries that the data have; nothing to evaluate anew
-        return dataset.changed(hypotheses=(*dataset.hypotheses, *more))
-    full = diagnosis_data_of(base, [*dataset.hypotheses, *more])
-    return full.without(dataset.data.faulty)
+    return dataset.changed(hypotheses=(*dataset.hypotheses, *more)) if more else dataset
 
 
 def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:
