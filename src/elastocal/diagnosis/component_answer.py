@@ -26,6 +26,7 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, left_out_residual, rms_with_interval
 from elastocal.identification.findings import BudgetStep
@@ -45,15 +46,37 @@ LARGE = 0.1  # share of the gap from which what has no name leaves the verdict o
 
 @dataclass(frozen=True)
 class SumAnswer:
-    """The pieces of a diagnosis that a sum of components fills."""
+    """The pieces of a diagnosis that a sum of components fills.
 
+    `before` has the columns of the cell's own parameters, `dataset` those beside the weights of
+    links where the sum has them.  `hidden` may be there as well: shares and intervals, not names,
+    count with them.
+    """
+
+    before: DiagnosisData
     dataset: DiagnosisData
     found: FittedSum
+    hidden: tuple[Component, ...]
     rng: np.random.Generator
 
     @cached_property
     def at(self) -> Projection:
-        return project(self.found.data, self.found.noise)
+        return project(self._wide, self.found.noise)
+
+    @cached_property
+    def _wide(self) -> NoisyData:
+        """The data of the sum with the columns of what is hidden last."""
+        data = self.found.data
+        columns = [np.zeros((*data.r.shape, 0)), *(data.masked(c.columns) for c in self.hidden)]
+        extra = np.concatenate(columns, axis=2)
+        return data.with_columns(extra, np.ones(extra.shape[2]))
+
+    @cached_property
+    def _spans(self) -> tuple[slice, ...]:
+        """Of the components' coefficients and the hidden ones', the fitted columns not counted."""
+        every = (*self.found.components, *self.hidden)
+        spans = spans_of(every, self._wide.X.shape[2])
+        return tuple(slice(s.start - self._own, s.stop - self._own) for s in spans)
 
     @cached_property
     def _own(self) -> int:
@@ -75,17 +98,16 @@ class SumAnswer:
         They follow in the directions that the readings determine, not in what rounding leaves of
         parallel axes; what is only uncertain of the load's point is no fitted parameter.
         """
-        data, own = self.found.data, self._own
-        X = data.X[_position_rows(data)]
-        fitted = np.isin(
-            self.dataset.fitted, [p.effect for p in self.dataset.base.model.parameters]
-        )
-        B = X[:, :own][:, fitted]
+        data, before = self.found.data, self.before
+        rows = _position_rows(data)
+        fitted = np.isin(before.fitted, [p.effect for p in before.base.model.parameters])
+        B = before.data.X[rows][:, fitted]
         U, size, _ = linalg.svd(
             B / np.maximum(np.linalg.norm(B, axis=0), 1e-300), full_matrices=False
         )
         Q = U[:, size > DETERMINED * size.max(initial=0.0)]
-        return np.asarray(X[:, own:] - Q @ (Q.T @ X[:, own:]))
+        moved = self._wide.X[rows][:, self._own :]
+        return np.asarray(moved - Q @ (Q.T @ moved))
 
     @cached_property
     def gram(self) -> Array:
@@ -117,17 +139,13 @@ class SumAnswer:
         count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
         return np.asarray((drawn * each).sum(axis=0) / (drawn * count[:, None]).sum(axis=0))
 
-    def _span(self, k: int) -> slice:
-        span = self.found.spans[k]
-        return slice(span.start - self._own, span.stop - self._own)
-
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
         w = self.draws[index := self._index(members)]
         return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
 
     def _index(self, members: Sequence[int]) -> IntArray:
-        return np.concatenate([np.r_[self._span(k)] for k in members])
+        return np.concatenate([np.r_[self._spans[k]] for k in members])
 
     def shares(self, members: Sequence[int]) -> Array:
         """What these components add to the mean square of the whole, over that (draws,): shares
@@ -151,7 +169,7 @@ class SumAnswer:
     @cached_property
     def deleted(self) -> Array:
         """The coefficients (Σ k, PARTS) without one part of the configurations after the other."""
-        data = self.found.data
+        data = self._wide
         all_ = Weighted.of(data, self.found.noise)
         prior = np.diag(all_.prior(data.precision))
         part, out = np.random.default_rng(0).permutation(len(data.r)) % PARTS, []
@@ -164,7 +182,7 @@ class SumAnswer:
 
     @cached_property
     def total(self) -> Array:
-        return self.squares(range(len(self.found.components)))
+        return self.squares(range(len(self._spans)))
 
     # Shares.
 
@@ -178,8 +196,13 @@ class SumAnswer:
         return tuple(sorted(rows, key=lambda row: -row.share))
 
     def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
-        share, rms = self.shares(members), np.sqrt(self.squares(members))
         chosen = [self.found.components[k] for k in members]
+        unseen = [
+            k for k, c in enumerate(self.hidden, start=len(self.found.components))
+            if (c.family, c.where) == (family, where)
+        ]  # fmt: skip
+        everything = [*members, *unseen]
+        share, rms = self.shares(everything), np.sqrt(self.squares(everything))
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
         return ComponentShare(

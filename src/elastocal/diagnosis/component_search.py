@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit
 
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.component_families import (
@@ -46,8 +47,9 @@ MOST_FIELDS = 4  # that one search adds
 
 def search_components(
     dataset: DiagnosisData, chosen: ModelSet, progress: Progress = lambda message: None
-) -> tuple[DiagnosisData, FittedSum]:
-    """The most probable sum beside the fitted parameters, and the data with all its columns.
+) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]]:
+    """The most probable sum beside the fitted parameters, the data with all its columns, and what
+    may be there as well though these data do not show it.
 
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
@@ -97,7 +99,8 @@ def search_components(
             break
         found = wider
     progress("what can be left out")
-    return full, _spared(data, found)
+    found = _spared(data, found)
+    return full, found, hidden_fellows(found, others)
 
 
 def _about(dataset: DiagnosisData, components: Sequence[Component]) -> DiagnosisData:
@@ -187,6 +190,28 @@ def _multiplied(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
                 found, changed = fitted, True
                 break
     return _tuned(dataset, data, found) if changed else found
+
+
+def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:
+    """Causes of kinds that are in the sum, at places where they are not, which may be there all
+    the same: with columns of the size that their fellows have on average.
+
+    What looks like something else that is in the sum, as an eccentricity of joint 2 looks like its
+    sag, has no evidence of its own, and what it may take from the other is uncertain.
+    """
+    at, hidden = project(found.data, found.noise), []
+    for c in components:
+        fellows = [k for k, o in enumerate(found.components) if o.effect.name == c.effect.name]
+        if not fellows or c.fellows < 2 or any(c is other for other in found.components):
+            continue
+        size = float(np.sqrt(np.mean(np.exp(2 * found.sizes.size[fellows]))))
+        evidence = direct(found.data.masked(c.columns), at).evidence(np.array([size]))
+        if expit(float(evidence[0]) + log_odds(found.components, c)) > CHANCE:
+            hidden.append(replace(c, columns=c.columns * size))
+    return tuple(hidden)
+
+
+CHANCE = 0.05  # probability from which what is not shown is reckoned with
 
 
 def _spared(data: NoisyData, found: FittedSum) -> FittedSum:
