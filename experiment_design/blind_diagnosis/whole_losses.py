@@ -4,9 +4,10 @@
     python experiment_design/blind_diagnosis/whole_losses.py FOLDER --seed S
 
 A line per arm: the tool's error over the oracle's; that of an oracle whose columns are those of
-the effects alone that the tool names (sag by moments of each joint's own), with the true orders,
-noise, scatter and priors; and what is left out, by how much each in µm would lower that error
-(root of the fall of the mean square).  Where the first two agree, structure is what is missing.
+the effects alone that the tool names (sag by moments of each joint's own, or by those that all
+joints share), with the true orders, noise, scatter and priors; and what is left out, by how much
+each in µm would lower that error (root of the fall of the mean square).  Where the first two agree,
+structure is what is missing.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ STANDS_FOR = {
     "gear_eccentricity": ("eccentricity",), "gear_spectrum": ("lines",), "gear_ripple": ("lines",),
     "joint_curve": ("eccentricity", "lines"), "gravity_sag": ("sag",), "move_lag": ("move",),
     "hysteresis": ("move",), "base_drift": ("creep",), "residual_field": ("creep",),
+    "link_weights": ("sag",),
 }  # fmt: skip
 SHOWN = 6
 
@@ -44,13 +46,13 @@ def units(sights: Sights) -> dict[Unit, list[Block]]:
                 kind = "eccentricity" if line == "eccentricity" else "lines"
                 out.setdefault((kind, e.where), []).append(next(every))
         elif e.name == WEIGHTS:
-            deviation = next(every).deviation
+            out["sag", "arm"] = [shared := next(every)]
             for j, k in enumerate(world.specimen.true.compliance):
                 here, there = (
                     at.joint[:, :, j, None] * k * at.weighing[:, j][:, None]
                     for at in (sights.at_here, sights.at_there)
                 )
-                own = Block(here, there, deviation, moments(e))
+                own = Block(here, there, shared.deviation, moments(e))
                 out["sag", f"joint{j + 1}"] = [own]
         else:
             kind = "move" if e.name == LAST_MOVE else "creep"
@@ -76,6 +78,12 @@ def losses(sights: Sights, answer: Mapping[str, Any]) -> tuple[float, list[tuple
     out would lower it."""
     every = units(sights)
     chosen = named(answer, every)
+    shared = ("sag", "arm")
+    if shared in chosen:
+        chosen -= {u for u in every if u[0] == "sag" and u != shared}
+        every = {u: b for u, b in every.items() if u[0] != "sag" or u == shared}
+    else:
+        del every[shared]
     left = set(every) - chosen
 
     def error(known: set[Unit]) -> float:

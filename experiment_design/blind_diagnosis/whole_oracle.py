@@ -27,6 +27,7 @@ from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep
 from world import Effect, Visits
 
 Array = NDArray[np.float64]
+SHOWN = 1e-4  # singular value of unit columns, of the largest
 SMALLEST = 1e-10  # of the creep's largest variance: what is below is left out
 
 
@@ -247,7 +248,9 @@ def gap_of(sights: Sights) -> Gap:
     parts = components(world, sights.here, scene)
     moved = np.stack([p.moved.ravel() for p in parts], axis=1)
     X = _fitted(sights)[0]
-    left = moved - X @ np.linalg.lstsq(X, moved, rcond=1e-10)[0]
+    # Axes that are all but parallel in this one arm show nothing: no fit would follow there.
+    X = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+    left = moved - X @ np.linalg.lstsq(X, moved, rcond=SHOWN)[0]
     products = left.T @ left / len(left)
     names = tuple((p.family, p.where) for p in parts)
     return Gap(names, products, float(np.sqrt(products.sum())))

@@ -26,6 +26,7 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, left_out_residual, rms_with_interval
 from elastocal.identification.findings import BudgetStep
@@ -35,6 +36,7 @@ from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
 
 DRAWS, PARTS = 400, 10
+DETERMINED = 1e-4  # of the largest, singular value of columns of unit length
 MOST_POSES = 1500  # that a set of new poses is drawn from
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
@@ -44,15 +46,37 @@ LARGE = 0.1  # share of the gap from which what has no name leaves the verdict o
 
 @dataclass(frozen=True)
 class SumAnswer:
-    """The pieces of a diagnosis that a sum of components fills."""
+    """The pieces of a diagnosis that a sum of components fills.
 
+    `before` has the columns of the cell's own parameters, `dataset` those beside the weights of
+    links where the sum has them.  `hidden` may be there as well: shares and intervals, not names,
+    count with them.
+    """
+
+    before: DiagnosisData
     dataset: DiagnosisData
     found: FittedSum
+    hidden: tuple[Component, ...]
     rng: np.random.Generator
 
     @cached_property
     def at(self) -> Projection:
-        return project(self.found.data, self.found.noise)
+        return project(self._wide, self.found.noise)
+
+    @cached_property
+    def _wide(self) -> NoisyData:
+        """The data of the sum with the columns of what is hidden last."""
+        data = self.found.data
+        columns = [np.zeros((*data.r.shape, 0)), *(data.masked(c.columns) for c in self.hidden)]
+        extra = np.concatenate(columns, axis=2)
+        return data.with_columns(extra, np.ones(extra.shape[2]))
+
+    @cached_property
+    def _spans(self) -> tuple[slice, ...]:
+        """Of the components' coefficients and the hidden ones', the fitted columns not counted."""
+        every = (*self.found.components, *self.hidden)
+        spans = spans_of(every, self._wide.X.shape[2])
+        return tuple(slice(s.start - self._own, s.stop - self._own) for s in spans)
 
     @cached_property
     def _own(self) -> int:
@@ -69,13 +93,21 @@ class SumAnswer:
     @cached_property
     def moved(self) -> Array:
         """C (rows, Σ k) in m: C w is what coefficients w leave of the positions once the fitted
-        parameters have followed them, at equal weights."""
-        data, own = self.found.data, self._own
-        X = data.X[_position_rows(data)]
-        size = np.maximum(np.linalg.norm(X[:, :own], axis=0), 1e-300)
-        Q, R = linalg.qr(X[:, :own] / size, mode="economic")
-        Q = Q[:, np.abs(np.diag(R)) > 1e-9]
-        return np.asarray(X[:, own:] - Q @ (Q.T @ X[:, own:]))
+        parameters have followed them, at equal weights.
+
+        They follow in the directions that the readings determine, not in what rounding leaves of
+        parallel axes; what is only uncertain of the load's point is no fitted parameter.
+        """
+        data, before = self.found.data, self.before
+        rows = _position_rows(data)
+        fitted = np.isin(before.fitted, [p.effect for p in before.base.model.parameters])
+        B = before.data.X[rows][:, fitted]
+        U, size, _ = linalg.svd(
+            B / np.maximum(np.linalg.norm(B, axis=0), 1e-300), full_matrices=False
+        )
+        Q = U[:, size > DETERMINED * size.max(initial=0.0)]
+        moved = self._wide.X[rows][:, self._own :]
+        return np.asarray(moved - Q @ (Q.T @ moved))
 
     @cached_property
     def gram(self) -> Array:
@@ -107,17 +139,13 @@ class SumAnswer:
         count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
         return np.asarray((drawn * each).sum(axis=0) / (drawn * count[:, None]).sum(axis=0))
 
-    def _span(self, k: int) -> slice:
-        span = self.found.spans[k]
-        return slice(span.start - self._own, span.stop - self._own)
-
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
         w = self.draws[index := self._index(members)]
         return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
 
     def _index(self, members: Sequence[int]) -> IntArray:
-        return np.concatenate([np.r_[self._span(k)] for k in members])
+        return np.concatenate([np.r_[self._spans[k]] for k in members])
 
     def shares(self, members: Sequence[int]) -> Array:
         """What these components add to the mean square of the whole, over that (draws,): shares
@@ -141,7 +169,7 @@ class SumAnswer:
     @cached_property
     def deleted(self) -> Array:
         """The coefficients (Σ k, PARTS) without one part of the configurations after the other."""
-        data = self.found.data
+        data = self._wide
         all_ = Weighted.of(data, self.found.noise)
         prior = np.diag(all_.prior(data.precision))
         part, out = np.random.default_rng(0).permutation(len(data.r)) % PARTS, []
@@ -154,7 +182,7 @@ class SumAnswer:
 
     @cached_property
     def total(self) -> Array:
-        return self.squares(range(len(self.found.components)))
+        return self.squares(range(len(self._spans)))
 
     # Shares.
 
@@ -168,8 +196,13 @@ class SumAnswer:
         return tuple(sorted(rows, key=lambda row: -row.share))
 
     def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
-        share, rms = self.shares(members), np.sqrt(self.squares(members))
         chosen = [self.found.components[k] for k in members]
+        unseen = [
+            k for k, c in enumerate(self.hidden, start=len(self.found.components))
+            if (c.family, c.where) == (family, where)
+        ]  # fmt: skip
+        everything = [*members, *unseen]
+        share, rms = self.shares(everything), np.sqrt(self.squares(everything))
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
         return ComponentShare(
@@ -342,9 +375,13 @@ class SumAnswer:
             parameters = tuple(p for k in members for p in self._parameters(k))
             yield FoundEffect(name, where, probability, reduction, ci90, ci95, parameters, settings)
 
+    @cached_property
+    def _present(self) -> Array:
+        return np.asarray(expit(self.found.earned - self.found.costs))
+
     def _there(self, k: int) -> float:
         """Probability that there is anything at a component's place."""
-        return float(expit(self.found.earned[k] - self.found.components[k].cost))
+        return float(self._present[k])
 
     def _probability(self, k: int) -> float:
         there = self._there(k)
@@ -368,7 +405,7 @@ class SumAnswer:
             elif isinstance(c.effect, JointCurve):
                 settings |= {"curve_size_rad": size, "curve_length_rad": length}
             elif c.effect.sized_by:
-                settings[c.effect.sized_by] = size * self._typical(c)
+                settings[c.effect.sized_by] = size * self._stated(c)
         families = [k for k in members if isinstance(self.found.components[k].effect, GearSpectrum)]
         lines = [line for k in families for line in self._lines(k)]
         if lines:
@@ -380,10 +417,13 @@ class SumAnswer:
                 settings |= {f"order_{n}": order, f"order_sd_{n}": sd}
         return settings
 
-    def _typical(self, c: Component) -> float:
-        """Typical size of the parameters of an effect that one setting sizes."""
-        assert c.hypothesis is not None
-        return float(np.max([p.typical or 0.0 for p in c.hypothesis.parameters]))
+    def _stated(self, c: Component) -> float:
+        """Of an effect that one setting sizes its value where the columns are of typical size."""
+        model = self.dataset.base.model
+        settings = c.effect.settings(c.where, model.chain, model.cell)
+        default = next(s.default for s in settings if s.key == c.effect.sized_by)
+        given = model.cell.model.nominal.settings.get(c.where, {})
+        return float(given.get(c.effect.sized_by, default))  # type: ignore[arg-type]
 
     def _lines(self, k: int) -> list[tuple[float, float, float]]:
         """Order, its standard deviation and prior size in rad of each line of a family."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,13 +16,11 @@ from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Constants, Hypothesis, RegressorDirection, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.diagnosis.unknown import Generic
-from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
 from elastocal.model.effects.driven import DrivenEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
-from elastocal.model.manipulator import Model
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 # Lengths in rad of a joint's curve that are tried; what the poses do not resolve is left to lines.
 SHORTEST, LONGEST = 0.06, 3.0
@@ -67,8 +66,9 @@ def driven_columns(
 def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
     """An error of every joint against its own angle."""
     effect, model = JointCurve(), dataset.base.model
+    joints = turning_joints(model.chain)
     n = len(dataset.blocks.member)
-    for where in turning_joints(model.chain):
+    for where in joints:
         if (effect.name, where) in {(p.effect, p.where) for p in model.parameters}:
             continue
         q = dataset.table.q[:, index(where)]
@@ -85,12 +85,14 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
             "angle", effect, where, driven_columns(dataset, effect, where, tried) * CURVE, CURVE,
             waves=effect.course(where, constants.chain, constants.cell).waves,
             lengths=(math.log(shortest), math.log(longest)), settings=tuple(measured.items()),
+            fellows=len(joints),
         )  # fmt: skip
 
 
 def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
     """Every hypothesis whose columns need no search."""
     cell = dataset.base.model.cell
+    places = Counter(h.effect.name for h in dataset.hypotheses)
     for h in dataset.hypotheses:
         if h.settings:
             continue
@@ -98,25 +100,17 @@ def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
         if np.abs(columns).max(initial=0.0) > 0:
             search = -dataset.columns.shares.get(h.key, 0.0)
             yield Component(
-                family_of(h.effect, cell), h.effect, h.where, columns, hypothesis=h, search=search
-            )
+                family_of(h.effect, cell), h.effect, h.where, columns, hypothesis=h, search=search,
+                fellows=places[h.effect.name],
+            )  # fmt: skip
 
 
-def judged_together(model: Model, table: object) -> list[Hypothesis]:
-    """Effects that are judged in the sum alone, but for the smooth ones, which have their own
-    searches, at every place where the table can test them."""
-    chain, cell = model.chain, model.cell
-    active = {(p.effect, p.where) for p in model.parameters}
-    return [
-        Hypothesis(effect, where, parameters, ())
-        for effect in CATALOGUE.values()
-        if effect.together
-        and not isinstance(effect, JointCurve | ResidualField | GearSpectrum)
-        and all(recorded(table, need) for need in effect.needed(cell))  # type: ignore[arg-type]
-        for where in effect.places(chain, cell)
-        if (effect.name, where) not in active
-        and (parameters := effect.parameters(where, chain, cell))
-    ]
+def drifts(dataset: DiagnosisData) -> Iterator[Component]:
+    """A smooth motion of the base in the course of the campaign, where times are recorded."""
+    effect, model, time = ResidualField(), dataset.base.model, dataset.table.time
+    places = effect.places(model.chain, model.cell)
+    if recorded(dataset.table, "time") and time is not None and np.ptp(time) > 0:
+        yield from (_field_component(dataset, effect, w, "time") for w in places if w == "base")
 
 
 # What is looked for beside those: families of lines of a joint's error, and smooth fields.
@@ -178,16 +172,30 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
             continue
         tried = [_best(dataset, beside, h, 0.0, float(found.noise.joint[i]), ())]
         curves = tuple(c for c in own if isinstance(c.effect, JointCurve))
-        joint = found.noise.joint.copy()
-        joint[i] = min(joint[i], NoiseValues.usual(len(joint)).joint[i])
-        if curves or joint[i] < found.noise.joint[i]:
+        for scatter in _less(found.noise, i) or ([found.noise.joint[i]] if curves else []):
+            joint = found.noise.joint.copy()
+            joint[i] = scatter
             noise, data = replace(found.noise, joint=joint), found.without_these(curves)
             grams = _grams(dataset, data, noise)
-            tried.append(_best(dataset, grams, h, grams.at.marginal - now, joint[i], curves))
+            tried.append(_best(dataset, grams, h, grams.at.marginal - now, scatter, curves))
         best = max(tried, key=lambda family: family.gain)
-        if best.gain > 0:
+        if best.gain > HOPELESS:
             out.append(best.placed(_family_component(dataset, best)))
     return sorted(out, key=lambda family: -family.gain)
+
+
+# A family that is this far (nats) from paying for its search beside the sum as it is may still pay
+# once noise, sizes and the other orders have followed.
+HOPELESS = -3.0
+
+
+def _less(noise: NoiseValues, i: int) -> list[float]:
+    """Scatter that joint i (0-based) may have once its lines are known: half, and as usual, whether
+    from visit to visit or from pose to pose."""
+    usual = NoiseValues.usual(len(noise.joint))
+    quiet = float(usual.joint[i] * np.hypot(1, usual.shared) / np.hypot(1, noise.shared))
+    now = float(noise.joint[i])
+    return [] if now <= quiet else sorted({max(quiet, now / 2), quiet}, reverse=True)
 
 
 MOST_FOUND = MOST_LINES - 3
@@ -212,27 +220,81 @@ def _best_family(dataset: DiagnosisData, grams: Grams, h: Hypothesis, m: int) ->
     q = dataset.table.q[:, index(h.where)]
     step = STEP / max(float(np.ptp(q)), 1e-3) / m
     orders = np.arange(LOWEST, HIGHEST / m, step)
-    each = _family_evidence(dataset, grams, h, orders, m)
+    # An order of 10 to 20 is as probable as one of 100 to 200 beforehand.
+    log_prior = -np.log(orders) - np.log((1 / orders).sum() * len(MULTIPLES))
+    each = _family_evidence(dataset, grams, h, orders, m) + log_prior
     k = int(np.argmax(each))
-    search = float(np.log(len(orders) * len(MULTIPLES)))
+    search = -float(log_prior[k])
     order, sd, evidence = _refined(dataset, grams, h, float(orders[k]), m, step)
     return LineFamily(h.where, order, m, evidence - search, sd, search)
 
 
-def tuned_family(dataset: DiagnosisData, found: FittedSum, family: Component) -> Component:
-    """The family of lines with its orders sought anew within NEARBY of their deviations."""
-    h = next(
-        h for h in dataset.hypotheses
-        if isinstance(h.effect, GearRipple) and h.where == family.where
-    )  # fmt: skip
-    given = dict(family.settings)
+def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | None:
+    """The components of a sum with the orders of all lines where they fit best together; None
+    where they are there already.
+
+    Gauss–Newton in the orders N of all families at once, sizes and noise as they are: with
+    amplitudes a_k, b_k at their posterior mean, a family's column is
+    Σ_k k (q − q₀)(a_k cos kNq − b_k sin kNq), which is that of the amplitudes' shifts.  The
+    posterior says how well each order is known.
+    """
+    families = [k for k, c in enumerate(found.components) if isinstance(c.effect, GearSpectrum)]
+    if not families:
+        return None
+    now, moved = found, False
+    lines, shifts = zip(*(_lines_and_shifts(found.spans[k]) for k in families), strict=True)
+    kept = np.ones(found.data.X.shape[2], dtype=bool)
+    kept[np.concatenate(shifts)] = False
+    places = [found.components[k].where for k in families]
+    most = STEP / np.array([max(float(np.ptp(dataset.table.q[:, index(w)])), 1e-3) for w in places])
+    best = -np.inf
+    for _ in range(SHARPENINGS):
+        X = now.data.X
+        alone = replace(now.data, X=X[:, :, kept], precision=now.data.precision[kept])
+        at = project(alone, now.noise)
+        if at.marginal < best + SHARP:
+            break
+        best, moved, found = at.marginal, now is not found or moved, now
+        amplitude = np.zeros(len(kept))
+        amplitude[kept] = at.beta
+        sd = [dict(now.components[k].settings)["order_sd_1"] for k in families]
+        turned = [
+            X[:, :, shift] @ amplitude[line] / d
+            for line, shift, d in zip(lines, shifts, sd, strict=True)
+        ]
+        at = project(alone.with_columns(np.stack(turned, axis=2), 1 / most**2), now.noise)
+        steps = np.clip(at.beta[-len(families) :], -most, most)
+        spread = np.linalg.norm(at.beta_deviation[:, -len(families) :], axis=0)
+        components = list(now.components)
+        for k, step, known in zip(families, steps, spread, strict=True):
+            c = components[k]
+            order = dict(c.settings)["order_1"] + float(step)
+            family = LineFamily(c.where, order, c.width // 4, 0.0, float(known), c.search)
+            components[k] = _family_component(dataset, family)
+        now = replace(now, components=tuple(components))
+    return list(found.components) if moved else None
+
+
+SHARPENINGS, SHARP = 6, 0.05  # nats that another step must gain
+
+
+def with_multiples(dataset: DiagnosisData, c: Component) -> list[Component]:
+    """A family of lines with one multiple more, and with one less; none of another component."""
+    if not isinstance(c.effect, GearSpectrum):
+        return []
+    given = dict(c.settings)
     m, order, sd = len(given) // 2, given["order_1"], given["order_sd_1"]
-    grams = _grams(dataset, found.without_these((family,)), found.noise)
-    order, sd, _ = _refined(dataset, grams, h, order, m, NEARBY * sd)
-    return _family_component(dataset, LineFamily(family.where, order, m, 0.0, sd, family.search))
+    return [
+        _family_component(dataset, LineFamily(c.where, order, n, 0.0, sd, c.search))
+        for n in (m + 1, m - 1)
+        if n in MULTIPLES and n * order <= HIGHEST
+    ]
 
 
-NEARBY = 4.0
+def _lines_and_shifts(span: slice) -> tuple[IntArray, IntArray]:
+    """Columns of a family's amplitudes, sine and cosine, and of their shifts after each pair."""
+    columns = np.arange(span.start, span.stop).reshape(-1, 4)
+    return columns[:, :2].ravel(), columns[:, 2:].ravel()
 
 
 def _refined(
@@ -281,7 +343,10 @@ def _family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
     columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
     columns /= np.array([int(p.key.split("_")[1]) for p in parameters])
     kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
-    return Component("angle", effect, where, columns, LINE, settings=kept, search=family.search)
+    return Component(
+        "angle", effect, where, columns, LINE, settings=kept, search=family.search,
+        fellows=len(turning_joints(dataset.base.model.chain)),
+    )  # fmt: skip
 
 
 # Smooth fields.

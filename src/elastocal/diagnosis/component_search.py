@@ -2,59 +2,86 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy import linalg
+from scipy.special import expit
 
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.component_families import (
     FEW_POSES,
     catalogue_components,
+    drifts,
     family_of,
     fields,
     joint_curves,
-    judged_together,
     line_families,
-    tuned_family,
+    sharpened,
+    with_multiples,
 )
-from elastocal.diagnosis.components import COST, PRESENT, Component, FittedSum, crossed, fit_sum
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.components import (
+    Component,
+    FittedSum,
+    Pool,
+    crossed,
+    fit_sum,
+    log_odds,
+    presence_cost,
+)
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, Prior, spectrum
-from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import ModelSet, packed_columns
+from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
+from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.model.effects.base import index
-from elastocal.model.effects.gears import GearSpectrum
+from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
+from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, Progress
 
 # Searches for more beside what has been found.
-LINE_SEARCHES, FIELD_SEARCHES = 16, 3
+LINE_SEARCHES, FIELD_SEARCHES, TWICE = 16, 3, 2
 MOST_FIELDS = 4  # that one search adds
 
 
 def search_components(
     dataset: DiagnosisData, chosen: ModelSet, progress: Progress = lambda message: None
-) -> tuple[DiagnosisData, FittedSum]:
-    """The most probable sum beside the fitted parameters, and the data with all its columns.
+) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]]:
+    """The most probable sum beside the fitted parameters, the data with all its columns, and what
+    may be there as well though these data do not show it.
 
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
     full = _with_together(dataset)
-    data = with_equal_noise(full)
-    instrument = chosen.noise.of_instrument() if data.stated else _started(data)
-    curves = list(joint_curves(full))
-    others = [*catalogue_components(full), *_searched(full, chosen)]
-    progress(f"sizes of {len(curves) + len(others)} components at once")
-    both = [*curves, *others]
-    found = _swapped(full, data, fit_sum(data, both, instrument), both)
+    for about_weights in (False, True):
+        data = with_equal_noise(full)
+        instrument = chosen.noise.of_instrument() if data.stated else _started(data)
+        curves = list(joint_curves(full))
+        every = [*drifts(full), *catalogue_components(full), *_searched(full, chosen)]
+        others = _first(every)
+        progress(f"sizes of {len(curves) + len(others)} components at once")
+        both = [*curves, *others]
+        found = _swapped(full, data, fit_sum(data, both, instrument), both)
+        weights = [c for c in found.components if isinstance(c.effect, LinkWeights)]
+        if about_weights or not weights:
+            break
+        # A compliance that was fitted without weights is wrong, and so are their columns by it.
+        full = _about(full, weights)
     lined = False
     if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
         # none of them stands out.
         progress("families of lines before curves")
         first = _swapped(full, data, fit_sum(data, others, instrument), others)
-        first = _with_lines(full, data, first)
+        first = _spared(data, _completed(data, first, others))
+        for _ in range(TWICE):
+            before = first
+            first = _completed(data, _with_lines(full, data, first), both)
+            if first.score <= before.score + GAINED:
+                break
         other = _wider(data, first, curves) or first
         lined = other.score > found.score
         found = other if lined else found
@@ -62,9 +89,9 @@ def search_components(
         progress("families of lines beside the components")
         found = _with_lines(full, data, found)
     progress("what shows now that the noise is smaller")
-    again = with_returned(data, found, others)
+    again = with_returned(data, found, every)
     if again is not found and len(full.blocks.member) <= FEW_POSES:
-        again = with_returned(data, _with_lines(full, data, again), others)
+        again = with_returned(data, _with_lines(full, data, again), every)
     found = again
     for _ in range(FIELD_SEARCHES):
         progress("fields beside the components")
@@ -74,7 +101,25 @@ def search_components(
             break
         found = wider
     progress("what can be left out")
-    return full, _spared(data, found)
+    found = _spared(data, found)
+    return full, found, hidden_fellows(found, others)
+
+
+def _about(dataset: DiagnosisData, components: Sequence[Component]) -> DiagnosisData:
+    """The data about a fit of the model with the effects of these components in it."""
+    added = [c.hypothesis for c in components if c.hypothesis is not None]
+    base = dataset.base
+    model = extended(base.model, [Item(h, np.zeros(0), 0.0) for h in added])
+    start = dict(zip(base.model.names, base.x, strict=True))
+    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
+    return about(dataset, fit_baseline(model, base.observed.table, x0=x0), added)
+
+
+def _first(components: Sequence[Component]) -> list[Component]:
+    """Those that are judged from the start: each joint's sag by itself only where the weights of
+    all links are not one component, and else if these leave something to it."""
+    shared = any(isinstance(c.effect, LinkWeights) for c in components)
+    return [c for c in components if not (shared and isinstance(c.effect, GravitySag))]
 
 
 def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
@@ -86,7 +131,10 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
         stand_out = line_families(dataset, found)
         wider = None
         many = len(dataset.blocks.member) > FEW_POSES
-        for chosen in [stand_out] if many else [[family] for family in stand_out[:TRIED]]:
+        # Where none pays by itself, some do together: what one joint's lines do hides another's.
+        some = [[family] for family in stand_out[:TRIED]]
+        some += [stand_out[:n] for n in range(2, min(TRIED, len(stand_out)) + 1)]
+        for chosen in [stand_out] if many else some:
             joint = found.noise.joint.copy()
             for family in chosen:
                 joint[index(family.where)] = family.scatter
@@ -101,7 +149,7 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
         if wider is None:
             break
         found = wider if many else _tuned(dataset, data, wider)
-    return found
+    return found if many else _multiplied(dataset, data, found)
 
 
 def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
@@ -111,9 +159,9 @@ def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Compon
         away = [c for c in components if id(c) not in taken]
         beside = Beside(found, [c.columns for c in away])
         each = beside.evidence(slice(0, 0), beside.spans)
-        evidence = [own - c.cost + COST for own, c in zip(each, away, strict=True)]
+        evidence = [e + log_odds(found.components, c) for e, c in zip(each, away, strict=True)]
         order = np.argsort(evidence)[::-1][:MOST_RETURNED]
-        wider = _wider(data, found, [away[k] for k in order if evidence[k] > WORTH])
+        wider = _wider(data, found, [away[k] for k in order if evidence[k] > 0])
         if wider is None:
             break
         found = wider
@@ -121,32 +169,57 @@ def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Compon
 
 
 RETURNS, MOST_RETURNED = 4, 6
-WORTH = float(np.log(1 / PRESENT - 1))  # log evidence, sizes mixed, that outweighs the prior odds
 
 
 def _tuned(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
-    """The sum with the orders of its lines sought anew, close by, beside what else is in it now."""
+    """The sum with the orders of all its lines where they fit best, each beside the others."""
+    components = sharpened(dataset, found)
+    if components is None:
+        return found
+    return fit_sum(data, components, found.noise, found.sizes, refit_noise=False)
+
+
+def _multiplied(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum with one multiple more or less of every family of lines where that is better."""
+    changed = False
     for c in found.components:
-        if not isinstance(c.effect, GearSpectrum):
-            continue
-        near = tuned_family(dataset, found, c)
-        if abs(near.settings[0][1] - c.settings[0][1]) < TUNED * c.settings[1][1]:
-            continue
-        start = found.sizes
-        tuned = [near if other is c else other for other in found.components]
-        fitted = fit_sum(data, tuned, found.noise, start, refit_noise=False)
-        if fitted.score > found.score:
-            found = fitted
-    return found
+        for other in with_multiples(dataset, c):
+            fitted = _exchanged(data, found, [c], [other], refit_noise=False)
+            if fitted.score > found.score:
+                found, changed = fitted, True
+                break
+    return _tuned(dataset, data, found) if changed else found
 
 
-TUNED = 0.2  # standard deviations of an order that are worth another fit
+def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:
+    """Causes of kinds that are in the sum, at places where they are not, which may be there all
+    the same: with columns of the size that their fellows have on average.
+
+    What looks like something else that is in the sum, as an eccentricity of joint 2 looks like its
+    sag, has no evidence of its own, and what it may take from the other is uncertain.
+    """
+    hidden = []
+    for c in components:
+        fellows = [k for k, o in enumerate(found.components) if o.effect.name == c.effect.name]
+        if not fellows or c.fellows < 2 or any(c is other for other in found.components):
+            continue
+        size = float(np.sqrt(np.mean(np.exp(2 * found.sizes.size[fellows]))))
+        hidden.append(replace(c, columns=c.columns * size))
+    beside = Beside(found, [c.columns for c in hidden])
+    each = beside.evidence(slice(0, 0), beside.spans, np.ones(1))
+    odds = [
+        evidence + log_odds(found.components, c) for evidence, c in zip(each, hidden, strict=True)
+    ]
+    return tuple(c for c, own in zip(hidden, odds, strict=True) if expit(own) > CHANCE)
+
+
+CHANCE = 0.05  # probability from which what is not shown is reckoned with
 
 
 def _spared(data: NoisyData, found: FittedSum) -> FittedSum:
     """The sum without what the others can stand in for, once their sizes have followed."""
     spared = 0
-    order = np.argsort(found.earned - [c.cost for c in found.components])
+    order = np.argsort(found.earned - found.costs)
     for c in [found.components[k] for k in order[:SPARED]]:
         if not any(c is other for other in found.components):
             continue
@@ -188,19 +261,27 @@ def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -
     """Log posterior of a sum under the priors that the forward search's sets have.
 
     Within a sum many causes are expected, so that each costs little; to be believed instead of a
-    few, each has to pay what one more effect of the catalogue pays there, and a line or what has
-    no name what its search costs.
+    few, the first of each kind has to pay what one more effect of the catalogue pays there, and a
+    line or what has no name what its search costs.
     """
     prior = Prior.of(dataset.hypotheses, [], ANOTHER)
     odds = {h.key: float(w) for h, w in zip(dataset.hypotheses, prior.hypotheses, strict=True)}
-    usual = min(odds.values(), default=-COST)
+    usual = min(odds.values(), default=0.0)
     known = {item.key: item.log_prior for item in chosen.items if item.known}
-    score = found.score
-    for c in found.components:
-        price = odds.get(c.hypothesis.key, usual) if c.hypothesis is not None else usual
-        if c.hypothesis is not None and c.settings:
-            price = known.get(c.hypothesis.key, price)
-        score += c.cost - c.search + price
+
+    def price(c: Component) -> float:
+        if c.hypothesis is None:
+            return usual
+        own = odds.get(c.hypothesis.key, usual)
+        return known.get(c.hypothesis.key, own) if c.settings else own
+
+    pool = Pool(found.components)
+    score = found.score + pool.cost - sum(c.search for c in found.components)
+    for n, own in zip(pool.places, pool.kinds, strict=True):
+        for before, k in enumerate(own):
+            fellow = presence_cost(n, before + 1) - presence_cost(n, before)
+            paid = -price(found.components[k])
+            score -= max(min(paid, fellow), 0.0) if before else paid
     return score
 
 
@@ -230,7 +311,7 @@ class Beside:
         precision = np.concatenate([data.precision, 1 / found.variances])
         self.prior = sums.prior(precision)
 
-    def evidence(self, gone: slice, tried: Sequence[slice]) -> list[float]:
+    def evidence(self, gone: slice, tried: Sequence[slice], scales: Array = WIDE) -> list[float]:
         """Of each of the columns `tried`, over none, beside all of the sum but those that are
         `gone`.
 
@@ -252,7 +333,7 @@ class Beside:
             A = self.M[span, span] - own.T @ own
             b = self.z[span] - own.T @ half[:, -1]
             found = spectrum(A[None], b[None], np.zeros((0, 1, k)))
-            out.append(float(found.evidence(WIDE)[0]))
+            out.append(float(found.evidence(scales)[0]))
             start += k
         return out
 
@@ -305,16 +386,46 @@ def _swapped(
     return found
 
 
+def _completed(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
+    """The sum with a kind of cause at all its places, or in the place of another kind, where that
+    is more probable.
+
+    What acts at every joint, a little at each, comes in together or not at all; and a single one of
+    another kind that stands in its place goes with it.
+    """
+    kinds: dict[str, list[Component]] = {}
+    for c in components:
+        if c.fellows > 1 and (not c.settings or isinstance(c.effect, JointCurve)):
+            kinds.setdefault(c.effect.name, []).append(c)
+    for _ in range(COMPLETED):
+        present = Counter(c.effect.name for c in found.components)
+        better = None
+        for name, own in kinds.items():
+            away = [c for c in own if not any(c is other for other in found.components)]
+            if not away:
+                continue
+            for instead in (None, *(n for n in kinds if n != name and present[n])):
+                gone = [c for c in found.components if c.effect.name == instead]
+                alike = {c.family for c in gone} & {c.family for c in own}
+                if (instead is None and not present[name]) or (gone and not alike):
+                    continue
+                fitted = _exchanged(data, found, gone, away, refit_noise=False)
+                if fitted.score > (found if better is None else better).score + GAINED:
+                    better = fitted
+        if better is None:
+            break
+        found = fit_sum(data, better.components, better.noise, better.sizes)
+    return found
+
+
+COMPLETED = 3
+
+
 def _with_together(dataset: DiagnosisData) -> DiagnosisData:
-    """The data with the columns of effects that are judged in the sum alone."""
+    """The data with the effects that are judged in the sum alone, whose columns they have."""
     base = dataset.base
     more = judged_together(base.model, base.observed.table)
-    if not more:
-        return dataset
-    if all(h.driven for h in more):  # by entries that the data have; nothing to evaluate anew
-        return dataset.changed(hypotheses=(*dataset.hypotheses, *more))
-    full = diagnosis_data_of(base, [*dataset.hypotheses, *more])
-    return full.without(dataset.data.faulty)
+    return dataset.changed(hypotheses=(*dataset.hypotheses, *more)) if more else dataset
 
 
 def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:

@@ -11,17 +11,22 @@ dependences without a name.  Sizes s_k, lengths ℓ_k and the noise maximise the
 likelihood (Patterson and Thompson 1971) times a prior that lets most components be absent: each
 one present costs what one more hypothesis costs, and goes where it does not earn it.  At the
 maximum most sizes are zero of themselves (automatic relevance determination, MacKay 1992).
+
+What acts at one joint of an arm mostly acts at the others, and is there of a similar size: of the
+components of one kind, the share that is present and their common size are unknown themselves
+(`Pool`), so that the first costs more than the last.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg, optimize, special
 
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import spans_of
@@ -42,10 +47,12 @@ Family = Literal[
     "angle", "gravity", "torque", "load", "move", "time", "temperature", "pose", "tool"
 ]  # fmt: skip
 
-# Prior probability that a component is there, and what the search for its size costs beside: a
-# size is known beforehand to a factor of e^SPREAD, and afterwards to about a third of itself.
-PRESENT, SPREAD, AFTERWARDS = 0.2, 1.5, 0.3
-COST = float(np.log(1 / PRESENT - 1) + np.log(SPREAD / AFTERWARDS))
+# Prior probability that a kind of component is there.  The logarithms of sizes, of typical ones,
+# spread by SPREAD, of which ALONE is each component's own and the rest that of its kind.
+# Afterwards a size is known to about a third of itself, a length likewise.
+PRESENT = 0.2
+SPREAD, ALONE, AFTERWARDS = 1.5, 1.0, 0.3
+COMMON = float(np.sqrt(SPREAD**2 - ALONE**2))
 # Below GONE, the log of a size in typical sizes, a component is as good as absent.
 GONE, LARGEST = -5.0, 7.0
 
@@ -57,7 +64,7 @@ class Component:
     `waves` are those of a smooth function, whose spectrum its length decides, between the
     logarithms `lengths`; they stand in the columns `repeat` times, once for each component of the
     motion.  `settings` are constants of the effect by key, `search` what finding them cost in nats;
-    `follows` is what a field depends on.
+    `follows` is what a field depends on; `fellows` at how many places there may be one of its kind.
     """
 
     family: Family
@@ -72,6 +79,7 @@ class Component:
     settings: tuple[tuple[str, float], ...] = ()
     hypothesis: Hypothesis | None = None
     search: float = 0.0
+    fellows: int = 1
 
     @property
     def label(self) -> str:
@@ -87,12 +95,10 @@ class Component:
         return self.columns.shape[2]
 
     @property
-    def cost(self) -> float:
-        """Nats that it has to earn: its prior odds, and the search for its size and length."""
+    def sought(self) -> float:
+        """Nats that the search for it, and for its length, cost."""
         low, high = self.lengths
-        return (
-            COST + self.search + (float(np.log((high - low) / AFTERWARDS)) if high > low else 0.0)
-        )
+        return self.search + (float(np.log((high - low) / AFTERWARDS)) if high > low else 0.0)
 
     def shares(self, log_length: float) -> tuple[Array, Array]:
         """Prior variances (k,) at size 1, and the slope of their logarithms in log ℓ."""
@@ -129,6 +135,90 @@ class Sizes:
         )
 
 
+class Pool:
+    """The prior of which components are there, and of the logarithms of their sizes.
+
+    A kind has n places, the k-th family of lines of a joint as one of the k-th ones.  It is there
+    with probability PRESENT, then at any number of them with equal probability, and at any k of
+    them (Scott and Berger 2010, Annals of Statistics 38, 2587): k cost log (1/PRESENT − 1) n (n
+    over k) nats.  Sizes of a kind have the covariance ALONE² I + COMMON² 11ᵀ.
+    """
+
+    def __init__(self, components: Sequence[Component]) -> None:
+        ranks: Counter[tuple[str, str, str]] = Counter()
+        kinds: dict[tuple[str, str, int], list[int]] = {}
+        for k, c in enumerate(components):
+            place = (c.effect.name, c.follows, c.where)
+            kinds.setdefault((*place[:2], ranks[place]), []).append(k)
+            ranks[place] += 1
+        self.kinds = tuple(np.array(own) for own in kinds.values())
+        self.places = tuple(
+            max(len(own), max(components[k].fellows for k in own)) for own in self.kinds
+        )
+        self.sought = np.array([c.sought for c in components])
+        self.precision = np.zeros((len(components), len(components)))
+        for own in self.kinds:
+            whole = ALONE**2 * np.eye(len(own)) + COMMON**2
+            self.precision[np.ix_(own, own)] = np.linalg.inv(whole)
+
+    @property
+    def cost(self) -> float:
+        """Nats that all of them have to earn."""
+        return float(self.sought.sum()) + sum(
+            _cost(n, len(own)) for n, own in zip(self.places, self.kinds, strict=True)
+        )
+
+    @cached_property
+    def costs(self) -> Array:
+        """Nats (K,) that each has to earn, the others there."""
+        out = self.sought.copy()
+        for n, own in zip(self.places, self.kinds, strict=True):
+            out[own] += _cost(n, len(own)) - _cost(n, len(own) - 1)
+        return out
+
+    def costs_of(self, earned: Array) -> Array:
+        """The same; where a kind as a whole does not earn its cost (K,), its mean for each."""
+        out = self.costs.copy()
+        for n, own in zip(self.places, self.kinds, strict=True):
+            whole = _cost(n, len(own))
+            if (earned - self.sought)[own].sum() < whole:
+                out[own] = np.maximum(out[own], whole / len(own) + self.sought[own])
+        return out
+
+    def penalty(self, sizes: Array) -> tuple[float, Array]:
+        """−2 log prior of the logarithms (K,) of sizes, and its slope."""
+        slope = self.precision @ sizes
+        return float(sizes @ slope), 2 * slope
+
+    def penalties(self, sizes: Array) -> Array:
+        """By how much (K,) −log prior falls where a component is left out."""
+        return np.asarray((self.precision @ sizes) ** 2 / np.diag(self.precision) / 2)
+
+
+def _cost(n: int, k: int) -> float:
+    """Nats of k components at n places, and of the search for their sizes."""
+    log_det = 2 * k * np.log(ALONE / AFTERWARDS) + np.log(1 + k * (COMMON / ALONE) ** 2)
+    return presence_cost(n, k) + float(log_det) / 2
+
+
+def presence_cost(n: int, k: int) -> float:
+    """Nats of k components of a kind being there at n places, over none."""
+    if k == 0:
+        return 0.0
+    ways = special.gammaln(n + 1) - special.gammaln(k + 1) - special.gammaln(n - k + 1)
+    return float(np.log((1 / PRESENT - 1) * n) + ways)
+
+
+def log_odds(components: Sequence[Component], another: Component) -> float:
+    """Prior log odds that another component is there beside these, less what its search cost."""
+    pool = Pool([*components, another])
+    (k, n), *_ = [
+        (len(own), n) for n, own in zip(pool.places, pool.kinds, strict=True)
+        if len(components) in own
+    ]  # fmt: skip
+    return presence_cost(n, k - 1) - presence_cost(n, k) - another.sought
+
+
 @dataclass(frozen=True)
 class SumOfComponents:
     """Components beside fitted columns, under a noise whose factor is free: −2ℓ and its slope.
@@ -158,6 +248,10 @@ class SumOfComponents:
         alone = w.alone - self.squares + self.squares / a**2 + 2 * self.rows * factor
         weighted = Weighted(w.root / a, w.X / a, w.r / a, w.M / a**2, w.z / a**2, alone)
         return replace(self, weighted=weighted, noise=_scaled(self.noise, factor))
+
+    @cached_property
+    def pool(self) -> Pool:
+        return Pool(self.components)
 
     def variances(self, at: Sizes) -> Array:
         """Prior variances of all coefficients (p + Σ k,)."""
@@ -192,10 +286,12 @@ class SumOfComponents:
         each = (1 - left) - b**2  # ∂(−2ℓ)/∂ log v
         slope = np.zeros_like(theta)
         for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
-            slope[1 + k] = 2 * each[span].sum() + 2 * at.size[k] / SPREAD**2
+            slope[1 + k] = 2 * each[span].sum()
             if c.waves is not None:
                 slope[1 + K + k] = each[span] @ c.shares(at.length[k])[1]
-        value += float((at.size**2).sum()) / SPREAD**2
+        prior, of_sizes = self.pool.penalty(at.size)
+        value += prior
+        slope[1 : K + 1] += of_sizes
         beta = root * b
         a2 = np.exp(2 * at.factor)
         M = self.weighted.M
@@ -295,8 +391,9 @@ def crossed(
 class FittedSum:
     """The components that are left, their sizes, the noise beside them and the log posterior.
 
-    `earned` (K,) nats of each; `sums` are those over the rows of `plain`, the data without their
-    columns, `variances` (Σ k,) their coefficients' prior.
+    `earned` (K,) nats of each, `costs` (K,) what it has to earn, the others there; `sums` are those
+    over the rows of `plain`, the data without their columns, `variances` (Σ k,) their coefficients'
+    prior.
     """
 
     components: tuple[Component, ...]
@@ -321,10 +418,14 @@ class FittedSum:
         return tuple(
             _compressed(
                 plain.masked(c.columns), self.variances[span.start - first : span.stop - first],
-                plain, self.noise, HARDLY,
+                self.sums.weighted.root, HARDLY,
             )
             for c, span in zip(self.components, self.spans, strict=True)
         )  # fmt: skip
+
+    @property
+    def costs(self) -> Array:
+        return Pool(self.components).costs
 
     @property
     def spans(self) -> tuple[slice, ...]:
@@ -375,8 +476,7 @@ def fit_sum(
         problem = posed(data, components, noise)
     variances = problem.variances(at)
     value = problem.factored(at)[3]
-    prior = -float((at.size**2).sum()) / 2 / SPREAD**2
-    score = -value / 2 + prior - sum(c.cost for c in components)
+    score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
     score -= 0.5 * log_prior(data.stated, noise)[0]
     return FittedSum(
         tuple(components), at, noise, problem.earned(at), score, data, problem,
@@ -388,17 +488,14 @@ def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     """Components that stay: not the worst of those that do not earn their cost, nor those that are
     next to nothing; only these go where not `strict`, since under a noise that does not suit them
     the others may earn too little."""
-    costs = np.array([c.cost for c in problem.components])
-    earned = problem.earned(at) - (at.size**2) / 2 / SPREAD**2
-    if not strict:
-        costs = np.full(len(costs), MOST_AT_ONCE)
-    poor = np.flatnonzero(earned < costs)
-    if not len(poor):
-        return list(range(len(costs)))
-    worst = poor[np.argmin(earned[poor] - costs[poor])]
-    gone = (at.size < GONE) | ((earned < MOST_AT_ONCE) & (earned < costs))
-    gone[worst] = True
-    return [k for k in range(len(costs)) if not gone[k]]
+    earned = problem.earned(at) - problem.pool.penalties(at.size)
+    spare = earned - (problem.pool.costs_of(earned) if strict else MOST_AT_ONCE)
+    poor = spare < 0
+    if not poor.any():
+        return list(range(len(spare)))
+    gone = (at.size < GONE) | ((earned < MOST_AT_ONCE) & poor)
+    gone[np.argmin(spare)] = True
+    return [k for k in range(len(spare)) if not gone[k]]
 
 
 def _narrowed(problem: SumOfComponents, kept: list[int]) -> dict:
@@ -421,10 +518,9 @@ def _noise_beside(
 ) -> NoiseValues:
     """The most probable noise beside the components at their sizes, from SOME configurations."""
     some = data.every(step) if (step := max(1, len(data.r) // SOME)) > 1 else data
+    root = Weighted.of(some, noise).root
     columns = [
-        _compressed(
-            some.masked(c.columns[::step]), np.exp(2 * s) * c.shares(length)[0], some, noise
-        )
+        _compressed(some.masked(c.columns[::step]), np.exp(2 * s) * c.shares(length)[0], root)
         for c, s, length in zip(components, at.size, at.length, strict=True)
     ]
     joined = _joined(some, columns)
@@ -444,13 +540,10 @@ STANDS_OUT = 2.0  # times its usual scatter: a joint that the data show
 FAINT, HARDLY = 1e-2, 1e-4
 
 
-def _compressed(
-    columns: Array, variances: Array, data: NoisyData, noise: NoiseValues, faint: float = FAINT
-) -> Array:
-    """The few directions (C, m, k) of a component that show beside the noise, of unit variance."""
+def _compressed(columns: Array, variances: Array, root: Array, faint: float = FAINT) -> Array:
+    """The few directions (C, m, k) of a component that show beside the noise, of unit variance;
+    `root` is K⁻¹ of its V = KKᵀ."""
     scaled = columns * np.sqrt(variances)
-    flat = scaled.reshape(-1, scaled.shape[2])
-    noisy = noise.factor**2 * np.diagonal(data.covariance, axis1=1, axis2=2)
-    white = flat / np.sqrt(np.maximum(noisy.ravel(), 1e-300))[:, None]
+    white = (root @ scaled).reshape(-1, scaled.shape[2])
     values, vectors = np.linalg.eigh(white.T @ white)
     return np.asarray(scaled @ vectors[:, values > faint])

@@ -201,11 +201,11 @@ def diagnose(
     base = dataset.base
     dataset, search, found, screened = _searched(dataset, options, progress)
     progress("judging all that may act at once")
-    full, total = search_components(dataset, found.chosen, progress)
+    full, total, hidden = search_components(dataset, found.chosen, progress)
     progress("confirming")
     rng = np.random.default_rng(options.seed)
     few = max(found.chosen.score, found.nothing.score)
-    answer_of_sum = SumAnswer(full, total, rng)
+    answer_of_sum = SumAnswer(dataset, full, total, hidden, rng)
     gained = compared_score(full, total, found.chosen) - few
     if gained > CLEARLY and answer_of_sum.n_causes >= MANY:
         return _diagnosis_of_sum(

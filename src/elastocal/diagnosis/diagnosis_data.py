@@ -24,6 +24,7 @@ from elastocal.diagnosis.hypotheses import (
     SettingsGrid,
     compute_columns,
     grid_of,
+    judged_together,
     moments_between,
     recorded,
     typical_sizes,
@@ -211,8 +212,8 @@ def diagnosis_data_of(
     """
     model, observed, blocks = base.model, base.observed, base.blocks
     loads = _load_hypotheses(base)
-    known = {h.key for h in hypotheses}
-    asked = [*hypotheses, *(h for h in loads if h.key not in known)]
+    together = (h for h in judged_together(model, observed.table) if not h.driven)
+    asked = list({h.key: h for h in (*loads, *together, *hypotheses)}.values())
     if around is None or x is None:
         around, x = model, base.x
     columns = compute_columns(base, asked, dict(zip(around.names, x, strict=True)))

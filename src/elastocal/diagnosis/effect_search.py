@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Prior, Scan, exceedance, scan
 from elastocal.diagnosis.hypotheses import Hypothesis
@@ -81,9 +83,15 @@ def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
     The residual is that of the fitted parameters alone: what the effects explain is put back, so
     that sets with and without them are judged on the same footing.
     """
-    base = dataset.base
-    fitted = fit_extended(dataset, chosen, [chosen.items[k] for k in _direct(chosen)])
-    model = fitted.model
+    items = [chosen.items[k] for k in _direct(chosen)]
+    fitted = fit_extended(dataset, chosen, items)
+    return about(dataset, fitted, [i.what for i in items if isinstance(i.what, Hypothesis)])
+
+
+def about(dataset: DiagnosisData, fitted: Baseline, added: Sequence[Hypothesis]) -> DiagnosisData:
+    """The data about a fit of the model with some of the hypotheses in it, what these explain put
+    back."""
+    base, model = dataset.base, fitted.model
     x = dict(zip(model.names, fitted.x, strict=True))
     moved = replace(
         base, x=np.array([x[name] for name in base.model.names]), residual=fitted.residual
@@ -92,9 +100,7 @@ def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
     # Put back by the data's own columns, which will have to explain it: those of the equilibrium
     # differ from them by a thousandth, and a large effect is a thousand deviations.
     back = np.zeros((*fitted.residual.reshape(-1, base.observed.size).shape, 1))
-    for k in _direct(chosen):
-        what = chosen.items[k].what
-        assert isinstance(what, Hypothesis)
+    for what in added:
         # What an effect tries from several starts has no size about any of them.
         starts = what.effect.starts(what.where, model.chain, model.cell)
         open_keys = {key for start in starts for key in start}

@@ -33,8 +33,10 @@ from elastocal.model.effects.driven import (
     LinkLength,
     MarkerMotion,
 )
+from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.effects.play import BY_ORDER, Backlash, Hysteresis
+from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, rows_needed, subset
@@ -142,6 +144,23 @@ def possible(
             else:
                 hypotheses.append(h)
     return [h for h in hypotheses if h.parameters], untested
+
+
+def judged_together(model: Model, table: Measurements) -> list[Hypothesis]:
+    """Effects that are judged in a sum alone, but for the smooth ones, which have their own
+    searches, at every place where the table can test them."""
+    chain, cell = model.chain, model.cell
+    active = {(p.effect, p.where) for p in model.parameters}
+    return [
+        Hypothesis(effect, where, parameters, ())
+        for effect in CATALOGUE.values()
+        if effect.together
+        and not isinstance(effect, JointCurve | ResidualField | GearSpectrum)
+        and all(recorded(table, need) for need in effect.needed(cell))
+        for where in effect.places(chain, cell)
+        if (effect.name, where) not in active
+        and (parameters := effect.parameters(where, chain, cell))
+    ]
 
 
 def recorded(table: Measurements, need: str) -> bool:

@@ -221,6 +221,7 @@ def joint_fit(
             residual, sums = at(x)
             free = _from_nominal(problem, functions, x, sums)
         assert scales is not None
+        reduction = reduction.seen(problem.free, free.R, sizes)
         posterior = _shrunk(problem, free, reduction.kept).posterior(scales)
         now = JointFit(
             problem, parts, functions, reduction, x, residual, scales, posterior, free, False, steps

@@ -32,7 +32,7 @@ from elastocal.model.arm import Parameter
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.units import Array, Progress
+from elastocal.units import Array, IntArray, Progress
 
 # Which parameters the data determine: a minimal complete set, a wider one, and what combines.
 
@@ -57,6 +57,21 @@ class Reduction:
     mixing: Array
     invisible: NDArray[np.int64]
     at_bound: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def seen(self, free: IntArray, R: Array, sizes: Array) -> Reduction:
+        """Without the kept parameters that move nothing any more, R (…, free) being that of the
+        `free` columns: those of a product vanish where its other factor is held at zero."""
+        length = np.linalg.norm(R[:, : len(free)], axis=0) * sizes[free]
+        own = length[np.searchsorted(free, self.kept)]
+        gone = own <= STRUCTURAL * length.max(initial=0.0)
+        if not gone.any():
+            return self
+        lost = self.kept[gone]
+        mixing = np.hstack([self.mixing[~gone], np.zeros((int((~gone).sum()), len(lost)))])
+        return replace(
+            self, kept=self.kept[~gone], dropped=np.append(self.dropped, lost), mixing=mixing,
+            invisible=np.append(self.invisible, lost),
+        )  # fmt: skip
 
     def terms(self, k: int, sizes: Array, std: float) -> dict[int, float]:
         """Parameters combined with kept parameter number k, and their factors.
@@ -382,6 +397,10 @@ def settle(
         kept = reduction.kept
         found = fit_kept(problem, sizes, found.x, reduction, again=True)
         sigma, r_factor = residual_sigma(found, len(kept)), free_r_factor(problem, found)
+    left = reduction.seen(problem.free, r_factor.R, sizes)
+    if left is not reduction:
+        reduction, found = left, fit_kept(problem, sizes, found.x, left, again=True)
+        r_factor = free_r_factor(problem, found)
     return problem, found, reduction, r_factor, nominal
 
 

@@ -79,11 +79,11 @@ def smooth_groups(model: Model) -> tuple[SmoothGroup, ...]:
                 )
             )  # fmt: skip
             own = sorted(set(own) - set(columns.ravel().tolist()))
-        if own:
-            unit = model.parameters[own[0]].unit
-            size = float(np.sqrt(sum((model.parameters[k].typical or 0.0) ** 2 for k in own)))
-            nan = float("nan")
+        for unit in dict.fromkeys(model.parameters[k].unit for k in own):
+            alike = [k for k in own if model.parameters[k].unit == unit]
+            size = float(np.sqrt(sum((model.parameters[k].typical or 0.0) ** 2 for k in alike)))
+            nan, columns = float("nan"), np.array([alike])
             found.append(
-                SmoothGroup(effect, where, "", np.array([own]), (unit,), size, nan, nan, nan, None)
+                SmoothGroup(effect, where, "", columns, (unit,), size, nan, nan, nan, None)
             )
     return tuple(found)

@@ -10,7 +10,7 @@ from elastocal.diagnosis.diagnosis import SMALLEST_P, Candidate, EffectAt, Found
 from elastocal.report.formatting import printable, significant, together, with_uncertainty
 
 # Places that are the only one their effects have: "base drift", not "base drift at base".
-SINGLE = ("base", "wrist", "load", "tracker")
+SINGLE = ("base", "wrist", "load", "tracker", "arm")
 STAGES = {
     "transmission": "transmission",
     "geometry": "links",

@@ -146,7 +146,9 @@ def test_any_table_gives_finite_numbers_or_a_clear_refusal(
     try:
         verdict = settle(replace(r, stated=None))
     except ElastocalError as refusal:
-        assert r.e.size < p + 5 or "measure" in str(refusal)
+        # Repeats add no rows that tell columns apart.
+        few = r.e.size / repeats < p + 5
+        assert few or "measure" in str(refusal), str(refusal)
         return
     found = verdict.noise
     assert np.isfinite(found.x).all()

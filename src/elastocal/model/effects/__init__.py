@@ -33,7 +33,7 @@ from elastocal.model.effects.gears import (
     JointOffset,
     WristCoupling,
 )
-from elastocal.model.effects.gravity_sag import GravitySag
+from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
 from elastocal.model.effects.loads import (
     GravityCompensator,
     LinkGravity,
@@ -86,6 +86,7 @@ CATALOGUE: dict[str, Effect] = {
         GravityCompensator(),
         LinkGravity(),
         LinkMassError(),
+        LinkWeights(),
         Payload(),
         PayloadError(),
         MarkerPosition(),

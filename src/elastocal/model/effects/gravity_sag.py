@@ -10,6 +10,16 @@ functions depend on each other: what two joints about parallel axes carry, masse
 largest independent set of them is chosen once for a chain (QR with column pivoting; Golub and Van
 Loan, Matrix Computations, section 5.4), numerically, as base inertial parameters are (Gautier
 1991, J. Robotic Systems 8, 485).
+
+Where the model has the joints' compliances the same weights make all joints yield, and what is
+unknown are the arm's moments alone.  For all joints together the independent ones have a closed
+form: a mass at the origin of link k's frame stands on link k − 1, and of a first moment the part
+along a joint's axis does not turn with it, so that
+
+    V = g u · [Σ_turning R_k (x_k S_kx + y_k S_ky) + Σ_sliding R_k a_k M_k q_k],
+
+x_k, y_k across the axis a_k of joint k, with all that stands further out counted in: M_k is the
+mass that joint k carries, and S_k the first moment of link k with it at the link's end.
 """
 
 from __future__ import annotations
@@ -24,8 +34,19 @@ from elastocal.cell.work_cell import Cell
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain, Joint, finite_ranges
-from elastocal.model.effects.base import Symbols, index, turning_joints
+from elastocal.model.effects.base import (
+    RECORD_TORQUES,
+    REVOLUTE,
+    Effect,
+    Symbols,
+    index,
+    links,
+    turning_joints,
+)
+from elastocal.model.effects.compliances import transverse_axes
 from elastocal.model.effects.driven import DrivenEffect, JointMotion
+from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.model.effects.placements import link_ends
 from elastocal.units import Array
 
 POSES = 400  # random ones, in which the functions are compared
@@ -88,7 +109,8 @@ class GravitySag(DrivenEffect):
     ranges: so a_i is how far the joint gives way on average.  The vertical is z of the tracker
     frame, seen from the base wherever that stands.  It needs no masses: a_i is compliance times
     g times a sum of masses and first moments.  Setting: the prior size `sag_size_rad` of each a_i.
-    Where masses are known, `link_gravity` and `joint_compliance` say more with less.
+    Where compliances are known, `link_weights` says more with less, and so does `link_gravity`
+    where masses are.
     """
 
     name = "gravity_sag"
@@ -120,3 +142,70 @@ class GravitySag(DrivenEffect):
             for k, (i, r) in enumerate(zip(chosen, rms, strict=True))
         )
         return sum(terms, ca.SX(0))
+
+
+# Kilograms of an arm of one metre: arms of 0.6 to 1.4 m weigh 15 to 40 kg per square metre of their
+# reach, and heavy ones twice as much.
+WEIGHT = 30.0  # kg/m²
+HOUSING = 0.1  # m, that even the last link stands out
+
+
+def lengths_carried(chain: Chain) -> Array:
+    """The stretched length (joints,) in m of what each joint carries, a housing's at least."""
+    lengths = [float(np.linalg.norm(T[:3, 3])) for T in link_ends(chain)]
+    return np.cumsum(lengths[::-1])[::-1] + HOUSING
+
+
+class LinkWeights(Effect):
+    """V = g u · [Σ R_k (x_k S_kx + y_k S_ky) + Σ R_k a_k M_k q_k]: weights of all links at once.
+
+    S_kx, S_ky (kg m) is the first moment of link k across its joint's axis, with the mass of all
+    that follows at the link's end; of a sliding joint M_k (kg) is the mass that it carries.  These
+    make up the torques of any masses about all joints, which then yield by their compliances: so
+    it shows where the cell has `joint_compliance` or other springs, and `gravity_sag` is what can
+    be had elsewhere.  With `link_gravity` they are what is missing from the masses stated.  Each is
+    as large as in a rod of `weights_kg_per_m` that reaches from the joint to the flange (setting,
+    the prior size), m ℓ²/2 or m ℓ.
+    """
+
+    name = "link_weights"
+    stage = "load"
+    together = True
+    family = "gravity"
+    sized_by = "weights_kg_per_m"
+    remedy = RECORD_TORQUES
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return ("arm",)
+
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        density = WEIGHT * float(lengths_carried(chain)[0])
+        return (Setting(self.sized_by, "range", density, 1e-9, 1e9),)
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        (setting,) = self.settings(place, chain, cell)
+        stated = cell.model.nominal.settings.get(place, {})
+        density = float(stated.get(setting.key, setting.default))  # type: ignore[arg-type]
+        found: list[ParameterSpec] = []
+        described = zip(links(chain), chain.kinds, lengths_carried(chain).tolist(), strict=True)
+        for link, kind, length in described:
+            if kind == REVOLUTE:
+                size = density * length**2 / 2
+                keys = (f"{link}_moment_x", f"{link}_moment_y")
+                found += [ParameterSpec(key, "kg*m", 0.0, size, shrunk=True) for key in keys]
+            else:
+                size = density * length
+                found.append(ParameterSpec(f"{link}_mass", "kg", 0.0, size, shrunk=True))
+        return tuple(found)
+
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
+        moment = ca.SX(0)
+        for i, (link, joint) in enumerate(zip(links(arm.chain), arm.chain.joints, strict=True)):
+            up = arm.T_tracker_link[i][2, :3]
+            if joint.kind == REVOLUTE:
+                for key, axis in zip("xy", transverse_axes(joint.axis), strict=True):
+                    moment += p[f"{link}_moment_{key}"] * (up @ rigid.constant(axis))
+            else:
+                along = up @ rigid.constant(joint.axis)
+                moment += p[f"{link}_mass"] * along * arm.joint_angle(i)
+        arm.add_potential(STANDARD_GRAVITY * moment)

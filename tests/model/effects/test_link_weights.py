@@ -1,0 +1,108 @@
+"""Moments that all joints share are enough for the torques of any weights, and none too many."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from model.effects.stick import model, positions, rows, stick
+from model.test_agreement_with_pinocchio import Reference, random_configurations
+from support.cells import kr270_cell, kr270_chain, random_table
+from support.robots import random_chain_urdf
+
+from elastocal.cell.arm_description import Nominal
+from elastocal.cell.work_cell import Cell
+from elastocal.model import Arm, Chain, Model, read_urdf
+from elastocal.model.effects.gravity_sag import LinkWeights
+from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.units import Array
+
+WEIGHTS = LinkWeights()
+
+
+def torques(chain: Chain, cell: Cell, q: Array) -> Array:
+    """−∂²V/∂q∂p (poses, joints, parameters)."""
+    arm = Arm(chain, cell)
+    arm.assemble()
+    p = {s.key: ca.SX.sym(s.key) for s in WEIGHTS.parameters("arm", chain, cell)}
+    WEIGHTS.load(arm, "arm", p)
+    D = -ca.jacobian(ca.gradient(arm.potential, arm.q_commanded), ca.vertcat(*p.values()))
+    f = ca.Function("D", [arm.q_commanded], [D])
+    return np.stack([f(row).full() for row in q])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_one_set_of_moments_makes_the_torques_of_any_weights_about_all_joints(
+    tmp_path: Path, seed: int
+) -> None:
+    """Masses, branches, prismatic joints and tilted bases, weighed by pinocchio."""
+    text = random_chain_urdf(seed)
+    path = tmp_path / "chain.urdf"
+    path.write_text(text)
+    chain = read_urdf(path, base="base", flange="flange")
+    reference = Reference(pin.buildModelFromXML(text), chain, "base", "flange")
+    reference.T_base_flange(np.zeros(chain.n_joints))
+    standing = np.array(reference.data.oMf[reference.base].rotation)
+    cell = kr270_cell(nominal=Nominal(base_rotation=standing))
+    q = random_configurations(chain, 80, seed)
+    weighed = -np.array([reference.gravity_torques(each) for each in q])
+    D = torques(chain, cell, q)
+    half = D[:40].reshape(-1, D.shape[2]), weighed[:40].ravel()
+    found, *_ = np.linalg.lstsq(*half, rcond=1e-10)
+    largest = np.abs(weighed).max()
+    np.testing.assert_allclose(D[40:] @ found, weighed[40:], atol=1e-9 * largest)
+
+
+def test_they_are_independent_but_for_what_an_upright_base_carries_anyway() -> None:
+    chain, cell = kr270_chain(), kr270_cell()
+    names = [s.key for s in WEIGHTS.parameters("arm", chain, cell)]
+    assert names == [f"link{k}_moment_{a}" for k in range(1, 7) for a in "xy"]
+    D = torques(chain, cell, random_configurations(chain, 60, 3)).reshape(-1, 12)
+    sizes = np.array([s.typical for s in WEIGHTS.parameters("arm", chain, cell)])
+    assert np.abs(D[:, :2]).max() < 1e-9  # joint 1 turns about the vertical
+    shown = D[:, 2:] * sizes[2:]
+    assert np.linalg.cond(shown / np.linalg.norm(shown, axis=0)) < 20
+
+
+def test_they_are_as_large_as_a_rod_of_the_density_that_the_cell_states() -> None:
+    settings = {"arm": {"weights_kg_per_m": 8.0}}
+    cell = kr270_cell(["link_weights"], nominal=Nominal(settings=settings))
+    found = Model.assembled(stick("yy", (1.0, 0.5)), cell).parameters
+    assert [(p.name, p.unit, p.shrunk) for p in found[:1]] == [("arm.link1_moment_x", "kg*m", True)]
+    assert [p.typical for p in found] == pytest.approx([4.0 * 1.6**2] * 2 + [4.0 * 0.6**2] * 2)
+
+
+def test_each_joint_yields_by_its_compliance_times_the_torque() -> None:
+    """Two sticks: the outer one's weight bends both joints, the inner one's only the first."""
+    k, S1, S2 = 1e-6, 6.0, 2.0
+    nominal = Nominal(joint_compliance=(k, 3 * k))
+    m = model(stick("yy", (1.0, 0.5)), "joint_compliance", "link_weights", nominal=nominal)
+    q = np.radians([[10.0, 20.0], [-40.0, 90.0], [0.0, 0.0]])
+    found = positions(m, rows(q), link1_moment_x=S1, link2_moment_x=S2)
+    # About −y a lever arm c gives the torque g c towards the ground, +y.
+    inner, both = np.cos(q[:, 0]), np.cos(q.sum(axis=1))
+    tau2 = STANDARD_GRAVITY * S2 * both
+    tau1 = STANDARD_GRAVITY * S1 * inner + tau2
+    sagged = q + np.stack([k * tau1, 3 * k * tau2], axis=1)
+    rigid = model(stick("yy", (1.0, 0.5)))
+    np.testing.assert_allclose(found, positions(rigid, rows(sagged)), atol=1e-7)
+    lowered = positions(rigid, rows(q))[:, 2] - found[:, 2]
+    assert (lowered[[0, 2]] > 1e-5).all()
+
+
+@pytest.mark.parametrize("deflection_model", ["equilibrium", "linear"])
+def test_their_columns_follow_the_compliances(deflection_model: str) -> None:
+    """B against finite differences away from zero: compliance times moment is bilinear."""
+    cell = kr270_cell(["joint_compliance", "link_weights"], deflection_model=deflection_model)
+    m = Model.assembled(kr270_chain(), cell)
+    table = random_table(kr270_chain(), 4, seed=5)
+    x = m.nominal + np.array([0.3 * (p.typical or 1e-7) for p in m.parameters])
+    B = m.regressor(table, x).B
+    for j, p in enumerate(m.parameters):
+        h = np.zeros(len(x))
+        h[j] = 1e-2 * (p.typical or 1e-7)
+        slope = (m.predict(table, x + h) - m.predict(table, x - h)).ravel() / (2 * h[j])
+        np.testing.assert_allclose(B[:, j], slope, atol=1e-5 * max(np.abs(B[:, j]).max(), 1e-12))
