@@ -365,6 +365,7 @@ def _swapped(
     """
     known = {(c.effect.name, c.where): c for c in components if c.hypothesis is not None}
     tried: set[tuple[str, str]] = set()
+    swapped = False
     for _ in range(SWAPS):
         best, rivals = None, Rivals(dataset, found)
         for k, c in enumerate(found.components):
@@ -380,10 +381,10 @@ def _swapped(
             break
         _, k, key = best
         tried.add(key)
-        other = _exchanged(data, found, [found.components[k]], [known[key]])
+        other = _exchanged(data, found, [found.components[k]], [known[key]], refit_noise=False)
         if other.score > found.score:
-            found = other
-    return found
+            found, swapped = other, True
+    return fit_sum(data, found.components, found.noise, found.sizes) if swapped else found
 
 
 def _completed(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:

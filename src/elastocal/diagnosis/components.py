@@ -456,7 +456,7 @@ def fit_sum(
 
     `known` are the sums of a fit to the same data, which are not summed anew."""
     components, at = list(components), start or Sizes.start(components)
-    rounds = 2 if refit_noise else 1
+    rounds = 2 if refit_noise and start is None else 1
     for last in range(rounds):
         problem = posed(data, components, noise, known)
         for _ in range(ROUNDS * 4):
@@ -527,13 +527,16 @@ def _noise_beside(
     wide = some.with_columns(joined, np.ones(joined.shape[2]))
     # From next to nothing the likelihood is flat in a joint's logarithm, and no climb leaves.
     usual = NoiseValues.usual(len(noise.joint)).joint
-    found = fit_noise(wide, replace(noise, joint=np.maximum(noise.joint, usual)))
+    start = replace(noise, joint=np.maximum(noise.joint, FLAT * usual))
+    found = fit_noise(wide, start, ENOUGH)
     if data.stated or (found.joint > STANDS_OUT * usual).any():
         return found
     # Nor from there where nothing is stated and the instrument has taken the joints' scatter.
-    return min(found, fit_noise(wide, balanced(wide)), key=lambda end: posterior(wide, end))
+    return min(found, fit_noise(wide, balanced(wide), ENOUGH), key=lambda end: posterior(wide, end))
 
 
+# Of its usual scatter: below, a joint's is not seen to grow.  Of −2ℓ: what the noise is fitted to.
+FLAT, ENOUGH = 0.2, 0.1
 STANDS_OUT = 2.0  # times its usual scatter: a joint that the data show
 # Of the noise's variance: what a direction of a component may add and be left out, where the noise
 # is fitted, and where more is searched for.

@@ -335,18 +335,21 @@ SOME = 250  # configurations that show where the optimum is
 ENOUGH, LEVEL = 1e-3, 3e-3  # change of −2ℓ, and its slope, at which a search ends
 
 
-def fit_noise(data: NoisyData, start: NoiseValues | None = None) -> NoiseValues:
+def fit_noise(
+    data: NoisyData, start: NoiseValues | None = None, enough: float = ENOUGH
+) -> NoiseValues:
     """The most probable noise values, by a quasi-Newton search in their logarithms.
 
     Where nothing is stated it starts from two ends, unless a start is given; with many
-    configurations it comes from some of them to all.
+    configurations it comes from some of them to all.  The search ends where −2ℓ changes by less
+    than `enough`.
     """
     if start is not None:
-        return _climbed(data, start)
+        return _climbed(data, start, enough)
     if len(data.r) >= 2 * SOME:
-        return _climbed(data, fit_noise(data.every(len(data.r) // SOME)))
+        return _climbed(data, fit_noise(data.every(len(data.r) // SOME)), enough)
     starts = [NoiseValues.usual(data.G.shape[2]), *([] if data.stated else [balanced(data)])]
-    return min((_climbed(data, s) for s in starts), key=lambda end: posterior(data, end))
+    return min((_climbed(data, s, enough) for s in starts), key=lambda end: posterior(data, end))
 
 
 def balanced(data: NoisyData) -> NoiseValues:
@@ -362,7 +365,7 @@ def balanced(data: NoisyData) -> NoiseValues:
     return NoiseValues(float(np.sqrt(0.5 * square / shape)), joint, SHARED)
 
 
-def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
+def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
     n = data.G.shape[2]
     known: dict[bytes, tuple[float, Array]] = {}
 
@@ -378,7 +381,7 @@ def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
     lower = np.array([-4 * spread, -5.0] + [np.log(SMALLEST_NOISE)] * n)
     upper = np.array([4 * spread, 2.0] + [np.log(LARGEST)] * n)
     theta = np.clip(start.logs(), lower, upper)
-    ftol = ENOUGH / max(abs(cost(theta)[0]), 1.0)
+    ftol = enough / max(abs(cost(theta)[0]), 1.0)
     # Step by step: one long stride of the line search ends where V is singular to rounding.
     # A round ends at the first small gain, often that of a poor first direction: the search is
     # over when a whole round gains nothing.
@@ -386,11 +389,11 @@ def _climbed(data: NoisyData, start: NoiseValues) -> NoiseValues:
         low, high = np.maximum(lower, theta - STRIDE), np.minimum(upper, theta + STRIDE)
         found = optimize.minimize(
             cost, theta, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-            options={"maxiter": 60, "ftol": ftol, "gtol": LEVEL},
+            options={"maxiter": 60, "ftol": ftol, "gtol": LEVEL * enough / ENOUGH},
         )  # fmt: skip
         gain, theta = cost(theta)[0] - float(found.fun), found.x
         inside = (theta > low) & (theta < high) | (theta == lower) | (theta == upper)
-        if inside.all() and gain < ENOUGH:
+        if inside.all() and gain < enough:
             break
     return NoiseValues.of_logs(theta)
 
