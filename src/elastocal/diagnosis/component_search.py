@@ -76,10 +76,10 @@ def search_components(
         # none of them stands out.
         progress("families of lines before curves")
         first = _swapped(full, data, fit_sum(data, others, instrument), others)
-        first = _spared(data, _completed(data, first, others))
+        first = _spared(data, completed(data, first, others))
         for _ in range(TWICE):
             before = first
-            first = _completed(data, _with_lines(full, data, first), both)
+            first = completed(data, _with_lines(full, data, first), both)
             if first.score <= before.score + GAINED:
                 break
         other = _wider(data, first, curves) or first
@@ -387,7 +387,7 @@ def _swapped(
     return fit_sum(data, found.components, found.noise, found.sizes) if swapped else found
 
 
-def _completed(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
+def completed(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
     """The sum with a kind of cause at all its places, or in the place of another kind, where that
     is more probable.
 
