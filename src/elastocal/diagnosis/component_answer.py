@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +14,7 @@ from scipy import linalg
 from scipy.special import expit, softmax
 
 from elastocal.diagnosis.component_search import Rivals
-from elastocal.diagnosis.components import Component, FittedSum
+from elastocal.diagnosis.components import Component, FittedSum, presence_cost
 from elastocal.diagnosis.diagnosis import (
     ComponentShare,
     Curve,
@@ -268,8 +269,16 @@ class SumAnswer:
 
     @cached_property
     def _rivals(self) -> dict[int, dict[tuple[str, str], float]]:
-        """Of each named component that has a hypothesis the probability of what it may be."""
+        """Of each named component that has a hypothesis the probability of what it may be: by the
+        evidence, and by what is there already of each kind."""
         out, sums = {}, Rivals(self.dataset, self.found)
+        places = Counter(h.effect.name for h in self.dataset.hypotheses)
+        present = Counter(c.effect.name for c in self.found.components if c.hypothesis is not None)
+
+        def odds(name: str, others: int) -> float:
+            others = min(others, places[name] - 1)
+            return presence_cost(places[name], others) - presence_cost(places[name], others + 1)
+
         angular = {(c.effect.name, c.where) for c in self.found.components if _of_gear(c)}
         for k, c in enumerate(self.found.components):
             if c.hypothesis is None or c.settings:
@@ -282,7 +291,8 @@ class SumAnswer:
                     if key[1] != c.where and key not in angular
                 }  # fmt: skip
             keys = [c.hypothesis.key, *others]
-            p = softmax(np.array([own, *others.values()]))
+            prior = [odds(name, present[name] - (name == c.effect.name)) for name, _ in keys]
+            p = softmax(np.array([own, *others.values()]) + prior)
             known = {key: float(v) for key, v in zip(keys, p, strict=True) if v >= CHANCE}
             out[k] = dict(sorted(known.items(), key=lambda pair: -pair[1]))
         return out
