@@ -44,11 +44,15 @@ LARGE = 0.1  # share of the gap from which what has no name leaves the verdict o
 
 @dataclass(frozen=True)
 class SumAnswer:
-    """The pieces of a diagnosis that a sum of components fills."""
+    """The pieces of a diagnosis that a sum of components fills.
+
+    `dataset` may be about a fit with some of these in it; `plain` is about the cell's own.
+    """
 
     dataset: DiagnosisData
     found: FittedSum
     rng: np.random.Generator
+    plain: DiagnosisData
 
     @cached_property
     def at(self) -> Projection:
@@ -71,11 +75,14 @@ class SumAnswer:
         """C (rows, Σ k) in m: C w is what coefficients w leave of the positions once the fitted
         parameters have followed them, at equal weights."""
         data, own = self.found.data, self._own
-        X = data.X[_position_rows(data)]
-        size = np.maximum(np.linalg.norm(X[:, :own], axis=0), 1e-300)
-        Q, R = linalg.qr(X[:, :own] / size, mode="economic")
+        rows = _position_rows(data)
+        # The springs of a fit with weights bend by these too, those of the cell's own do not.
+        X = self.plain.data.X[rows]
+        size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+        Q, R = linalg.qr(X / size, mode="economic")
         Q = Q[:, np.abs(np.diag(R)) > 1e-9]
-        return np.asarray(X[:, own:] - Q @ (Q.T @ X[:, own:]))
+        columns = data.X[rows][:, own:]
+        return np.asarray(columns - Q @ (Q.T @ columns))
 
     @cached_property
     def gram(self) -> Array:

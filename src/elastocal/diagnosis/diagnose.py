@@ -205,7 +205,7 @@ def diagnose(
     progress("confirming")
     rng = np.random.default_rng(options.seed)
     few = max(found.chosen.score, found.nothing.score)
-    answer_of_sum = SumAnswer(full, total, rng)
+    answer_of_sum = SumAnswer(full, total, rng, dataset)
     gained = compared_score(full, total, found.chosen) - few
     if gained > CLEARLY and answer_of_sum.n_causes >= MANY:
         return _diagnosis_of_sum(
