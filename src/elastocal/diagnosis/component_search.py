@@ -42,7 +42,7 @@ def search_components(
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
     full = _with_together(dataset)
-    for about_weights in (False, True):
+    for weighed in (False, True):
         data = with_equal_noise(full)
         instrument = chosen.noise.of_instrument() if data.stated else _started(data)
         curves = list(joint_curves(full))
@@ -53,7 +53,7 @@ def search_components(
         found = _swapped(full, data, fit_sum(data, both, instrument), both)
         kept = (c.hypothesis for c in found.components)
         weights = [h for h in kept if h is not None and isinstance(h.effect, LinkWeights)]
-        if about_weights or not weights:
+        if weighed or not weights:
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_weights(full, weights)
