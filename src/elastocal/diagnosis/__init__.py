@@ -9,7 +9,7 @@ ROOMS = {
     ),
     "component_answer": "SumAnswer",
     "component_families": "catalogue_components driven_columns joint_curves line_families",
-    "component_search": "compared_score search_components with_returned",
+    "component_search": "about_weights compared_score search_components with_returned",
     "components": "Component FittedSum Sizes SumOfComponents fit_sum posed",
     "diagnose": "DiagnosisOptions write_extended_cell",
     "diagnosis": (
@@ -25,8 +25,8 @@ ROOMS = {
     "evidence": "EntrySums Grams Prior Scan direct evidence_of exceedance scan",
     "extra_poses": "expected expected_of_random fewest measuring_order plan_extra",
     "hypotheses": (
-        "Hypothesis SettingsGrid change_times compute_columns grid_of model_keys possible "
-        "with_recorded_drivers"
+        "Hypothesis SettingsGrid change_times compute_columns grid_of judged_together model_keys "
+        "possible with_recorded_drivers"
     ),
     "model_set": (
         "Item ModelSet distances extended fit_extended fit_set packed_columns refine "

@@ -56,7 +56,7 @@ def search_components(
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
     full = _with_together(dataset)
-    for about_weights in (False, True):
+    for weighed in (False, True):
         data = with_equal_noise(full)
         instrument = chosen.noise.of_instrument() if data.stated else _started(data)
         curves = list(joint_curves(full))
@@ -65,11 +65,12 @@ def search_components(
         progress(f"sizes of {len(curves) + len(others)} components at once")
         both = [*curves, *others]
         found = _swapped(full, data, fit_sum(data, both, instrument), both)
-        weights = [c for c in found.components if isinstance(c.effect, LinkWeights)]
-        if about_weights or not weights:
+        kept = (c.hypothesis for c in found.components)
+        weights = [h for h in kept if h is not None and isinstance(h.effect, LinkWeights)]
+        if weighed or not weights:
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
-        full = _about(full, weights)
+        full = about_weights(full, weights)
     lined = False
     if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
@@ -105,14 +106,13 @@ def search_components(
     return full, found, hidden_fellows(found, others)
 
 
-def _about(dataset: DiagnosisData, components: Sequence[Component]) -> DiagnosisData:
-    """The data about a fit of the model with the effects of these components in it."""
-    added = [c.hypothesis for c in components if c.hypothesis is not None]
+def about_weights(dataset: DiagnosisData, weights: Sequence[Hypothesis]) -> DiagnosisData:
+    """The data about a fit of the model with these weights in it."""
     base = dataset.base
-    model = extended(base.model, [Item(h, np.zeros(0), 0.0) for h in added])
+    model = extended(base.model, [Item(h, np.zeros(0), 0.0) for h in weights])
     start = dict(zip(base.model.names, base.x, strict=True))
     x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
-    return about(dataset, fit_baseline(model, base.observed.table, x0=x0), added)
+    return about(dataset, fit_baseline(model, base.observed.table, x0=x0), weights)
 
 
 def _first(components: Sequence[Component]) -> list[Component]:

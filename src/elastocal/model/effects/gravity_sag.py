@@ -35,7 +35,6 @@ from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain, Joint, finite_ranges
 from elastocal.model.effects.base import (
-    RECORD_TORQUES,
     REVOLUTE,
     Effect,
     Symbols,
@@ -173,7 +172,6 @@ class LinkWeights(Effect):
     together = True
     family = "gravity"
     sized_by = "weights_kg_per_m"
-    remedy = RECORD_TORQUES
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return ("arm",)
