@@ -278,6 +278,29 @@ def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | Non
 SHARPENINGS, SHARP = 6, 0.05  # nats that another step must gain
 
 
+def sought_anew(dataset: DiagnosisData, found: FittedSum, c: Component) -> Component | None:
+    """The family of lines that stands out most at the joint of `c` beside all others, where it is
+    another one than c and more probable."""
+    if not isinstance(c.effect, GearSpectrum):
+        return None
+    h = _ripple_at(dataset, c.where)
+    scatter = float(found.noise.joint[index(c.where)])
+    grams = _grams(dataset, found.without_these((c,)), found.noise)
+    best = _best(dataset, grams, h, 0.0, scatter, ())
+    given = dict(c.settings)
+    own = _family_evidence(dataset, grams, h, np.array([given["order_1"]]), c.width // 4)[0]
+    near = abs(best.order - given["order_1"]) < best.sd + given["order_sd_1"]
+    if near or best.gain <= own - c.search:
+        return None
+    return _family_component(dataset, best)
+
+
+def _ripple_at(dataset: DiagnosisData, where: str) -> Hypothesis:
+    return next(
+        h for h in dataset.hypotheses if isinstance(h.effect, GearRipple) and h.where == where
+    )
+
+
 def with_multiples(dataset: DiagnosisData, c: Component) -> list[Component]:
     """A family of lines with one multiple more, and with one less; none of another component."""
     if not isinstance(c.effect, GearSpectrum):

@@ -20,6 +20,7 @@ from elastocal.diagnosis.component_families import (
     joint_curves,
     line_families,
     sharpened,
+    sought_anew,
     with_multiples,
 )
 from elastocal.diagnosis.components import (
@@ -149,7 +150,7 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
         if wider is None:
             break
         found = wider if many else _tuned(dataset, data, wider)
-    return found if many else _multiplied(dataset, data, found)
+    return found if many else _reviewed(dataset, data, found)
 
 
 def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
@@ -179,11 +180,14 @@ def _tuned(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedS
     return fit_sum(data, components, found.noise, found.sizes, refit_noise=False)
 
 
-def _multiplied(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
-    """The sum with one multiple more or less of every family of lines where that is better."""
+def _reviewed(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum with other orders of a joint's lines, or one multiple more or less, where that is
+    better beside all that has been found since."""
     changed = False
     for c in found.components:
-        for other in with_multiples(dataset, c):
+        anew = sought_anew(dataset, found, c)
+        others = with_multiples(dataset, c)
+        for other in others if anew is None else [anew, *others]:
             fitted = _exchanged(data, found, [c], [other], refit_noise=False)
             if fitted.score > found.score:
                 found, changed = fitted, True

@@ -536,7 +536,7 @@ def _noise_beside(
 
 
 # Of its usual scatter: below, a joint's is not seen to grow.  Of −2ℓ: what the noise is fitted to.
-FLAT, ENOUGH = 0.2, 0.1
+FLAT, ENOUGH = 1.0, 0.01
 STANDS_OUT = 2.0  # times its usual scatter: a joint that the data show
 # Of the noise's variance: what a direction of a component may add and be left out, where the noise
 # is fitted, and where more is searched for.
