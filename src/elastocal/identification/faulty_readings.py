@@ -469,8 +469,8 @@ def report_faulty(
     else:
         own = own_noise(noise.fit, readings)[0]
         root = block_diagonal(inverse_factor(own))
-        whiten = weights_of(noise, readings).whiten
-        shared = bool((noise.fit.common > 0).any()) and whiten is not None
+        whiten = weights_of(noise, readings).whole
+        shared = bool((noise.fit.common > 0).any()) or noise.lasting is not None
         if shared and whiten is not None:
             e = block_diagonal(own) @ (whiten.T @ (whiten @ e))
         B, e = root @ B, root @ e

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, option
+from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary, held_out_residual
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
@@ -170,6 +171,7 @@ LITTLE = 1.25  # times better than the nominal arm, below which little was gaine
 # this much larger than held-out poses' and chance allows for it in one table of a hundred.
 WORSE, CHANCE = 1.25, 0.01
 MANY = 0.05  # share of the readings fitted, above which those beyond the noise are no accidents
+SCATTERS = 0.01  # p-value below which joints settle anew at each visit, or something drifts
 NOT_NORMAL = 0.01  # p-value below which standardised residuals are not normal
 FEW_DOF_PER_PARAMETER = 1.0
 MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
@@ -211,6 +213,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         *(f for f in of_solution if f.kind == "ill_conditioned"),
         *_against_stated_noise(result),
         *_repeats(result),
+        *_visits(result),
         *_prediction(result),
         *(f for f in of_solution if f.kind != "ill_conditioned"),
         *_faulty(result),
@@ -314,6 +317,38 @@ def _repeats(result: Calibration) -> Iterator[Finding]:
                 "of": tuple(s.name for s in shared),
                 "sigma_um": tuple(_um(s.sigma) for s in shared if s.sigma is not None),
             },
+        )  # fmt: skip
+
+
+def _visits(result: Calibration) -> Iterator[Finding]:
+    """Joints that settle anew at each visit, and a drift: what a test of false-alarm rate SCATTERS
+    finds, and the noise model has."""
+    noise, sizes = result.noise, result.noise.sizes or ()
+    p = {test.part: test.p for test in noise.tests}
+    joints = [s for s in sizes if s.of_joints and s.sigma]
+    if joints and p.get(JOINTS, 1.0) < SCATTERS:
+        yield Finding(
+            "joint_scatter", "note",
+            {
+                "of": tuple(s.name for s in joints), "p": p[JOINTS],
+                "sigma_urad": tuple(_um(s.sigma) for s in joints if s.sigma is not None),
+            },
+            "Measure more poses rather than one pose longer, and approach each from the same side: "
+            "the joints settle anew at every visit.",
+        )  # fmt: skip
+    drifts = [s for s in sizes if s.drift and s.sigma]
+    if noise.drift is not None and drifts and p.get(TIME, 1.0) < SCATTERS:
+        seconds = noise.drift.seconds
+        yield Finding(
+            "drift", "care",
+            {
+                "sigma_um": _um(drifts[0].sigma or 0.0), "p": p[TIME],
+                "lasting_s": seconds, "lasting_share": noise.drift.share,
+                "by": "times" if seconds is not None else "order of the rows",
+            },
+            "Measure poses and loads in random order, return to a reference pose every ten poses, "
+            + ("" if seconds is not None else "record times, ")
+            + "and let arm and tracker warm up.",
         )  # fmt: skip
 
 
@@ -501,6 +536,15 @@ SENTENCES = {
         "too narrow: use the default method, whose noise model has this scatter, or intervals by "
         "cr2; measure more configurations rather than more repeats."
     ),
+    "drift": (
+        "Base or tracker drift in the course of the campaign ({sigma_um:.3g} µm in each direction, "
+        "judged by the {by}; p = {p:.1g}). Weights and intervals count with it, and the held-out "
+        "error leaves out whole blocks in time. {remedy}"
+    ),
+    "joint_scatter": (
+        "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
+        "p = {p:.1g}). Weights and intervals count with it. {remedy}"
+    ),
     "at_bound": (
         "{parameter} stands at its bound {bound:g} {unit}; it is held there and has no interval. "
         "{remedy}"
@@ -523,12 +567,16 @@ def warning_sentences(result: Calibration) -> tuple[str, ...]:
         if f.kind == "faulty_readings":
             told += _faulty_readings(result)
         elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
-            words = {k: ", ".join(map(str, v)) if isinstance(v, tuple) else v
+            words = {k: ", ".join(map(_word, v)) if isinstance(v, tuple) else v
                      for k, v in f.numbers.items()}  # fmt: skip
             within = f.kind == "beyond_bound"  # there the remedy ends a sentence
             remedy = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
             told.append(SENTENCES[f.kind].format(**words, remedy=remedy))
     return tuple(told)
+
+
+def _word(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"
 
 
 def _faulty_readings(result: Calibration) -> list[str]:
@@ -563,7 +611,7 @@ def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
 # Of these the warning, or the line on the prior, says what to do.
 TOLD_ELSEWHERE = (
     "not_converged", "few_degrees_of_freedom", "ill_conditioned", "at_bound", "beyond_bound",
-    "many_faulty_readings", "mostly_prior",
+    "many_faulty_readings", "mostly_prior", "drift", "joint_scatter",
 )  # fmt: skip
 
 

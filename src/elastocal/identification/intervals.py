@@ -302,7 +302,7 @@ def _bootstrapped(
     observed, weights = problem.observations, problem.weights
     sigma = residual_sigma(fit, len(fit.columns))
     readings = linearised(problem.model, observed, fit.x, fit.columns)
-    whiten = None if weights.whiten is None else weights.whiten.tocsc()
+    whiten = None if weights.whole is None else weights.whole.tocsc()
 
     def draw(rng: np.random.Generator) -> Array:
         z = sigma * rng.normal(size=len(observed.value))

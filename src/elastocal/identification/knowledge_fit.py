@@ -628,16 +628,17 @@ def _held_out(solution: Solution, found: ConstrainedFit, local: LinearisedFit) -
     # The prior's rows go with no configuration, so that they are never left out.
     more = -len(local.P) % observed.size
     P = np.vstack([local.P, np.zeros((more, len(local.x)))])
-    own = observed.configuration.max() + 1 + np.arange(len(P) // observed.size)
+    left_out = observed.configuration if weights.together is None else weights.together
+    own = left_out.max() + 1 + np.arange(len(P) // observed.size)
     whiten = sparse.diags_array(np.sqrt(local.loss.weights(local.e)))
-    if weights.whiten is not None:
-        whiten = whiten @ weights.whiten
+    if weights.whole is not None:
+        whiten = whiten @ weights.whole
     both = sparse.block_diag([whiten, sparse.eye_array(len(P))], format="csr")
     held = held_out_residual(
         np.vstack([found.B, P]) @ local.face,
         np.concatenate([found.residual, local.lack, np.zeros(more)]),
-        replace(weights, whiten=sparse.csr_array(both)),
-        np.concatenate([observed.configuration, own]),
+        replace(weights, whiten=sparse.csr_array(both), low=None, common=None, together=None),
+        np.concatenate([left_out, own]),
         observed.size,
     )
     return held[: len(found.residual)]

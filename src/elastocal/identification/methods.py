@@ -90,7 +90,7 @@ def _settled(
     # One that ended at a bound is held there and no longer a column.
     fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
     final = estimate_noise(fitted, noise.kind, noise)
-    final = replace(final, trials=noise.trials, reason=noise.reason)
+    final = replace(final, trials=noise.trials, reason=noise.reason, tests=noise.tests)
     return solution, final, now
 
 

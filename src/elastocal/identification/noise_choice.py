@@ -12,25 +12,36 @@ from scipy import linalg, sparse, stats
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, orthogonal
 from elastocal.identification.noise_structure import (
+    EACH,
+    JOINTS,
     REGISTERED,
     SHARED,
     STRUCTURES,
+    TIME,
+    Kind,
     Readings,
+    SharedEffect,
     Structure,
-    noise_models,
+    along_axes,
+    joint_effects,
     polar,
     shared_effects,
+    with_drift,
 )
 from elastocal.identification.outliers import FALSE_ALARM
 from elastocal.identification.reml import (
+    TINY,
     LogPrior,
     Reml,
     Whitened,
     kenward_roger,
     prior_of_groups,
     reml,
+    score_test,
+    score_test_of_columns,
     usual_start,
 )
+from elastocal.identification.visit_record import VisitRecord, visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,
@@ -39,7 +50,6 @@ from elastocal.identification.weighted_problem import (
 )
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, available_noise, polar_axes
-from elastocal.text import did_you_mean
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which noise model: what the readings allow is tried, and an information criterion decides.
@@ -65,12 +75,23 @@ class Trial:
 
 
 @dataclass(frozen=True)
+class NoiseTest:
+    """A further part of the noise that was looked for: JOINTS or TIME, and the p-value of its being
+    none, beside the model that was chosen without it."""
+
+    part: str
+    p: float
+
+
+@dataclass(frozen=True)
 class NoiseFit:
     """The noise model that was chosen, the estimate under it, and what else was tried.
 
     `x` (p,) is the generalised least-squares estimate of the readings' Δx, `covariance` that of
     Kenward and Roger; `kind` is a name of `noise_models` other than auto.  `fit` is in orthonormal
     parameters: Δx = basis · fit.state.x, which shifts all its log-likelihoods by one constant.
+    Where the noise has a course in time, `every` (p + k,) and `spread` (p + k, p + k) hold its
+    coefficients behind x, and their covariance.
     """
 
     kind: str
@@ -79,14 +100,39 @@ class NoiseFit:
     covariance: Covariance
     trials: tuple[Trial, ...]
     reason: str
-    basis: Array  # (p, p)
+    basis: Array  # (p + k, p + k)
+    every: Array
+    spread: Array
+    tests: tuple[NoiseTest, ...] = ()
+    course: VisitRecord | None = None  # whose times those of what drifts are
 
     @property
     def description(self) -> str:
         """The model in words."""
         text = self.fit.structure.description
-        found = [e.name for e, v in zip(self.fit.shared, self.fit.common, strict=True) if v > 0]
-        return text + (f", and a deviation common to each {' / '.join(found)}" if found else "")
+        told = [e for e, v in zip(self.fit.shared, self.fit.common, strict=True) if v > 0]
+        found = [e.name for e in told if not e.joints]
+        if found:
+            text += f", and a deviation common to each {' / '.join(found)}"
+        if any(e.joints for e in told):
+            text += ", joints that settle anew at each visit"
+        return text + (", and a drift in time" if self.lasting else "")
+
+    @property
+    def lasting(self) -> float | None:
+        """Correlation time of what drifts, as a share of the campaign; None where nothing does."""
+        return self.fit.structure.lasting
+
+    def columns(self, readings: Readings) -> Array:
+        """B of the readings (N, size, p + k) with the columns of what drifts."""
+        if self.lasting is None or readings.visits is None:
+            return readings.B
+        waves = readings.visits.waves(self.lasting)
+        return np.concatenate([readings.B, along_axes(waves, readings.size)], axis=2)
+
+    def of(self, readings: Readings) -> Readings:
+        """The readings as the model takes them: repeats of different visits apart, or together."""
+        return readings.by_visit(Kind.of(self.kind).by_visit)
 
 
 def estimate_noise(
@@ -95,52 +141,150 @@ def estimate_noise(
     """Variances of the chosen noise model by REML, and the estimate under it.
 
     `kind`: a structure (independent, axis, marker, groups, polar, stated), with "+configuration"
-    for effects that readings of a configuration share, or "auto".  Auto tries every structure
+    for effects that readings of a configuration share, "+joints" or "+each-joint" for joints that
+    settle anew at each visit, "+time" for a drift, or "auto".  Auto tries every structure
     that the table has the labels and the readings for, each with shared effects, takes the one
-    with the smallest criterion, and leaves the shared effects out where it is smaller without.
+    with the smallest criterion, and leaves the shared effects out where it is smaller without;
+    scatter of the joints and drift are tried where a test finds a trace of them.
     `like`, a fit of nearly the same readings, is where the search of a named kind starts.
 
     Raises InputError for an unknown kind or one that the readings do not support.
     """
-    if kind not in noise_models():
-        raise InputError(f"there is no noise model '{kind}'{did_you_mean(kind, noise_models())}")
+    asked = Kind.of(kind)
     basis, T = _orthonormal(readings)
     if kind != "auto":
-        near = None if like is None else like.fit
-        fit = _fitted(basis, kind.removesuffix(SHARED), kind.endswith(SHARED), near)
-        return _result(kind, fit, T, (), "as asked for")
-    best: tuple[float, str, Reml] | None = None
-    trials: list[Trial] = []
-    price = np.log(max(readings.e.size - readings.n_parameters, 3))
+        fit = _fitted(basis, asked, None if like is None else like.fit)
+        found = _result(kind, fit, T, (), "as asked for")
+    else:
+        found = _Choice(basis).result(T)
+    return replace(found, course=readings.visits)
 
-    def attempt(name: str, shared: bool) -> None:
-        nonlocal best
+
+# What may be added to the best model of single readings and configurations.  Only a trace of it is
+# worth the fits: a part that a test at this level does not find changes no interval.
+TRACE = 0.05
+MOST_TOGETHER = 300  # rows of a configuration, whose covariance is formed
+FEWEST_VISITS = 8
+LASTING = (0.2, 0.05, 0.8)  # correlation times tried, as shares of the campaign
+TESTED = 0.2  # the one of them that a drift is looked for with
+
+
+class _Choice:
+    """The search for the model with the smallest criterion."""
+
+    def __init__(self, readings: Readings) -> None:
+        self.readings = readings
+        self.trials: list[Trial] = []
+        self.price = float(np.log(max(readings.e.size - readings.n_parameters, 3)))
+        self.best: tuple[float, Kind, Reml] | None = None
+        self.tests: list[NoiseTest] = []
+
+    def result(self, T: Array) -> NoiseFit:
+        readings = self.readings
+        could_share = bool(shared_effects(STRUCTURES["independent"](readings).sets, readings.size))
+        names = _supported(readings)
+        for name in names:
+            self.attempt(Kind(name, could_share))
+        if self.best is None:
+            raise InsufficientDataError(
+                "there are too few readings to estimate any noise from; measure more poses"
+            )
+        if self.best[1].shared:
+            self.attempt(self.best[1]._replace(shared=False))
+        if self._knows_visits():
+            self._with_joints(names[0])
+            if self.readings.visits is not None and self.readings.visits.drifts:
+                self._with_time(names[0])
+        _, kind, fit = self.best
+        tests, trials = tuple(self.tests), tuple(self.trials)
+        return _result(kind.name, fit, T, trials, _reason(kind.name, self.trials), tests)
+
+    def attempt(self, kind: Kind, lasting: float | None = None) -> None:
+        """Fit a kind of noise and keep it where it is better than what there is."""
         try:
-            fit = _fitted(basis, name, shared, best[2] if best else None)
+            fit = _fitted(self.readings, kind, self.best[2] if self.best else None, lasting)
         except InsufficientDataError:
             return
-        if shared and not (fit.common > 0).any():
-            shared = False  # none was found: the same model without
-        label = name + (SHARED if shared else "")
-        own, common = len(fit.structure.names), int((fit.common > 0).sum())
-        if fit.structure.shrunk:
-            own = readings.size + 2  # means of log θ and its two variances
-        criterion = own * price + 2 * common - 2 * fit.log_likelihood
-        trials.append(Trial(label, own + common, float(criterion)))
-        if best is None or criterion < best[0]:
-            best = (criterion, label, fit)
-
-    could_share = bool(shared_effects(STRUCTURES["independent"](basis).sets, readings.size))
-    for name in _supported(basis):
-        attempt(name, could_share)
-    if best is None:
-        raise InsufficientDataError(
-            "there are too few readings to estimate any noise from; measure more poses"
+        told = [e for e, v in zip(fit.shared, fit.common, strict=True) if v > 0]
+        # Where none was found, it is the same model without.
+        kind = kind._replace(
+            shared=kind.shared and any(not e.joints for e in told),
+            joints=kind.joints if any(e.joints for e in told) else "",
         )
-    if best[1].endswith(SHARED):
-        attempt(best[1].removesuffix(SHARED), False)
-    _, label, fit = best
-    return _result(label, fit, T, tuple(trials), _reason(label, trials))
+        own, common = fit.structure.n_own, len(told)
+        if fit.structure.shrunk:
+            own = self.readings.size + 2  # means of log θ and its two variances
+        drifting = len(fit.structure.names) - fit.structure.n_own
+        spent = common + drifting + kind.time
+        criterion = own * self.price + 2 * spent - 2 * fit.log_likelihood
+        self.trials.append(Trial(kind.name, own + spent, float(criterion)))
+        if self.best is None or criterion < self.best[0]:
+            self.best = (float(criterion), kind, fit)
+
+    def _knows_visits(self) -> bool:
+        record = self.readings.visits
+        if record is None or record.n_visits < FEWEST_VISITS:
+            return False
+        together = np.unique(self.readings.configuration, return_counts=True)[1]
+        return int(together.max()) * self.readings.size <= MOST_TOGETHER
+
+    def _plain(self, first: str) -> list[str]:
+        """Structures to add to: the best one, and the `first` one where that has a prior."""
+        assert self.best is not None
+        _, kind, fit = self.best
+        return [kind.own, first] if fit.structure.shrunk else [kind.own]
+
+    def _with_joints(self, first: str) -> None:
+        assert self.best is not None
+        p = self.p_value(JOINTS)
+        if p < TRACE:
+            shared = self.best[1].shared
+            for own in self._plain(first):
+                for both in (True, False) if shared else (False,):
+                    self.attempt(self.best[1]._replace(own=own, shared=both, joints=JOINTS))
+            if self.best[1].joints:
+                self.attempt(self.best[1]._replace(joints=EACH))
+        self.tests.append(NoiseTest(JOINTS, p))
+
+    def _with_time(self, first: str) -> None:
+        assert self.best is not None
+        p = self.p_value(TIME)
+        self.tests.append(NoiseTest(TIME, p))
+        if p >= TRACE:
+            return
+        name = next((own for own in self._plain(first) if own != "groups"), first)
+        kind = self.best[1]._replace(own=name, time=True)
+        for lasting in LASTING:
+            self.attempt(kind, lasting)
+        if not self.best[1].time:
+            return
+        lasting = self.best[2].structure.lasting
+        for less in (kind._replace(shared=False), kind._replace(joints="")):
+            if less != kind:
+                self.attempt(less, lasting)
+
+    def p_value(self, part: str) -> float:
+        """Of there being none of a part of the noise that the best model lacks."""
+        assert self.best is not None
+        _, kind, fit = self.best
+        if part == TIME:
+            sets = fit.structure.sets
+            assert sets.visits is not None
+            waves = sets.visits.waves(TESTED)
+            # Of a pose, only positions.
+            columns = along_axes(waves, min(self.readings.size, 3))
+            if self.readings.size == 6:
+                columns = np.concatenate([columns, 0 * columns], axis=1)
+            return score_test_of_columns(fit, columns)
+        structure, effects = _parts(
+            self.readings, kind._replace(joints=JOINTS), fit.structure.lasting
+        )
+        own, n = structure.n_own, len(structure.names)
+        theta = _known(structure, effects, fit, np.zeros(n + len(effects)))
+        theta[:own] = fit.own[: fit.structure.n_own]
+        looked = [n + k for k, e in enumerate(effects) if e.joints]
+        found = [score_test(structure, effects, theta, k) for k in looked]
+        return min(1.0, len(found) * min(found, default=1.0))
 
 
 def _supported(readings: Readings) -> list[str]:
@@ -161,25 +305,78 @@ def _supported(readings: Readings) -> list[str]:
     return names + [name for name, model in REGISTERED.items() if model.supports(readings)]
 
 
-def _fitted(readings: Readings, name: str, shared: bool, like: Reml | None = None) -> Reml:
-    """A structure's fit; the search starts from the variances of `like` where it has the same."""
-    structure = STRUCTURES[name](readings)
-    effects = shared_effects(structure.sets, readings.size, shared)
-    if shared and not effects:
+def _parts(
+    readings: Readings, kind: Kind, lasting: float | None
+) -> tuple[Structure, tuple[SharedEffect, ...]]:
+    """The structure of a kind of noise, what is `lasting` so long included, and its effects."""
+    readings = readings.by_visit(kind.by_visit)
+    structure = STRUCTURES[kind.own](readings)
+    effects = shared_effects(structure.sets, readings.size, kind.shared)
+    if kind.shared and not effects:
         raise InputError(
-            f"'{name}{SHARED}' needs repeats or several markers in a configuration; this table "
+            f"'{kind.own}{SHARED}' needs repeats or several markers in a configuration; this table "
             "has one reading in each"
         )
+    if kind.joints:
+        effects += joint_effects(structure.sets, kind.joints == EACH)
+    if not kind.time or lasting is None:
+        return structure, effects
+    before = len(structure.sets)
+    structure = with_drift(structure, lasting)
+    return structure, tuple(e.padded(len(structure.sets) - before) for e in effects)
+
+
+def _fitted(
+    readings: Readings, kind: Kind, like: Reml | None = None, lasting: float | None = None
+) -> Reml:
+    """A model's fit; the search starts from the variances of `like` where it has the same.
+
+    What drifts is `lasting` so long, as in `like`, or as is the most likely.
+    """
+    if kind.by_visit and readings.visits is None:
+        raise InputError(
+            f"'{kind.name}' needs the visits of the arm, which these readings do not tell"
+        )
+    if kind.time and readings.visits is not None and not readings.visits.drifts:
+        raise InputError("smooth functions leave no drift to be found in the noise beside them")
+    if kind.time and lasting is None:
+        if like is None or like.structure.lasting is None:
+            tried = [_fitted(readings, kind, like, each) for each in LASTING]
+            return max(tried, key=lambda fit: fit.log_likelihood)
+        lasting = like.structure.lasting
+    structure, effects = _parts(readings, kind._replace(time=False), None)
     start, prior = usual_start(structure, effects), None
     own = len(structure.names)
     if structure.shrunk:
         prior = _prior(structure)
         start[:own] = np.exp(prior.mean)
-    if like is not None and len(like.common) == len(effects):
-        start[own:] = np.where(like.common > 0, like.common, start[own:])
-        if like.structure.names == structure.names:
-            start[:own] = np.where(like.own > LEAST_START * like.own.max(), like.own, start[:own])
-    return reml(structure, effects, prior, start)
+    if kind.time:
+        if structure.shrunk:
+            raise InputError(f"'{kind.own}' has a prior, with which no drift can be estimated")
+        structure, effects = _parts(readings, kind, lasting)
+        # As a course of variance one has a mean square of about one: as shared effects start.
+        drift = max(0.1 * float((readings.e**2).mean()), TINY)
+        start = np.insert(start, own, np.full(len(structure.names) - own, drift))
+    return reml(structure, effects, prior, _known(structure, effects, like, start))
+
+
+def _known(
+    structure: Structure, effects: tuple[SharedEffect, ...], like: Reml | None, start: Array
+) -> Array:
+    """Variances (K,) of `like` where it has the same ones, else those of the `start`."""
+    theta = start.copy()
+    if like is None:
+        return theta
+    own, n = structure.n_own, len(structure.names)
+    common = {e.name: v for e, v in zip(like.shared, like.common, strict=True) if v > 0}
+    theta[n:] = [common.get(e.name, v) for e, v in zip(effects, theta[n:], strict=True)]
+    if like.structure.names[: like.structure.n_own] == structure.names[:own]:
+        known = like.own[: like.structure.n_own]
+        theta[:own] = np.where(known > LEAST_START * known.max(), known, theta[:own])
+    if like.structure.lasting is not None:
+        known = like.own[like.structure.n_own :]
+        theta[own:n] = known[: n - own]
+    return theta
 
 
 def _prior(structure: Structure) -> LogPrior:
@@ -213,11 +410,19 @@ def _orthonormal(readings: Readings) -> tuple[Readings, Array]:
     return replace(readings, B=factors.Q.reshape(n, size, p)), factors.V
 
 
-def _result(label: str, fit: Reml, T: Array, trials: tuple[Trial, ...], reason: str) -> NoiseFit:
-    adjusted, dof = kenward_roger(fit, T)
+def _result(
+    label: str, fit: Reml, T: Array, trials: tuple[Trial, ...], reason: str,
+    tests: tuple[NoiseTest, ...] = (),
+) -> NoiseFit:  # fmt: skip
+    p = len(T)
+    whole = linalg.block_diag(T, np.eye(len(fit.state.x) - p))
+    adjusted, dof = kenward_roger(fit, whole)
     text = "weights estimated by restricted likelihood; covariance of Kenward and Roger"
-    covariance = Covariance("kenward-roger", adjusted, dof, text)
-    return NoiseFit(label, fit, T @ fit.state.x, covariance, trials, reason, T)
+    covariance = Covariance("kenward-roger", adjusted[:p, :p], dof[:p], text)
+    every = whole @ fit.state.x
+    return NoiseFit(
+        label, fit, every[:p], covariance, trials, reason, whole, every, adjusted, tests
+    )
 
 
 # Is a reading explained by the others?  Deletion residuals under an estimated noise model.
@@ -236,6 +441,7 @@ def unexplained_readings(
     error of predicting them from good readings that are not they.  Each component of it, in
     units of its own deviation, is compared with t on the degrees of freedom behind that.
     """
+    readings = found.of(readings)
     own, dof = own_noise(found.fit, readings)
     t = np.zeros(readings.e.shape)
     t[good] = _deletion_fit(found, readings.take(good), own[good])
@@ -261,9 +467,9 @@ def own_noise(fit: Reml, readings: Readings) -> tuple[Array, Array]:
         if name == "polar"
         else STRUCTURES[name](readings)
     )
-    place = {name: k for k, name in enumerate(fit.structure.names)}
+    place = {name: k for k, name in enumerate(fit.structure.names[: fit.structure.n_own])}
     known = np.array([place.get(name, -1) for name in whole.names])
-    own = fit.own
+    own = fit.own[: fit.structure.n_own]
     theta = np.where(known >= 0, own[known], own.mean())
     W = fit.covariance[: len(own), : len(own)]
     spread = np.where(known >= 0, np.diag(W)[known], np.diag(W).max())
@@ -297,6 +503,7 @@ def _deletion_fit(found: NoiseFit, inside: Readings, own: Array) -> Array:
             mean_Pe[w.stack.sets[:, j]] = Pe[:, rows]
     precision = np.linalg.inv(own)
     unit = np.einsum("cl,clij->cij", fit.own[fit.structure.index], fit.structure.mean_matrix)
+    # `set_of` knows nothing of what holds a course in time: it comes last.
     share = precision @ unit[set_of]  # of a reading in the mean of its set, transposed
     P = precision - share @ precision + share @ mean_P[set_of] @ share.transpose(0, 2, 1)
     deviation = (inside.e - sets.e[set_of])[:, :, None]
@@ -318,10 +525,12 @@ def _not_fitted(found: NoiseFit, rest: Readings, own: Array) -> Array:
     Σ − kᵀV⁻¹k + FΦ_AFᵀ, where F = B − kᵀV⁻¹B_fit.
     """
     fit = found.fit
-    d, F = rest.e - rest.B @ found.x, rest.B.copy()
-    spread = own.copy()
+    F = found.columns(rest).copy()
+    d, spread = rest.e - F @ found.every, own.copy()
+    each = np.arange(len(rest))[:, None]
     for effect, variance in zip(fit.shared, fit.common, strict=True):
-        spread += variance * np.diag(effect.axes)
+        mine = effect.of(rest)
+        spread += variance * mine.product(each, mine, each)[:, 0, :, 0]
     if fit.shared:
         for w in fit.state.whitened:
             here, u = _common(fit, w, rest)
@@ -329,9 +538,9 @@ def _not_fitted(found: NoiseFit, rest: Readings, own: Array) -> Array:
             mates, z = w.B[here[1]], _residual(fit, w)[here[1]]
             d[here[0]] -= (back @ z[:, :, None])[..., 0]
             spread[here[0]] -= back @ u
-            observed = (back @ mates).reshape(-1, rest.n_parameters)
+            observed = (back @ mates).reshape(-1, F.shape[2])
             F[here[0]] -= np.linalg.solve(found.basis.T, observed.T).T.reshape(F[here[0]].shape)
-    spread += F @ found.covariance.matrix @ F.transpose(0, 2, 1)
+    spread += F @ found.spread @ F.transpose(0, 2, 1)
     return d / np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
 
 
@@ -345,14 +554,10 @@ def _common(fit: Reml, w: Whitened, rest: Readings) -> tuple[tuple[IntArray, Int
     mates = np.array([cluster.get(int(c), -1) for c in rest.configuration])
     here = np.flatnonzero(mates >= 0)
     members = w.stack.sets[mates[here]]  # (n, sets)
-    common = np.zeros((len(here), members.shape[1], size))
+    k = np.zeros((len(here), members.shape[1] * size, size))
     for effect, variance in zip(fit.shared, fit.common, strict=True):
-        same = np.all(
-            [getattr(sets, by)[members] == getattr(rest, by)[here, None] for by in effect.by],
-            axis=0,
-        )
-        common += variance * same[:, :, None] * effect.axes
-    k = (common[:, :, :, None] * np.eye(size)).reshape(len(here), members.shape[1] * size, size)
+        both = effect.product(members, effect.of(rest), here[:, None])
+        k += variance * both.reshape(k.shape)
     return (here, mates[here]), w.inverse[mates[here]] @ k
 
 
@@ -447,7 +652,8 @@ def settle(
         if again is not None:
             updated = np.logical_or.reduce(masks[again:])
         try:
-            noise = estimate_noise(readings.take(updated), noise.kind)
+            near = None if noise.lasting is None else noise  # how long it lasts is known by now
+            noise = estimate_noise(readings.take(updated), noise.kind, near)
         except ElastocalError:
             break  # so few readings cannot judge the others
         good = updated
@@ -487,24 +693,53 @@ def linearised(
     return Readings(
         at.B.reshape(n, size, -1), at.residual.reshape(n, size), table.configuration[observed.lead],
         load, table.marker[observed.lead], sight, reach, _stated(model, observed),
-        table, observed.lead,
+        table, observed.lead, visit_record(model, observed, x),
     )  # fmt: skip
 
 
 def weights_of(noise: NoiseFit, readings: Readings) -> Weights:
     """Weights of the readings (N,) under an estimated noise; whitened residuals have size 1."""
-    size = readings.size
+    n, size = len(readings), readings.size
     covariance = block_diagonal(own_noise(noise.fit, readings)[0])
     for effect, variance in zip(noise.fit.shared, noise.fit.common, strict=True):
         if variance <= 0:
             continue
-        key = np.column_stack([getattr(readings, label) for label in effect.by])
-        unit = np.unique(key, axis=0, return_inverse=True)[1].ravel()
-        place = (np.ones(len(unit)), (np.arange(len(unit)), unit))
-        Z = sparse.csr_array(place, shape=(len(unit), unit.max() + 1))
-        axes = sparse.dia_array((effect.axes[None], [0]), shape=(size, size))
-        covariance = covariance + variance * sparse.kron(Z @ Z.T, axes, format="csr")
-    return Weights(noise.kind, whitener(sparse.csr_array(covariance)), True, noise.description)
+        mine = effect.of(readings)
+        m, r = mine.unit.shape[1], mine.loading.shape[3]
+        units, unit = np.unique(mine.unit, return_inverse=True)
+        column = unit.reshape(n, m, 1, 1) * r + np.arange(r)
+        row = np.arange(n)[:, None, None, None] * size + np.arange(size)[:, None]
+        row, column = np.broadcast_arrays(row, column)
+        value = np.where(mine.unit[:, :, None, None] >= 0, mine.loading, 0.0)
+        place = (value.ravel(), (row.ravel(), column.ravel()))
+        Z = sparse.csr_array(place, shape=(n * size, len(units) * r))
+        Z.eliminate_zeros()
+        covariance = covariance + variance * (Z @ Z.T)
+    whiten = whitener(sparse.csr_array(covariance))
+    weights = Weights(noise.kind, whiten, True, noise.description)
+    if noise.lasting is None or readings.visits is None:
+        return weights
+    fit, k = noise.fit, readings.n_parameters
+    kinds = fit.own[fit.structure.n_own :][
+        np.arange(size) // 3 if size == 6 else np.zeros(size, int)
+    ]
+    columns = noise.columns(readings)[:, :, k:].reshape(n * size, -1)
+    deviation = np.tile(np.sqrt(kinds), columns.shape[1] // size)
+    return weights.with_common(columns * deviation, time_blocks(readings, noise.lasting))
+
+
+FEWEST_BLOCKS, MOST_BLOCKS = 5, 10
+
+
+def time_blocks(readings: Readings, lasting: float) -> IntArray:
+    """Blocks (N,) of whole configurations that follow each other in time, as long as what drifts
+    is `lasting`, if that makes neither too few nor too many."""
+    assert readings.visits is not None
+    number = int(np.clip(round(1 / lasting), FEWEST_BLOCKS, MOST_BLOCKS))
+    _, code = np.unique(readings.configuration, return_inverse=True)
+    when = np.bincount(code, readings.visits.place[:, 0]) / np.bincount(code)
+    rank = np.argsort(np.argsort(when, kind="stable"))
+    return (rank * min(number, len(when)) // len(when))[code]
 
 
 def _sight(model: Model, observed: Observations) -> tuple[Array | None, Array | None]:

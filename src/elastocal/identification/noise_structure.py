@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from elastocal.errors import require
+from elastocal.errors import InputError, require
+from elastocal.identification.visit_record import VisitRecord
 from elastocal.measurements import Measurements
 from elastocal.plugin_loader import check_registered, same_class
+from elastocal.text import did_you_mean
 from elastocal.units import Array, BoolArray, IntArray
 
 # Residuals and B per reading, with the labels that say what readings have in common.
@@ -25,7 +27,8 @@ class Readings:
     `configuration`, `load` and `marker` (N,) are repeats.  `sight` (N, 3, 3), where the tracker's
     position is known, holds the unit vectors along and across the line of sight as rows and
     `reach` (N,) its length in m; `stated` (N, size, size), where noise is stated, its covariance.
-    `lead` (N,) are the readings' rows in the `table`.
+    `lead` (N,) are the readings' rows in the `table`.  `visits` says at which visits of the arm
+    they were made; `apart`, that repeats of different visits are no repeats of one reading.
     """
 
     B: Array
@@ -38,6 +41,8 @@ class Readings:
     stated: Array | None = None
     table: Measurements | None = None
     lead: IntArray | None = None
+    visits: VisitRecord | None = None
+    apart: bool = False
 
     def __post_init__(self) -> None:
         n, size = self.e.shape
@@ -70,8 +75,10 @@ class Readings:
     @cached_property
     def set_of(self) -> IntArray:
         """Number (N,) of the set of repeats that a reading belongs to."""
-        key = np.column_stack([self.configuration, self.load, self.marker])
-        return np.unique(key, axis=0, return_inverse=True)[1].ravel()
+        labels = [self.configuration, self.load, self.marker]
+        if self.apart and self.visits is not None:
+            labels.append(self.visits.visit[:, 0])
+        return np.unique(np.column_stack(labels), axis=0, return_inverse=True)[1].ravel()
 
     @cached_property
     def sets(self) -> RepeatSets:
@@ -82,7 +89,13 @@ class Readings:
         """Only the readings where `chosen` (N,) holds."""
         names = ("B", "e", "configuration", "load", "marker", "sight", "reach", "stated", "lead")
         parts = {name: getattr(self, name) for name in names}
-        return replace(self, **{k: v[chosen] for k, v in parts.items() if v is not None})
+        own = None if self.visits is None else self.visits.take(chosen)
+        parts = {k: v[chosen] for k, v in parts.items() if v is not None}
+        return replace(self, **parts, visits=own)
+
+    def by_visit(self, apart: bool = True) -> Readings:
+        """The same with repeats of different visits `apart`, or all together."""
+        return self if apart == self.apart else replace(self, apart=apart)
 
     def of_columns(self, chosen: BoolArray) -> Readings:
         """Only the columns of B where `chosen` (p,) holds."""
@@ -117,6 +130,7 @@ class RepeatSets:
     marker: IntArray
     sight: Array | None
     reach: Array | None
+    visits: VisitRecord | None = None
 
     def __len__(self) -> int:
         return len(self.e)
@@ -153,6 +167,7 @@ def reduce_repeats(readings: Readings, stated: bool = False) -> RepeatSets:
         readings.configuration[first], readings.load[first], readings.marker[first],
         None if readings.sight is None else readings.sight[first],
         None if readings.reach is None else readings.reach[first],
+        None if readings.visits is None else readings.visits.take(first),
     )  # fmt: skip
 
 
@@ -173,7 +188,8 @@ class Structure:
 
     `index` (C, L) into the `names` of the variances θ, in m² (rad²); `matrix` (C, L, size, size)
     for a single reading.  The set's mean has that covariance with `mean_matrix` in its place.
-    `shrunk` says that the variances are many and share a prior (see shrinkage).
+    `shrunk` says that the variances are many and share a prior (see shrinkage).  Where there is a
+    course in time, it is `lasting` so long (`with_drift`) and its coefficients' sets come last.
     """
 
     name: str
@@ -184,6 +200,12 @@ class Structure:
     matrix: Array
     mean_matrix: Array
     shrunk: bool = False
+    lasting: float | None = None
+
+    @property
+    def n_own(self) -> int:
+        """How many of the variances are those of single readings."""
+        return sum(not name.startswith(DRIFT) for name in self.names)
 
 
 def _plain(
@@ -290,6 +312,7 @@ STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
     "stated": as_stated,
 }
 SHARED = "+configuration"
+JOINTS, EACH, TIME = "+joints", "+each-joint", "+time"
 
 
 class NoiseModel:
@@ -378,8 +401,42 @@ def register(model: NoiseModel) -> None:
 
 
 def noise_models() -> tuple[str, ...]:
-    """Every name that `noise` takes: auto, the structures, and those with shared deviations."""
+    """Every name that `noise` takes: auto, the structures, and those with shared deviations.
+
+    Those but auto may have the scatter of the joints (JOINTS or EACH) and a course in TIME added.
+    """
     return ("auto", *STRUCTURES, *(name + SHARED for name in STRUCTURES))
+
+
+class Kind(NamedTuple):
+    """A noise model by its parts: a structure, deviations of a configuration, scatter of the joints
+    at each visit (JOINTS, EACH or none), a course in time."""
+
+    own: str
+    shared: bool = False
+    joints: str = ""
+    time: bool = False
+
+    @classmethod
+    def of(cls, name: str) -> Kind:
+        """That of a name, as "axis+configuration+joints+time"; InputError where there is none."""
+        rest, time = name.removesuffix(TIME), name.endswith(TIME)
+        joints = next((part for part in (EACH, JOINTS) if rest.endswith(part)), "")
+        rest = rest.removesuffix(joints)
+        if rest not in noise_models() or (rest == "auto" and rest != name):
+            raise InputError(
+                f"there is no noise model '{name}'{did_you_mean(rest, noise_models())}"
+            )
+        return cls(rest.removesuffix(SHARED), rest.endswith(SHARED), joints, time)
+
+    @property
+    def name(self) -> str:
+        return self.own + SHARED * self.shared + self.joints + TIME * self.time
+
+    @property
+    def by_visit(self) -> bool:
+        """Whether it matters at which visit a reading was made."""
+        return bool(self.joints) or self.time
 
 
 # Random effects: what readings of a configuration have in common besides the model.
@@ -394,15 +451,57 @@ PARTITIONS = (
 
 @dataclass(frozen=True)
 class SharedEffect:
-    """A deviation common to all sets of one `unit` (C,): covariance τ² diag(`axes`).
+    """A deviation common to all sets of one `unit` (C, m): covariance τ² Σ ℓ ℓᵀ of those that share
+    it, with the loadings ℓ of each set on its units, `loading` (C, m, size, r).
 
-    Sets are of one unit where they agree in the labels `by`.
+    Sets are of one unit where they agree in the labels `by`; at an unit of −1 there is nothing.  A
+    joint that settles elsewhere at each visit is the deviation of a visit with ℓ = ∂(reading)/∂q of
+    the `joints`.
     """
 
     name: str
     by: tuple[str, ...]
     unit: IntArray
+    loading: Array
     axes: Array
+    joints: tuple[int, ...] = ()
+
+    def of(self, readings: Readings) -> SharedEffect:
+        """The same deviation for single readings (N in the place of C)."""
+        if self.joints:
+            return _of_joints(self.name, readings, self.joints)
+        return _common(self.name, self.by, readings, self.axes)
+
+    def padded(self, k: int) -> SharedEffect:
+        """The same with k more sets that have no part in it."""
+        unit = np.concatenate([self.unit, np.full((k, self.unit.shape[1]), -1)])
+        loading = np.concatenate([self.loading, np.zeros((k, *self.loading.shape[1:]))])
+        return replace(self, unit=unit, loading=loading)
+
+    def product(self, members: IntArray, other: SharedEffect, others: IntArray) -> Array:
+        """Σ ℓ ℓᵀ (G, n, size, k, size) of the sets `members` (G, n) and `others` (G, k)."""
+        mine, theirs = self.unit[members], other.unit[others]
+        same = (mine[:, :, None, :, None] == theirs[:, None, :, None, :]) & (
+            mine[:, :, None, :, None] >= 0
+        )
+        a, b = self.loading[members], other.loading[others]
+        return np.asarray(
+            np.einsum("gnkab,gnasr,gkbtr->gnskt", same.astype(float), a, b, optimize=True)
+        )
+
+
+def _common(
+    name: str, by: tuple[str, ...], labelled: RepeatSets | Readings, axes: Array
+) -> SharedEffect:
+    """Sets or readings that agree in the labels `by` share a deviation of covariance diag(axes)."""
+    unit = np.zeros(len(labelled), dtype=np.int64)
+    for label in PARTITIONS[-1]:
+        unit = unit * LABELS + (getattr(labelled, label) + 1 if label in by else 0)
+    loading = np.diag(np.sqrt(axes))[:, axes > 0]
+    return SharedEffect(name, by, unit[:, None], np.tile(loading, (len(labelled), 1, 1, 1)), axes)
+
+
+LABELS = 2**20  # that a table may have of each kind, so that three of them make one number
 
 
 def shared_effects(sets: RepeatSets, size: int, wanted: bool = True) -> tuple[SharedEffect, ...]:
@@ -427,10 +526,95 @@ def shared_effects(sets: RepeatSets, size: int, wanted: bool = True) -> tuple[Sh
         kept[by] = unit
     position = np.where(np.arange(size) < 3, 1.0, 0.0)
     names = {by: " and ".join([", ".join(by[:-1]), by[-1]] if by[1:] else by) for by in kept}
-    found = [SharedEffect(names[by], by, unit, position) for by, unit in kept.items()]
+    found = [_common(names[by], by, sets, position) for by in kept]
     if size == 6:
-        found += [
-            SharedEffect(f"{names[by]} (rotation)", by, unit, 1.0 - position)
-            for by, unit in kept.items()
-        ]
+        found += [_common(f"{names[by]} (rotation)", by, sets, 1.0 - position) for by in kept]
     return tuple(found)
+
+
+# Joints that settle anew at each visit, and a base or tracker that drifts.
+
+VISIT = "visit"
+ALIKE = 1e-9  # m per rad: joints that move no reading more than this have no scatter to be seen
+
+
+def joint_effects(sets: RepeatSets, each: bool) -> tuple[SharedEffect, ...]:
+    """The scatter of the joints from visit to visit, as a diagnosis has it too: a standard
+    deviation for each joint, or one for all that turn and one for all that slide."""
+    record = sets.visits
+    if record is None:
+        return ()
+    seen = np.abs(record.motion).max(axis=(0, 1, 2), initial=0.0) > ALIKE
+    if each:
+        groups = [(f"joint{j + 1}", (int(j),)) for j in np.flatnonzero(seen)]
+    else:
+        both = ("each joint", record.turning), ("each slide", ~record.turning)
+        groups = [(name, tuple(np.flatnonzero(seen & kind).tolist())) for name, kind in both]
+    return tuple(_of_joints(name, sets, joints) for name, joints in groups if joints)
+
+
+def _of_joints(name: str, labelled: RepeatSets | Readings, joints: tuple[int, ...]) -> SharedEffect:
+    record = labelled.visits
+    assert record is not None
+    loading = record.motion[..., list(joints)]
+    return SharedEffect(name, (VISIT,), record.visit, loading, np.zeros(0), joints)
+
+
+DRIFT = "drift in time"
+
+
+def with_drift(structure: Structure, lasting: float) -> Structure:
+    """The structure with a course in time common to all readings, of unknown variance.
+
+    The course's coefficients (`VisitRecord.waves`) are columns of
+    B, along x, y and z (and of rotations), which readings of zero with the unknown variance hold:
+    restricted likelihood is then the same as that of the course taken for noise (Henderson 1975),
+    and nothing that is as large as the table squared is formed.
+    """
+    sets = structure.sets
+    assert sets.visits is not None
+    waves = sets.visits.waves(lasting)
+    (C, size, p), k = sets.B.shape, waves.shape[1]
+    kinds = [np.arange(3), np.arange(3, 6)] if size == 6 else [np.arange(size)]
+    names = (DRIFT, f"{DRIFT} (rotation)")[: len(kinds)]
+    more = along_axes(waves, size)
+    held = np.concatenate([np.zeros((k, size, p)), np.eye(k * size).reshape(k, size, -1)], axis=2)
+    none = np.zeros((k, size, size))
+
+    def tailed(values: Array, tail: Array) -> Array:
+        return np.concatenate([values, tail])
+
+    # A new configuration for each, so that it is correlated with nothing.
+    fresh = int(sets.configuration.max()) + 1 + np.arange(k)
+    zero = np.zeros(k, dtype=np.int64)
+    grown = replace(
+        sets, B=tailed(np.concatenate([sets.B, more], axis=2), held),
+        e=tailed(sets.e, np.zeros((k, size))), unit=tailed(sets.unit, none + np.eye(size)),
+        repeats=tailed(sets.repeats, zero + 1), dof=tailed(sets.dof, np.zeros(k)),
+        scatter=tailed(sets.scatter, none), configuration=tailed(sets.configuration, fresh),
+        load=tailed(sets.load, zero), marker=tailed(sets.marker, zero), sight=None, reach=None,
+        visits=None,
+    )  # fmt: skip
+    L, K = max(structure.index.shape[1], len(kinds)), len(structure.names)
+    index = np.zeros((C + k, L), dtype=np.int64)
+    index[:C, : structure.index.shape[1]] = structure.index
+    index[C:, : len(kinds)] = K + np.arange(len(kinds))
+    parts = np.array([np.diag(np.isin(np.arange(size), kind).astype(float)) for kind in kinds])
+
+    def padded(matrix: Array) -> Array:
+        out = np.zeros((C + k, L, size, size))
+        out[:C, : matrix.shape[1]] = matrix
+        out[C:, : len(kinds)] = parts
+        return out
+
+    return replace(
+        structure, names=(*structure.names, *names), sets=grown, index=index,
+        matrix=padded(structure.matrix), mean_matrix=padded(structure.mean_matrix),
+        lasting=lasting,
+    )  # fmt: skip
+
+
+def along_axes(waves: Array, size: int) -> Array:
+    """Columns (N, size, k·size) of a course's coefficients, from `waves` (N, k)."""
+    each = waves[:, None, :, None] * np.eye(size)[:, None, :]
+    return np.asarray(each.reshape(len(waves), size, -1))

@@ -11,8 +11,14 @@ from scipy import stats
 
 from elastocal.errors import InputError
 from elastocal.identification.methods import MethodResult
-from elastocal.identification.noise_choice import NoiseFit, Trial, linearised, own_noise
-from elastocal.identification.noise_structure import SHARED
+from elastocal.identification.noise_choice import (
+    NoiseFit,
+    NoiseTest,
+    Trial,
+    linearised,
+    own_noise,
+)
+from elastocal.identification.noise_structure import DRIFT, SHARED
 from elastocal.identification.weighted_problem import Weights, block_diagonal, weights_for, whitener
 from elastocal.measurements import Measurements
 from elastocal.model.observations import Observations
@@ -65,6 +71,8 @@ def lack_of_fit(observed: Observations, whitened: Array, n_parameters: int) -> L
 
 NUMBERED = re.compile(r"^(marker|configuration) (\d+)")
 COMMON = "common to each"
+SCATTER = "scatter of {} from visit to visit"
+SLIDES = SCATTER.format("each slide")
 TOO_LARGE = (
     "the table is too large for a choice among noise models; stated noise, or equal noise "
     "where none is stated, is scaled to the residual"
@@ -78,15 +86,31 @@ class NoiseSize:
     name: str
     sigma: float | None
     factor: float | None = None
+    of_joints: bool = False
 
     @property
     def shared(self) -> bool:
         """Whether it is a deviation that readings have in common, as those of a configuration."""
         return self.name.startswith(COMMON)
 
+    @property
+    def drift(self) -> bool:
+        """Whether it is what changes in the course of the campaign."""
+        return self.name.startswith(DRIFT)
+
     def to_json(self) -> dict[str, Any]:
-        size: dict[str, Any] = {"name": self.name, "sigma_um": _um(self.sigma)}
+        unit = "sigma_urad" if self.of_joints and not self.name.endswith(SLIDES) else "sigma_um"
+        size: dict[str, Any] = {"name": self.name, unit: _um(self.sigma)}
         return size if self.factor is None else size | {"factor": self.factor}
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The correlation time of what drifts, as a `share` of the campaign and in `seconds`; None
+    where the table has no times, and the order of its rows was taken for that of the visits."""
+
+    share: float
+    seconds: float | None
 
 
 @dataclass(frozen=True)
@@ -97,6 +121,8 @@ class Noise:
     where one number says it, `ratio_to_stated` the residual over the stated noise where any was
     stated.  `interval_kind` and `interval_description` say how intervals follow from it.  Where the
     noise was estimated there are its `sizes` and the models `tried`; `reason` says why this one.
+    `tests` are those for joints that settle anew at each visit and for a drift, `drift` says of a
+    course in time how long it lasts.
     """
 
     kind: str
@@ -109,6 +135,8 @@ class Noise:
     reason: str | None = None
     sizes: tuple[NoiseSize, ...] | None = None
     tried: tuple[Trial, ...] | None = None
+    tests: tuple[NoiseTest, ...] = ()
+    drift: Drift | None = None
 
     @property
     def estimated(self) -> bool:
@@ -118,7 +146,13 @@ class Noise:
     @property
     def shared(self) -> bool:
         """Whether the noise model has a deviation common to the readings of a configuration."""
-        return self.kind.endswith(SHARED)
+        return SHARED in self.kind
+
+    @property
+    def held_out_by(self) -> str:
+        """What is left out at a time to judge predictions: whole blocks in time where something
+        drifts, since neighbours in time err alike."""
+        return "configurations" if self.drift is None else "blocks in time"
 
     @property
     def intervals_by_configuration(self) -> bool:
@@ -134,12 +168,17 @@ class Noise:
             "sigma_um": _um(self.sigma),
             "ratio_to_stated": self.ratio_to_stated,
             "lack_of_fit": None if self.lack_of_fit is None else asdict(self.lack_of_fit),
+            "held_out_by": self.held_out_by,
             "intervals": {"kind": self.interval_kind, "description": self.interval_description},
         }
         if self.reason is not None:
             content["reason"] = self.reason
         if self.sizes is not None:
             content["variances"] = [size.to_json() for size in self.sizes]
+        if self.tests:
+            content["tests"] = [{"part": t.part.strip("+"), "p": t.p} for t in self.tests]
+        if self.drift is not None:
+            content["drift"] = asdict(self.drift)
         if self.tried is not None:
             content["tried"] = [
                 {"kind": t.kind, "variances": t.n_variances, "criterion": t.criterion}
@@ -180,14 +219,21 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
     names = [NUMBERED.sub(label, name) for name in fit.structure.names]
     own = [
         NoiseSize(name, None, float(np.sqrt(v)))
-        if fit.structure.name == "stated"
+        if fit.structure.name == "stated" and not name.startswith(DRIFT)
         else NoiseSize(name, float(np.sqrt(v)))
         for name, v in zip(names, fit.own, strict=True)
     ]
     shared = [
-        NoiseSize(f"{COMMON} {e.name}", float(np.sqrt(v)))
+        NoiseSize(SCATTER.format(e.name), float(np.sqrt(v)), None, True)
+        if e.joints
+        else NoiseSize(f"{COMMON} {e.name}", float(np.sqrt(v)))
         for e, v in zip(fit.shared, fit.common, strict=True)
     ]
+    drift = None
+    if found.lasting is not None and found.course is not None:
+        drift = Drift(
+            found.lasting, found.lasting * found.course.span if found.course.timed else None
+        )
     alone = fit.structure.name == "independent" and len(fit.own) == 1
     return replace(
         noise,
@@ -197,6 +243,8 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
         sigma=float(np.sqrt(fit.own[0])) if alone else None,
         sizes=(*own, *shared),
         tried=found.trials,
+        tests=found.tests,
+        drift=drift,
     )
 
 
@@ -226,7 +274,10 @@ def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
     solution = found.solution
     problem, fit = solution.problem, solution.fit
     weights = problem.weights
-    if found.noise is not None and any(found.noise.fit.common > 0):
+    common = found.noise is not None and (
+        bool(found.noise.fit.common.any()) or found.noise.lasting is not None
+    )
+    if common and found.noise is not None:
         few = fit.columns[~problem.model.shrunk[fit.columns]]
         readings = linearised(problem.model, problem.observations, fit.x, few)
         own = block_diagonal(own_noise(found.noise.fit, readings)[0])

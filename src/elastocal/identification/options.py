@@ -12,7 +12,7 @@ from elastocal.errors import InputError, option
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.intervals import IntervalKind
 from elastocal.identification.knowledge import Constraints, GaussianPrior
-from elastocal.identification.noise_structure import noise_models
+from elastocal.identification.noise_structure import Kind
 from elastocal.identification.weighted_problem import WeightKind
 from elastocal.text import did_you_mean, quoted
 
@@ -58,7 +58,6 @@ class Options:
     def __post_init__(self) -> None:
         for name, value, valid in (
             ("method", self.method, METHODS),
-            ("noise", self.noise, noise_models()),
             ("weights", self.weights, get_args(WeightKind)),
             ("intervals", self.intervals, INTERVALS),
             ("outliers", self.faulty, get_args(FaultyReadings)),
@@ -68,6 +67,7 @@ class Options:
                     f"{option(name)} takes one of {', '.join(valid)}; found {quoted(value)}"
                     f"{did_you_mean(str(value), valid)}"
                 )
+        Kind.of(self.noise)
         if self.noise != "auto" and self.resolved != "reml":
             raise InputError(
                 f"the noise model '{self.noise}' is estimated by the method reml; "

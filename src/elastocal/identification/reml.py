@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse, special
+from scipy import linalg, sparse, special, stats
 
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.noise_structure import RepeatSets, SharedEffect, Structure
@@ -77,9 +77,7 @@ def _stack(structure: Structure, shared: tuple[SharedEffect, ...], members: IntA
     index, part = _own(structure, members)
     n_own = len(structure.names)
     for k, effect in enumerate(shared):
-        unit = effect.unit[members]
-        same = (unit[:, :, None] == unit[:, None, :]).astype(float)
-        block = same[:, :, None, :, None] * np.diag(effect.axes)[None, None, :, None, :]
+        block = effect.product(members, effect, members)
         part = np.concatenate([part, block.reshape(G, 1, m * size, m * size)], axis=1)
         index = np.concatenate([index, np.full((G, 1), n_own + k)], axis=1)
     B = sets.B[members].reshape(G, m * size, p)
@@ -154,7 +152,8 @@ class State:
 
 @dataclass(frozen=True)
 class Slope:
-    """Score (K,), expected and observed information (K, K) of θ; `C` (K, p, p): BᵀV⁻¹V_kV⁻¹B.
+    """Score (K,), expected and observed information (K, K) of θ; `C` (K, p, p): BᵀV⁻¹V_kV⁻¹B;
+    `mean` (K,): ½ tr(P V_k), the mean of ½ eᵀP V_k P e.
 
     `told` (K,): whether the readings say anything of θ_k, which they do not where the parameters
     explain all that it could cause.
@@ -165,6 +164,7 @@ class Slope:
     observed: Array
     C: Array
     told: BoolArray
+    mean: Array
 
 
 def evaluate(structure: Structure, stacked: list[Stack], theta: Array) -> State:
@@ -203,7 +203,7 @@ def slope(structure: Structure, state: State) -> Slope:
     """Score and information of θ at a state."""
     K, p = len(state.theta), len(state.x)
     score, summed, D = np.zeros(K), np.zeros((K, p * p)), np.zeros((K, p))
-    known = np.zeros(K)
+    known, mean = np.zeros(K), np.zeros(K)
     twice_expected, product = np.zeros(K * K), np.zeros(K * K)
     half = linalg.cholesky(state.Phi, lower=True)
     for w in state.whitened:
@@ -221,25 +221,29 @@ def slope(structure: Structure, state: State) -> Slope:
         squares = (Az @ z[:, :, None])[..., 0]
         trace = np.trace(w.A, axis1=2, axis2=3)
         score += np.bincount(flat, 0.5 * (squares - trace).ravel(), K)
+        mean += np.bincount(flat, 0.5 * trace.ravel(), K)
         spread, whole = (AB @ half).reshape(G, L, -1), w.A.reshape(G, L, -1)
         known += np.bincount(flat, 0.5 * (whole**2).sum(axis=2).ravel(), K)
         local = whole @ whole.transpose(0, 2, 1) - 2 * spread @ spread.transpose(0, 2, 1)
         twice_expected += np.bincount(w.stack.pairs, local.ravel(), K * K)
         product += np.bincount(w.stack.pairs, (Az @ Az.transpose(0, 2, 1)).ravel(), K * K)
     C = summed.reshape(K, p, p)
-    score += 0.5 * summed @ state.Phi.ravel()
+    taken = 0.5 * summed @ state.Phi.ravel()
+    score, mean = score + taken, mean - taken
     rotated = (half.T @ C @ half).reshape(K, -1)
     information = 0.5 * (twice_expected.reshape(K, K) + rotated @ rotated.T)
     # −∂²ℓ/∂θ_k∂θ_l = eᵀP V_k P V_l P e − ½ tr(P V_k P V_l)
     Dh = D @ half
     observed = product.reshape(K, K) - Dh @ Dh.T - information
-    _within(structure, state, score, information, observed)
-    return Slope(score, information, observed, C, np.diag(information) > LEAST_TOLD * known)
+    _within(structure, state, score, mean, information, observed)
+    told = np.diag(information) > LEAST_TOLD * known
+    return Slope(score, information, observed, C, told, mean)
 
 
 def _within(
-    structure: Structure, state: State, score: Array, information: Array, observed: Array
-) -> None:
+    structure: Structure, state: State, score: Array, mean: Array, information: Array,
+    observed: Array,
+) -> None:  # fmt: skip
     """Add what the scatter of repeats says: Wishart terms of each set."""
     sets, K = structure.sets, len(score)
     repeated = np.flatnonzero(sets.dof > 0)
@@ -253,7 +257,9 @@ def _within(
     other = S.transpose(0, 1, 3, 2).reshape(n, L, -1)
     squares = (flat @ W.transpose(0, 2, 1).reshape(n, -1, 1))[..., 0]
     trace = np.trace(S, axis1=2, axis2=3)
-    score += np.bincount(index.ravel(), 0.5 * (squares - dof[:, None] * trace).ravel(), K)
+    expects = dof[:, None] * trace
+    score += np.bincount(index.ravel(), 0.5 * (squares - expects).ravel(), K)
+    mean += np.bincount(index.ravel(), 0.5 * expects.ravel(), K)
     pairs = (index[:, :, None] * K + index[:, None, :]).ravel()
     expected = 0.5 * dof[:, None, None] * (flat @ other.transpose(0, 2, 1))
     product = flat @ (W[:, None] @ S).transpose(0, 1, 3, 2).reshape(n, L, -1).transpose(0, 2, 1)
@@ -502,10 +508,63 @@ def usual_start(structure: Structure, shared: tuple[SharedEffect, ...]) -> Array
         squares = float(np.trace(sets.scatter, axis1=1, axis2=2).sum())
         own = max(squares / (float(sets.dof.sum()) * size), 1e-9 * own)
     # Shared effects start above zero, from where they are free to go there.
-    share = max(0.1 * float((sets.e**2).mean()), TINY)
-    return np.concatenate(
-        [np.full(len(structure.names), max(own, TINY)), np.full(len(shared), share)]
-    )
+    share = 0.1 * float((sets.e**2).mean())
+    moved = [float((effect.loading**2).sum(axis=(1, 3)).mean()) for effect in shared]
+    common = [
+        share / m if effect.joints else share for effect, m in zip(shared, moved, strict=True)
+    ]
+    return np.concatenate([np.full(len(structure.names), max(own, TINY)), np.maximum(common, TINY)])
+
+
+# Is there a further variance?  A test that needs no fit with it.
+#
+# At θ_k = 0, U = ½ eᵀP V_k P e has the mean ½ tr(P V_k) and, the other variances being estimated,
+# the variance I_kk − I_ko I_oo⁻¹ I_ok; a scaled χ² with the same two moments gives its p-value
+# (Zhang and Lin 2003, Biostatistics 4, 57).
+
+
+def score_test(
+    structure: Structure, shared: tuple[SharedEffect, ...], theta: Array, k: int
+) -> float:
+    """p-value of the hypothesis θ_k = 0; `theta` (K,) is the fit without it, with zero in its
+    place."""
+    at = slope(structure, evaluate(structure, stacks(structure, shared), theta))
+    free = (theta > 0) & at.told
+    if not at.told[k]:
+        return 1.0
+    own, across = at.information[np.ix_(free, free)], at.information[free, k]
+    return _tail(float(at.score[k]), float(at.mean[k]), at.information[k, k], across, own)
+
+
+def score_test_of_columns(fit: Reml, F: Array) -> float:
+    """p-value of V_k = FFᵀ not being part of the covariance; F (C, size, q) of the fit's sets."""
+    state = fit.state
+    white, across, right = [], 0.0, 0.0
+    for w in state.whitened:
+        own = w.inverse @ F[w.stack.sets].reshape(len(w.B), -1, F.shape[2])
+        white.append(own)
+        across = across + np.tensordot(w.B, own, ((0, 1), (0, 1)))
+    W, mixed = np.zeros((F.shape[2],) * 2), np.zeros(len(state.theta))
+    for w, own in zip(state.whitened, white, strict=True):
+        H = own - w.B @ (state.Phi @ across)
+        W += np.tensordot(H, H, ((0, 1), (0, 1)))
+        right = right + np.tensordot(H, w.e - w.B @ state.x, ((0, 1), (0, 1)))
+        each = np.einsum("glnm,gnq,gmq->gl", w.A, H, H, optimize=True)
+        mixed += np.bincount(w.stack.index.ravel(), 0.5 * each.ravel(), len(mixed))
+    free = (state.theta > 0) & fit.slope.told
+    mean = 0.5 * float(np.trace(W))
+    score = 0.5 * float(right @ right) - mean
+    own = fit.slope.information[np.ix_(free, free)]
+    return _tail(score, mean, 0.5 * float((W**2).sum()), mixed[free], own)
+
+
+def _tail(score: float, mean: float, variance: float, across: Array, own: Array) -> float:
+    """p-value of a score with the information `variance`, of which the other variances (k,), with
+    the information `own` (k, k), explain a part `across`."""
+    left = variance - float(across @ np.linalg.pinv(own, hermitian=True) @ across)
+    if mean <= 0 or left <= LEAST_TOLD * variance:
+        return 1.0
+    return float(stats.chi2.sf(2 * mean * (mean + score) / left, 2 * mean**2 / left))
 
 
 # Covariance and degrees of freedom of an estimate whose weights were estimated too.

@@ -39,7 +39,11 @@ def held_out_residual(
     determines a parameter has no held-out residual: its rows are infinite.
 
     B (rows, columns) and residual (rows,) raw; `configuration` (observations,), `size` rows each.
+    Where all readings are correlated, those of `weights.together` are left out at a time.
     """
+    if weights.together is not None:
+        block = np.repeat(weights.together, size)
+        return residual + _growth_of_blocks(B, residual, weights, block)
     Q, R = linalg.qr(weights.apply(B), mode="economic")
     rows_of = np.repeat(configuration, size)
     return residual + _growth(B, Q, R, weights.apply(residual), rows_of)
@@ -111,6 +115,26 @@ def _growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> 
         growth[rows] = _times(B[rows], shift)
         growth[rows[alone]] = np.inf
     return growth
+
+
+def _growth_of_blocks(B: Array, residual: Array, weights: Weights, block: IntArray) -> Array:
+    """By how much (rows,) the residual grows where its block is left out, readings being correlated
+    by the noise FFᵀ that they have in common.
+
+    Its coefficients are columns beside B, held by rows of their own that never go out; what is
+    predicted is without them.
+    """
+    F = weights.common
+    assert F is not None
+    (n, p), k = B.shape, F.shape[1]
+    held = np.hstack([np.zeros((k, p)), np.eye(k)])
+    rows = np.vstack([weights.alone(np.hstack([B, F])), held])
+    Q, R = linalg.qr(rows, mode="economic")
+    e = np.concatenate([weights.alone(residual), np.zeros(k)])
+    e = e - Q @ (Q.T @ e)
+    seen = np.hstack([np.vstack([B, np.zeros((k, p))]), np.zeros((n + k, k))])
+    labels = np.concatenate([block, block.max() + 1 + np.arange(k)])
+    return _growth(seen, Q, R, e, labels)[:n]
 
 
 def _moved(share: Array, right: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -470,7 +470,8 @@ class _Course:
         # parameters already.
         bare = linearised(self.model, self.observed, every.fit.x, np.zeros(0, dtype=np.int64))
         column = np.random.default_rng(0).normal(size=(*bare.e.shape, 1))
-        self.readings: Readings = replace(bare, B=column)
+        visits = None if bare.visits is None else replace(bare.visits, drifts=False)
+        self.readings: Readings = replace(bare, B=column, visits=visits)
         self.standard = np.zeros(bare.e.shape)
 
     def problem_of(self, good: BoolArray, weights: Weights) -> Problem:

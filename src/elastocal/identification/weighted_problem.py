@@ -40,16 +40,44 @@ class Weights:
 
     `absolute` says whether Σ is stated in m² (then a whitened residual has expected size 1)
     or holds only up to a common factor, which the residual must tell.
+
+    Where all readings have some noise in common, as a drift in time, Σ = Σ₀ + FFᵀ with few columns
+    F, `common` (rows, k), and W = (I − low lowᵀ) W₀; `whiten` is then W₀, and a reading is judged
+    by those outside its block of time, `together` (observations,).
     """
 
     kind: str
     whiten: sparse.csr_array | None
     absolute: bool
     description: str
+    low: Array | None = None
+    common: Array | None = None
+    together: IntArray | None = None
 
     def apply(self, rows: Array) -> Array:
         """Whiten a vector (rows,) or matrix (rows, k)."""
+        return self._beside(self.alone(rows))
+
+    def _beside(self, own: Array) -> Array:
+        return own if self.low is None else own - self.low @ (self.low.T @ own)
+
+    def alone(self, rows: Array) -> Array:
+        """The same by what is not common to all readings, W₀."""
         return rows if self.whiten is None else self.whiten @ rows
+
+    def with_common(self, F: Array, together: IntArray) -> Weights:
+        """With noise FFᵀ more, F (rows, k), that readings far from each other share."""
+        U, size, _ = linalg.svd(self.apply(F), full_matrices=False)
+        # (I + FFᵀ)^(−1/2) = I − U (1 − (1 + s²)^(−1/2)) Uᵀ
+        low = U * np.sqrt(1 - 1 / np.sqrt(1 + size**2))
+        return replace(self, low=low[:, size > 0], common=F, together=together)
+
+    @property
+    def whole(self) -> sparse.csr_array | None:
+        """W (rows, rows), all of it."""
+        if self.low is None or self.whiten is None:
+            return self.whiten
+        return sparse.csr_array(self._beside(self.whiten.toarray()))
 
 
 def weights_for(

@@ -17,7 +17,9 @@ from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measuremen
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain
 from elastocal.model.choice import cell_of, load_chain
+from elastocal.model.effects import effect_of
 from elastocal.model.effects.base import Effect
+from elastocal.model.effects.driven import JointMotion
 from elastocal.model.evaluate import summary
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
@@ -286,6 +288,21 @@ class Model:
         return np.array(
             [common[p.effect, p.unit] if p.typical is None else p.typical for p in self.parameters]
         )
+
+    @cached_property
+    def moving(self) -> Model:
+        """The nominal arm with what registration places, and a small motion of each joint: the
+        last parameters, whose B is ∂(reading)/∂q.  A deflection counts as a position."""
+        spec = self.cell.model
+        placed = tuple(c for c in spec.effects if effect_of(c.name).registered)
+        observe = "position" if spec.observe == "deflection" else spec.observe
+        spec = replace(spec, effects=placed, observe=observe, link_gravity=False)
+        motion = JointMotion()
+        return Model.assembled(
+            self.chain, replace(self.cell, model=spec),
+            [(motion, place) for place in motion.places(self.chain, self.cell)],
+            backend=self._symbolic.backend,
+        )  # fmt: skip
 
     def deflection(self, table: Measurements, x: Array | None = None) -> NDArray:
         """Elastic deflections θ at static equilibrium.

@@ -186,7 +186,10 @@ def how_well_it_predicts(result: Calibration) -> str:
     )
     nominal, held = result.nominal_rms, result.heldout_rms
     if math.isfinite(held):
-        text = f"In poses that were not fitted the {what} is predicted to {length(held)} rms"
+        left_out = "" if result.noise.drift is None else " (whole blocks in time left out)"
+        text = (
+            f"In poses that were not fitted{left_out} the {what} is predicted to {length(held)} rms"
+        )
         if held > 0 and nominal > held:
             text += (
                 f"; the {nominal_arm(result)} is off by {length(nominal)}, "
@@ -578,6 +581,9 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "many_faulty_readings": lambda f: (
         f"{f.numbers['faulty']} of the {f.numbers['fitted']} readings fitted lie beyond what the "
         "noise explains"
+    ),
+    "drift": lambda f: (
+        f"base or tracker drift by {_length(f, 'sigma_um')} in the course of the campaign"
     ),
     "test_data_worse": lambda f: (
         f"test data are off by {_length(f, 'test_rms_um')} rms, more than chance explains"

@@ -10,8 +10,8 @@ import numpy as np
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.findings import shape_of
-from elastocal.identification.noise_structure import REGISTERED, SHARED
-from elastocal.identification.noise_summary import Noise, NoiseSize
+from elastocal.identification.noise_structure import EACH, JOINTS, REGISTERED, Kind
+from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.model.observations import available_noise
@@ -213,6 +213,10 @@ KINDS = {
     "polar": "range and transverse sizes of the tracker",
     "stated": "stated noise × factor",
 }
+SCATTERS = {
+    JOINTS: " + joints that settle anew at each visit",
+    EACH: " + joints that settle anew at each visit, each by its own size",
+}
 COMPARED = (
     "residual_above_stated_noise",
     "residual_agrees_with_stated_noise",
@@ -298,8 +302,8 @@ def noise_model_line(result: Calibration) -> str | None:
 def size_rows(noise: Noise) -> list[tuple[str, str]]:
     """Name and standard deviation of every noise component; of many, the two extremes."""
     sizes = noise.sizes or ()
-    shared = [s for s in sizes if s.shared]
-    own = [s for s in sizes if not s.shared]
+    shared = [s for s in sizes if s.shared or s.of_joints or s.drift]
+    own = [s for s in sizes if s not in shared]
     if len(own) <= FEW:
         return [(printable(s.name), _size(s)) for s in [*own, *shared]]
     ordered = sorted(own, key=_number)
@@ -326,10 +330,13 @@ def candidate_rows(noise: Noise) -> list[tuple[str, str, str]]:
 
 
 def kind_in_words(kind: str) -> str:
-    own = kind.removesuffix(SHARED)
+    parts = Kind.of(kind)
+    own = parts.own
     known = KINDS | {name: model.description for name, model in REGISTERED.items()}
     text = printable(known.get(own, own))
-    return f"{text} + deviations of a configuration" if kind.endswith(SHARED) else text
+    text += " + deviations of a configuration" if parts.shared else ""
+    text += SCATTERS.get(parts.joints, "")
+    return f"{text} + drift in time" if parts.time else text
 
 
 def repeats_line(result: Calibration) -> str | None:
@@ -399,6 +406,8 @@ def ratio(group: GroupSummary) -> str:
 def _size(s: NoiseSize) -> str:
     if s.sigma is None:
         return significant(_number(s))
+    if s.of_joints and not s.name.endswith(SLIDES):
+        return f"{significant(s.sigma * 1e6)} µrad"
     if s.name in TURNED or s.name.endswith("(rotation)"):
         return f"{significant(s.sigma * 1e6)} µrad"
     return length(s.sigma)

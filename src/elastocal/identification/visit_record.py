@@ -1,0 +1,129 @@
+"""What readings share because the arm came to them at one visit, or was read at nearby times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import optimize
+
+from elastocal.measurements import Measurements, visits
+from elastocal.model.effects.driven import JointMotion
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
+from elastocal.units import Array, BoolArray, IntArray
+
+# The visits behind each reading: what a joint that settles elsewhere there, or a base that has
+# drifted by then, would do to it.
+
+
+@dataclass(frozen=True)
+class VisitRecord:
+    """The rows of the table behind each of N readings: m of them, one but for deflections.
+
+    `visit` (N, m) numbers the arm's visits to a pose (−1: no such row), `motion` (N, m, size,
+    joints) is ∂(reading)/∂q there, `share` (N, m) the row's factor in the reading, `place` (N, m)
+    its time as a share of the campaign's `span` in s; where the table has no times (`timed`), the
+    order of the rows stands for them.  `turning` (joints,) says which joints are revolute.  Where
+    the model itself has what changes with time, no drift of the noise is looked for (`drifts`).
+    """
+
+    visit: IntArray
+    motion: Array
+    share: Array
+    place: Array
+    turning: BoolArray
+    timed: bool
+    span: float
+    drifts: bool = True
+
+    def take(self, chosen: BoolArray | IntArray) -> VisitRecord:
+        """That of the `chosen` readings."""
+        names = ("visit", "motion", "share", "place")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+
+    @cached_property
+    def n_visits(self) -> int:
+        return len(np.unique(self.visit[self.visit >= 0]))
+
+    def waves(self, lasting: float) -> Array:
+        """Loadings (N, k) on independent deviations of variance 1, which add up to a random course
+        of correlation exp(−|t − t′|/`lasting`), times as shares of the span."""
+        rows = course_waves(self.place.ravel(), lasting)
+        return np.asarray(np.einsum("nm,nmk->nk", self.share, rows.reshape(*self.place.shape, -1)))
+
+
+def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord | None:
+    """The visits of the observations of a fit at x (parameters,); None for an arm that no joint
+    moves."""
+    table, n = observed.table, len(observed.lead)
+    if not model.chain.n_joints:
+        return None
+    combine = observed.combine
+    count = np.diff(combine.indptr)
+    m = int(count.max(initial=1))
+    place = np.arange(m) < count[:, None]
+    row, share = np.zeros((n, m), dtype=np.int64), np.zeros((n, m))
+    row[place], share[place] = combine.indices, combine.data
+    moved = _joint_motion(model, table, x)[row] * share[:, :, None, None]
+    when, span, timed = _when(table)
+    turning = np.array([kind != "prismatic" for kind in model.chain.kinds])
+    visit = np.where(place, visits(table)[row], -1)
+    return VisitRecord(visit, moved, share, when[row], turning, timed, span)
+
+
+def _joint_motion(model: Model, table: Measurements, x: Array) -> Array:
+    """∂(reading)/∂q (rows, size, joints) of the nominal arm, base and markers where x has them."""
+    moving = model.moving
+    at = dict(zip(model.names, x.tolist(), strict=True))
+    here = np.array([at.get(p.name, p.nominal) for p in moving.parameters])
+    joints = np.flatnonzero([p.effect == JointMotion.name for p in moving.parameters])
+    B = moving.regressor(table, here, joints).B
+    return B.reshape(len(table), -1, len(joints))
+
+
+def _when(table: Measurements) -> tuple[Array, float, bool]:
+    """Time (rows,) of each row as a share of the campaign, its length, and whether it was recorded:
+    without times the visits, in the order of the rows, take equally long."""
+    if table.time is not None and np.isfinite(table.time).all() and np.ptp(table.time) > 0:
+        span = float(np.ptp(table.time))
+        return (table.time - table.time.min()) / span, span, True
+    _, first, visit = np.unique(visits(table), return_index=True, return_inverse=True)
+    order = np.argsort(np.argsort(first))[visit.ravel()].astype(float)
+    span = max(float(order.max(initial=0.0)), 1.0)
+    return order / span, span, False
+
+
+# A course in time as a sum of waves.
+#
+# On [0, 1] the correlation exp(−c|t − t′|) has the eigenfunctions cos ω(t − ½) with ω tan(ω/2) = c
+# and sin ω(t − ½) with ω cot(ω/2) = −c, of eigenvalues 2c/(ω² + c²) (Karhunen and Loève; Ghanem and
+# Spanos 1991, section 2.3.3).  Those left out are what changes faster than the k-th wave: noise of
+# single visits.
+
+MOST_WAVES = 20
+ENOUGH = 0.97  # of the variance
+
+
+def course_waves(t: Array, lasting: float) -> Array:
+    """Waves (n, k) at t (n,) in 0 … 1, their products summing to nearly exp(−|t − t′|/lasting)."""
+    c = 1 / lasting
+    found, told = [], 0.0
+    for k in range(MOST_WAVES):
+        even = k % 2 == 0
+
+        def end(w: float, even: bool = even) -> float:
+            s, v = np.sin(w / 2), np.cos(w / 2)
+            return float(w * s - c * v) if even else float(w * v + c * s)
+
+        w = optimize.brentq(end, k * np.pi, (k + 1) * np.pi) if k or end(0.0) else 0.0
+        value = 2 * c / (w**2 + c**2)
+        # ∫ cos² and ∫ sin² over the interval.
+        norm = 0.5 * (1 + np.sin(w) / w) if even else 0.5 * (1 - np.sin(w) / w)
+        wave = np.cos(w * (t - 0.5)) if even else np.sin(w * (t - 0.5))
+        found.append(wave * np.sqrt(value / norm))
+        told += value
+        if told > ENOUGH:
+            break
+    return np.column_stack(found)

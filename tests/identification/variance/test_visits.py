@@ -1,0 +1,166 @@
+"""Joints that settle anew at each visit and drift in time: formulas, choice, false alarms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import linalg, stats
+
+from elastocal.errors import InputError
+from elastocal.identification import Readings, estimate_noise, kenward_roger
+from elastocal.identification.noise_choice import NoiseFit, time_blocks, weights_of
+from elastocal.identification.residuals import held_out_residual
+from elastocal.identification.visit_record import VisitRecord, course_waves
+
+SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 2e-5, 4e-5, 0.2
+
+
+def readings(seed=0, configurations=20, repeats=1):
+    """Two loads and two markers at each pose, a visit for each load and repeat; e is zero."""
+    rng = np.random.default_rng(seed)
+    labels = np.array(
+        [
+            (c, k, m, r)
+            for c in range(configurations)
+            for r in range(repeats)
+            for k in range(2)
+            for m in range(2)
+        ]
+    )
+    c, load, marker, _repeat = labels.T
+    visit = np.unique(labels[:, [0, 3, 1]], axis=0, return_inverse=True)[1].ravel()
+    n, joints = len(labels), 3
+    motion = rng.normal(size=(configurations, 2, 3, joints))[c, marker]
+    when = visit / visit.max()
+    record = VisitRecord(
+        visit[:, None], motion[:, None], np.ones((n, 1)), when[:, None],
+        np.ones(joints, dtype=bool), True, 3600.0,
+    )  # fmt: skip
+    B = rng.normal(size=(configurations, 2, 2, 3, 5))[c, load, marker]
+    return Readings(B, np.zeros((n, 3)), c, load, marker, visits=record)
+
+
+def covariance(r, joints=0.0, drift=0.0):
+    """V (rows, rows) from its definition."""
+    n = len(r)
+    visit, when = r.visits.visit[:, 0], r.visits.place[:, 0]
+    G = r.visits.motion[:, 0].reshape(3 * n, -1)
+    same = np.repeat(np.repeat(visit[:, None] == visit, 3, axis=0), 3, axis=1)
+    waves = course_waves(when, LASTING)
+    return (
+        SIGMA**2 * np.eye(3 * n)
+        + joints**2 * (G @ G.T) * same
+        + drift**2 * np.kron(waves @ waves.T, np.eye(3))
+    )
+
+
+def drawn(r, rng, joints=0.0, drift=0.0):
+    V = covariance(r, joints, drift)
+    return r.moved((np.linalg.cholesky(V) @ rng.normal(size=len(V))).reshape(-1, 3))
+
+
+def restricted(V, B, e):
+    """ℓ_R, x̂ and Φ with dense matrices."""
+    L = np.linalg.cholesky(V)
+    WB, We = linalg.solve_triangular(L, B, lower=True), linalg.solve_triangular(L, e, lower=True)
+    M = WB.T @ WB
+    x = np.linalg.solve(M, WB.T @ We)
+    left = We - WB @ x
+    twice = 2 * np.log(np.diag(L)).sum() + np.linalg.slogdet(M)[1] + left @ left
+    return -0.5 * (twice + (len(e) - len(x)) * np.log(2 * np.pi)), x, np.linalg.inv(M)
+
+
+@pytest.mark.parametrize("kind", ["independent+joints", "independent+time"])
+def test_likelihood_and_estimate_are_those_of_dense_matrices(kind):
+    r = drawn(readings(), np.random.default_rng(1), SCATTER, DRIFT)
+    found = estimate_noise(r, kind)
+    V = found.fit.own[0] * np.eye(3 * len(r))
+    if found.lasting is None:
+        V += found.fit.common[0] / SCATTER**2 * (covariance(r, SCATTER) - covariance(r))
+    else:
+        waves = r.visits.waves(found.lasting)
+        V += found.fit.own[1] * np.kron(waves @ waves.T, np.eye(3))
+    B, e = r.B.reshape(3 * len(r), -1), r.e.ravel()
+    value, x, Phi = restricted(V, B, e)
+    # B is orthonormal in the fit, which shifts ℓ by ½ log|BᵀB|.
+    shift = 0.5 * np.linalg.slogdet(B.T @ B)[1]
+    assert found.fit.log_likelihood == pytest.approx(value + shift, rel=1e-9)
+    assert np.allclose(found.x, x, atol=1e-6 * np.sqrt(np.diag(Phi)).min())
+    p = len(x)
+    plain = found.basis @ found.fit.state.Phi @ found.basis.T
+    assert np.allclose(plain[:p, :p], Phi, rtol=1e-6)
+    # No other variances are likelier.
+    for k in range(len(found.fit.state.theta)):
+        assert abs(found.fit.slope.score[k] * found.fit.state.theta[k]) < 1e-4
+
+
+def test_weights_whiten_what_drifts_and_blocks_are_left_out_as_by_fits_to_the_others():
+    r = drawn(readings(), np.random.default_rng(2), SCATTER, DRIFT)
+    found = estimate_noise(r, "independent+joints+time")
+    weights = weights_of(found, r)
+    waves = r.visits.waves(found.lasting)
+    G = covariance(r, 1.0) - covariance(r)
+    V = (
+        found.fit.own[0] * np.eye(3 * len(r)) + found.fit.common[0] * G
+        + found.fit.own[1] * np.kron(waves @ waves.T, np.eye(3))
+    )  # fmt: skip
+    W = weights.whole.toarray()
+    assert np.allclose(W @ V @ W.T, np.eye(len(V)), atol=1e-8)
+    B, e = r.B.reshape(len(V), -1), r.e.ravel()
+    residual = e - B @ found.x
+    held = held_out_residual(B, residual, weights, r.configuration, 3)
+    block = np.repeat(time_blocks(r, found.lasting), 3)
+    assert len(np.unique(block)) == 5
+    for b in range(5):
+        others = block != b
+        x = restricted(V[np.ix_(others, others)], B[others], e[others])[1]
+        assert np.allclose(held[~others], e[~others] - B[~others] @ x, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("joints", "drift", "part"), [(SCATTER, 0.0, "+joints"), (0.0, DRIFT, "+time")]
+)
+def test_what_is_there_is_chosen_and_its_size_found(joints, drift, part):
+    r, rng = readings(), np.random.default_rng(3)
+    kinds: list[NoiseFit] = [estimate_noise(drawn(r, rng, joints, drift)) for _ in range(5)]
+    assert all(part in k.kind or (part == "+joints" and "joint" in k.kind) for k in kinds)
+    assert all({t.part: t.p for t in k.tests}[part] < 0.01 for k in kinds)
+    if joints:
+        sizes = [np.sqrt(k.fit.common[-1]) for k in kinds]
+        assert abs(np.mean(sizes) / SCATTER - 1) < 0.2
+
+
+def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
+    """p-values of independent noise are uniform: 1 % and 20 % below these, within chance."""
+    r, rng = readings(configurations=12), np.random.default_rng(4)
+    p = np.array([[t.p for t in estimate_noise(drawn(r, rng)).tests] for _ in range(60)])
+    for level, most in ((0.01, 4), (0.2, 23)):
+        assert (((p < level).sum(axis=0)) <= most).all()
+        assert stats.binom.sf(most, len(p), level) < 2e-3
+    assert ((p > 0.5).mean(axis=0) > 0.3).all()
+
+
+def test_repeats_of_other_visits_are_apart_where_it_matters():
+    r = readings(repeats=3)
+    rng = np.random.default_rng(5)
+    found = estimate_noise(drawn(r, rng, SCATTER), "independent+joints")
+    assert len(found.fit.structure.sets) == len(r)
+    assert np.sqrt(found.fit.common[0]) == pytest.approx(SCATTER, rel=0.3)
+    plain = estimate_noise(drawn(r, rng, SCATTER), "independent+configuration")
+    assert len(plain.fit.structure.sets) == len(r) // 3
+
+
+def test_kenward_roger_widens_for_a_drift_and_knows_few_degrees_of_freedom():
+    found = estimate_noise(drawn(readings(), np.random.default_rng(6), 0.0, DRIFT), "axis+time")
+    plain = (found.basis @ found.fit.state.Phi @ found.basis.T).diagonal()[:5]
+    assert (found.covariance.matrix.diagonal() >= plain).all()
+    assert np.allclose(kenward_roger(found.fit, found.basis)[0], found.spread)
+
+
+def test_readings_without_visits_have_neither():
+    r = replace(drawn(readings(), np.random.default_rng(7), SCATTER), visits=None)
+    assert estimate_noise(r).tests == ()
+    with pytest.raises(InputError, match="visits"):
+        estimate_noise(r, "independent+joints")
+    with pytest.raises(InputError, match="no noise model"):
+        estimate_noise(r, "axis+sometimes")
