@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -114,6 +114,40 @@ def atomic_binary_writer(path: str | Path) -> Iterator[BinaryIO]:
         yield handle
 
 
+# While `together` runs: the files that it holds back, and what is written of them so far.
+_held: set[Path] = set()
+_written: list[tuple[Path, Path]] = []
+
+
+@contextmanager
+def together(paths: Iterable[str | Path]) -> Iterator[None]:
+    """Files under `paths` that are written in the `with` block appear at its end, all of them.
+
+    Where the block fails none does, and what stood there before is untouched.
+    """
+    _held.update(_final(path) for path in paths)
+    try:
+        yield
+        for temporary, target in _written:
+            with _write_errors(target):
+                os.replace(temporary, target)
+    finally:
+        for temporary, _ in _written:
+            with suppress(OSError):
+                temporary.unlink()
+        _held.clear()
+        _written.clear()
+
+
+def temporary_beside(path: Path) -> Path:
+    """A hidden name of its own in the folder of `path`, for what is not finished."""
+    return path.with_name(f".{path.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}")
+
+
+def _final(path: str | Path) -> Path:
+    return Path(os.path.realpath(path))  # a link keeps pointing to what it points to
+
+
 @contextmanager
 def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
     _check_path(path)
@@ -126,14 +160,17 @@ def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
             with open(target, f"w{binary}", **options) as device:
                 yield device
             return
-        target = Path(os.path.realpath(target))  # a link keeps pointing to what it points to
-        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}")
+        target = _final(target)
+        temporary = temporary_beside(target)
         try:
             with open(temporary, f"x{binary}", **options) as handle:
                 yield handle
                 handle.flush()
                 os.fsync(handle.fileno())
-            os.replace(temporary, target)
+            if target in _held:
+                _written.append((temporary, target))
+            else:
+                os.replace(temporary, target)
         except BaseException:
             with suppress(OSError):
                 temporary.unlink()

@@ -22,7 +22,7 @@ import time
 import traceback
 import unicodedata
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -54,7 +54,8 @@ class Case:
     code: int = 0
     stdout: str = ""
     stderr: str = ""
-    seconds: float = 0.0
+    seconds: float = 0.0  # of processor time
+    took: float = 0.0  # s by the clock
     resident: int = 0
     complaints: list[str] = field(default_factory=list)
 
@@ -113,24 +114,33 @@ def make(seed: int, base: Path, folder: Path, verbs: tuple[str, ...] = ()) -> Ca
 
 def run(case: Case) -> Case:
     """Run the case in a child; what broke is in its `complaints`."""
-    before = _seen(case.folder)
+    before = seen(case.folder)
+    execute(case)
+    case.complaints = list(_complaints(case, before))
+    return case
+
+
+def execute(
+    case: Case, prepare: Callable[[], object] = lambda: None, longest: float = WALL
+) -> Case:
+    """Run the case in a child, which calls `prepare` before the command; killed after `longest` s."""
     out, err = case.folder.parent / "stdout", case.folder.parent / "stderr"
     begun = time.monotonic()
     sys.stdout.flush(), sys.stderr.flush()
     child = os.fork()
     if child == 0:
-        _child(case, out, err)
-    status, usage = _waited(child, begun + WALL)
+        _child(case, out, err, prepare)
+    status, usage = _waited(child, begun + longest)
+    case.took = time.monotonic() - begun
     case.seconds = usage.ru_utime + usage.ru_stime
     case.resident = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     case.code = os.waitstatus_to_exitcode(status)
     case.stdout = out.read_text(encoding="utf-8", errors="surrogateescape")
     case.stderr = err.read_text(encoding="utf-8", errors="surrogateescape")
-    case.complaints = list(_complaints(case, before))
     return case
 
 
-def _child(case: Case, out: Path, err: Path) -> None:
+def _child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) -> None:
     """In the child: the command as a shell would start it; never returns."""
     code = 1
     try:
@@ -146,6 +156,7 @@ def _child(case: Case, out: Path, err: Path) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (room, room))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 5))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        prepare()
         sys.argv = ["elastocal", case.command.verb, *case.words]
         from elastocal.__main__ import main
 
@@ -184,15 +195,15 @@ def _waited(child: int, deadline: float) -> tuple[int, resource.struct_rusage]:
     return status, usage
 
 
-def _seen(folder: Path) -> dict[str, bytes | None]:
+def seen(folder: Path) -> dict[str, bytes | None]:
     """Every file below `folder` with its content; None for what is no file, or too large."""
-    seen: dict[str, bytes | None] = {}
+    found: dict[str, bytes | None] = {}
     for above, _, names in os.walk(folder):
         for name in names:
             path = Path(above, name)
             small = path.is_file() and path.stat().st_size < 50_000_000
-            seen[str(path.relative_to(folder))] = path.read_bytes() if small else None
-    return seen
+            found[str(path.relative_to(folder))] = path.read_bytes() if small else None
+    return found
 
 
 def _complaints(case: Case, before: dict[str, bytes | None]) -> Iterator[str]:
@@ -212,7 +223,7 @@ def _complaints(case: Case, before: dict[str, bytes | None]) -> Iterator[str]:
     odd = {c for c in told if c != "\n" and (unicodedata.category(c) in ("Cc", "Cs") or c in DIRECTIONS)}
     if odd:
         yield f"raw characters {sorted(map(ascii, odd))}"
-    after = _seen(case.folder)
+    after = seen(case.folder)
     new = {name for name in after if name not in before or after[name] != before[name]}
     if case.code != 0:
         kept = KEPT.get(case.command.verb, ())
@@ -228,9 +239,9 @@ def _complaints(case: Case, before: dict[str, bytes | None]) -> Iterator[str]:
     if case.code == 0:
         for name in sorted(new):
             content = after[name]
-            if problem := None if content is None else _malformed(name, content):
+            if problem := None if content is None else malformed(name, content):
                 yield f"{name}: {problem}"
-        if _as_json(case.words) and (problem := _malformed("x.json", case.stdout.encode())):
+        if _as_json(case.words) and (problem := malformed("x.json", case.stdout.encode())):
             yield f"stdout: {problem}"
 
 
@@ -243,7 +254,7 @@ def _message_complaints(case: Case) -> Iterator[str]:
         return
     message = case.stderr[case.stderr.index(messages[0]) + len(messages[0]) :]
     words = (*case.words, *case.command.line.split(), *case.command.named)
-    names = {Path(word).name for word in words} - {""}
+    names = {Path(word).name or "." for word in words}
     if not (any(repr(name)[1:-1] in message for name in names) or NAMED.search(message)):
         yield "names no culprit"
 
@@ -254,7 +265,7 @@ def _as_json(words: list[str]) -> bool:
     return any(not above.startswith("-") or above == "-q" for above in before)
 
 
-def _malformed(name: str, content: bytes) -> str | None:
+def malformed(name: str, content: bytes) -> str | None:
     """What is wrong with a written file of this name, or None."""
     ending = name.rpartition(".")[2].lower()
     try:

@@ -17,9 +17,9 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path[:0] = [str(Path(__file__).parents[2] / "src"), str(Path(__file__).parents[1])]
 
-from fuzz import campaign, harness  # noqa: E402
+from fuzz import campaign, harness, kills  # noqa: E402
 
 
 def main() -> int:
@@ -28,6 +28,8 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=float("inf"), help="longest time")
     parser.add_argument("--seed", type=int, default=0, help="number of the first case")
     parser.add_argument("--verb", action="append", default=[], help="only this verb; repeatable")
+    parser.add_argument("--kills", type=int, default=0, help="kill each command so many times")
+    parser.add_argument("--full", type=int, default=0, help="fill its disk so many times")
     parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-"))
@@ -52,6 +54,11 @@ def main() -> int:
         if case.complaints:
             broken += 1
             print(case.told(), flush=True)
+    if asked.kills or asked.full:
+        found, tried = kills.run_kills(base, folder, asked.seed, asked.kills, asked.full)
+        broken += found
+        for (verb, how), n in tried.items():
+            print(f"{verb:12} {how}: {n}")
     shutil.rmtree(folder, ignore_errors=True)
     for (verb, code), n in sorted(ends.items()):
         print(f"{verb:12} exit {code}: {n}")

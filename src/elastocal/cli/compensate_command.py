@@ -100,7 +100,7 @@ def compensate(
     """
     from elastocal import verbs
     from elastocal.compensation.tool import one_target, tool_point
-    from elastocal.files import atomic_write_text
+    from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
 
@@ -148,8 +148,9 @@ def compensate(
             corrections = correction_table(arm, lines, where, force, start, seed, progress)
             content["table"], texts[table] = _table(corrections, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
-        for path, text in texts.items():
-            atomic_write_text(path, text)
+        with together(written):
+            for path, text in texts.items():
+                atomic_write_text(path, text)
     if as_json:
         both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
         typer.echo(json_text(both))

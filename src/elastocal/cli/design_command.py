@@ -114,6 +114,7 @@ def design(
 
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
+    from elastocal.files import together
     from elastocal.planning.design import Checkpoint, key_of
     from elastocal.planning.design import design as run
     from elastocal.verbs import design_request
@@ -156,12 +157,13 @@ def design(
                 checkpoint.drop()
             raise
         interrupts.check()
-        _write_all(plan, output, programs, picture)
-        if report is not None:
-            from elastocal.report.page import write_page
+        with together(written):
+            _write_all(plan, output, programs, picture)
+            if report is not None:
+                from elastocal.report.page import write_page
 
-            progress("writing the report")
-            write_page(plan, report, list(dict.fromkeys(files)), repeated())
+                progress("writing the report")
+                write_page(plan, report, list(dict.fromkeys(files)), repeated())
         checkpoint.clear()
     if as_json:
         typer.echo(summary.read_text(encoding="utf-8"), nl=False)
@@ -227,7 +229,7 @@ def _check_programs(cell: Cell, programs: list[Path]) -> None:
 
 
 def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | None) -> None:
-    """plan.csv, plan.json, robot programs and picture, each whole or not at all."""
+    """plan.csv, plan.json, robot programs and picture."""
     from elastocal.files import atomic_write_text
     from elastocal.saving import save_plan
 

@@ -145,21 +145,23 @@ def write_results(
     truth: Truth | None = None,
     published: Published | None = None,
 ) -> None:
-    """Write what was asked for, each file whole or not at all.
+    """Write what was asked for, all of it or nothing.
 
     `inputs` are named with their hashes in the report, where `truth` and `published` (SI) stand
     beside the estimates.
     """
+    from elastocal.files import together
     from elastocal.saving import save_residuals, write_json
 
-    if output is not None:
-        write_json(output, result.to_json())
-    if residuals is not None:
-        save_residuals(result, residuals)
-    if report is not None:
-        from elastocal.report.page import write_page
+    with together(path for path in (output, residuals, report) if path is not None):
+        if output is not None:
+            write_json(output, result.to_json())
+        if residuals is not None:
+            save_residuals(result, residuals)
+        if report is not None:
+            from elastocal.report.page import write_page
 
-        write_page(result, report, inputs, repeated(), seed, truth=truth, published=published)
+            write_page(result, report, inputs, repeated(), seed, truth=truth, published=published)
 
 
 def _read_covariance(path: Path) -> Any:

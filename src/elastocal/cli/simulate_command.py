@@ -56,6 +56,7 @@ def simulate(
     Example: elastocal simulate cell.toml plan.csv -o data.csv --set joint2.compliance=3e-7
     --load 0 0 -2600 --repeats 6
     """
+    from elastocal.files import together
     from elastocal.measurements import write_measurements
     from elastocal.model.manipulator import Model
     from elastocal.saving import write_json
@@ -69,10 +70,11 @@ def simulate(
         model, poses, values=dict(_assignment(text) for text in set_ or ()), draw=draw, load=load,
         repeats=repeats, noise=not no_noise, seed=seed,
     )  # fmt: skip
-    write_measurements(table, output, model.chain.kinds)
     named = dict(zip(model.names, x.tolist(), strict=True))
-    if truth is not None:
-        write_json(truth, named)
+    with together(written):
+        write_measurements(table, output, model.chain.kinds)
+        if truth is not None:
+            write_json(truth, named)
     if as_json:
         summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
         typer.echo(json_text(summary | {"seed": seed, "truth": named}))
