@@ -164,6 +164,8 @@ def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
         temporary = temporary_beside(target)
         try:
             with open(temporary, f"x{binary}", **options) as handle:
+                if target.exists():  # what others may not read they may not read afterwards
+                    os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
                 yield handle
                 handle.flush()
                 os.fsync(handle.fileno())

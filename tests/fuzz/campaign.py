@@ -253,15 +253,15 @@ above = "count"
 """
 
 COMMANDS = (
+    Command("design", "wished.toml -o plan.csv --effort quick --candidates 30 --curve 3,4 "
+            "--json -q --criterion A", ("plan.csv", "plan.json"), ("arm.csv", "links.csv")),
+    Command("design", "wished.toml -o plan.csv --effort quick --poses 4 --candidates 40 "
+            "--criterion D --augment data.csv --program robot.src --picture plan.svg",
+            ("plan.csv", "plan.json", "robot.src", "plan.svg"), ("arm.csv", "links.csv")),
     Command("design", "planned.toml -o plan.csv --effort quick --knowledge knowledge.toml "
             "--program robot.script --report design.html --fix joint1.compliance",
             ("plan.csv", "plan.json", "robot.script", "design.html"),
             ("arm.csv", "links.csv", "path.csv", "fixture.stl")),
-    Command("design", "wished.toml -o plan.csv --effort quick --poses 4 --candidates 40 "
-            "--criterion D --augment data.csv --program robot.src --picture plan.svg",
-            ("plan.csv", "plan.json", "robot.src", "plan.svg"), ("arm.csv", "links.csv")),
-    Command("design", "wished.toml -o plan.csv --effort quick --candidates 30 --curve 3,4 "
-            "--json -q --criterion A", ("plan.csv", "plan.json"), ("arm.csv", "links.csv")),
     Command("simulate", "deflecting.toml poses.csv -o out.csv --set joint2.compliance=2e-6 "
             "--truth truth.json --draw 0.1 --load 0 0 -98 --repeats 2 --seed 3",
             ("out.csv", "truth.json"), ("arm.csv", "links.csv")),
@@ -271,16 +271,18 @@ COMMANDS = (
             "--preview", ("out.csv",), ("arm.urdf",)),
     Command("import", "points.txt poses.dat --preset spatialanalyzer --preset kuka -o out.csv "
             "--length-unit mm --angle-unit deg --json", ("out.csv",)),
+    Command("identify", "deflecting.toml data.csv -o out.json --weights covariance "
+            "--covariance noise.csv --fix joint1 --method wls --json -q "
+            "--residuals out.csv", ("out.json", "out.csv"), ("arm.csv", "links.csv")),
     Command("identify", "deflecting.toml data.csv -o out.json --test data.csv --report out.html "
             "--residuals out.csv --knowledge knowledge.toml",
             ("out.json", "out.html", "out.csv"), ("arm.csv", "links.csv")),
     Command("identify", "placed.toml placed.csv -o out.json --method huber --outliers keep "
             "--test placed.csv --report out.html", ("out.json", "out.html"), ("arm.urdf",)),
-    Command("identify", "deflecting.toml data.csv -o out.json --weights covariance "
-            "--covariance noise.csv --fix joint1 --method wls --json -q",
-            ("out.json",), ("arm.csv", "links.csv")),
     Command("identify", "placed.toml placed.csv --residuals out.csv --noise axis --bounded "
             "--physical --seed 4", ("out.csv",), ("arm.urdf",)),
+    Command("diagnose", "deflecting.toml data.csv -o out.json --cell-out cell_out.toml -q",
+            ("out.json", "cell_out.toml"), ("arm.csv", "links.csv")),
     Command("diagnose", "deflecting.toml data.csv -o out.json --report out.html --plan extra.csv "
             "--poses 3 --cell-out cell_out.toml --without backlash",
             ("out.json", "out.html", "cell_out.toml"), ("arm.csv", "links.csv")),

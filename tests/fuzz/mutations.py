@@ -306,6 +306,8 @@ def xml_changed(text: str, rng: Random) -> str:
     if how == 4:
         return text[: tag.end()] + tag[0] + text[tag.end() :]
     quoted = list(re.finditer(r'"([^"]*)"', text))
+    if not quoted:
+        return text
     a, b = rng.choice(quoted), rng.choice(quoted)
     new = f'"{rng.choice((b[1], *NAMES, *NUMBERS, "1 2", "1 2 3 4", "nan nan nan"))}"'
     return text[: a.start()] + new + text[a.end() :]

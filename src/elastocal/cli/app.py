@@ -181,15 +181,17 @@ def check_outputs(*paths: Path | None) -> list[Path]:
 
 def check_apart(written: list[Path], read: Iterable[Path | None], cell: Cell | None = None) -> None:
     """Refuse to write over an input or a file that the `cell` names, or two outputs into one."""
-    inputs = {path.resolve() for path in read if path is not None}
-    inputs |= set() if cell is None else {path.resolve() for path in files_of(cell)}
-    taken: set[Path] = set()
+    # Not Path.resolve, which raises RuntimeError where links go round in a circle.
+    inputs = {os.path.realpath(path) for path in read if path is not None}
+    inputs |= set() if cell is None else {os.path.realpath(path) for path in files_of(cell)}
+    taken: set[str] = set()
     for path in written:
-        if path.resolve() in inputs:
+        real = os.path.realpath(path)
+        if real in inputs:
             raise InputError(f"{path} is read and would be written over; name another output")
-        if path.resolve() in taken:
+        if real in taken:
             raise InputError(f"{path}: two outputs of the same name; name another one")
-        taken.add(path.resolve())
+        taken.add(real)
 
 
 def files_of(cell: Cell) -> list[Path]:

@@ -24,7 +24,7 @@ from elastocal.cli.app import (
     progress_line,
     repeated,
 )
-from elastocal.errors import ElastocalError, InputError, require
+from elastocal.errors import InputError, require
 
 if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell
@@ -152,7 +152,7 @@ def design(
             plan = run(wanted, options, checkpoint, progress)
         except Exception as error:
             interrupts.check()
-            if isinstance(error, ElastocalError):
+            if not isinstance(error, OSError):
                 # The same input ends here again: there is nothing to go on with.
                 checkpoint.drop()
             raise

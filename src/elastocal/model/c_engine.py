@@ -202,9 +202,9 @@ def compile_library(compiler: Compiler, source: str) -> bytes:
     """
     with tempfile.TemporaryDirectory(prefix="elastocal-") as folder:
         text, library = Path(folder, "rows.c"), Path(folder, f"rows{SUFFIX}")
-        text.write_text(source)
         command = [*compiler.command, *FLAGS, text.name, "-o", library.name, *LIBRARIES]
         try:
+            text.write_text(source)
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, errors="replace",
                 timeout=TIME_LIMIT,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from elastocal import __version__
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, option, require
+from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_write_bytes
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
@@ -161,7 +161,13 @@ class Stage:
         text = io.BytesIO()
         np.savez(text, allow_pickle=False, **{k: np.asarray(v) for k, v in state.items()})
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write_bytes(self.path, text.getvalue())
+        try:
+            atomic_write_bytes(self.path, text.getvalue())
+        except InputError:
+            if self.path.parent.is_dir():
+                raise
+            # Another run of the same design has ended, and cleared the folder that both used.
+            self.save(state)
 
 
 @dataclass(frozen=True)
