@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError
-from elastocal.files import decoded, open_input
+from elastocal.files import check_size, decoded, open_input
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import Array, IntArray, to_si
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 MAX_LINE = 64 * 1024
 MAX_BLANK_LINES = 10_000
 MAX_ROWS = 5_000_000
+MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
 CHUNK_BYTES = 1 << 20
 DELIMITERS = ",;\t"
 BOM = b"\xef\xbb\xbf"
@@ -556,7 +557,7 @@ def read_table(
         return _read_csv(CsvLines(source, BytesIO(text.encode()), what, comments), choose)
     if Path(path).suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(source, choose, what)
-    with open_input(path, what) as handle:
+    with open_input(path, what, MOST_BYTES) as handle:
         return _read_csv(CsvLines(source, handle, what, comments), choose)
 
 
@@ -581,11 +582,26 @@ def _read_parquet(source: str, choose: ChooseLayout, what: str) -> RawTable:
     """The same of a Parquet file, where pandas finds an engine to read it; rows from 1."""
     import pandas as pd
 
-    with open_input(source, what) as handle:
+    with open_input(source, what, MOST_BYTES) as handle:
         if handle.read(4) != b"PAR1":
             raise InputError(f"{source}: is not a Parquet file; check it, or name a CSV .csv")
     try:
+        from pyarrow.parquet import ParquetFile
+
+        # A few kilobytes may unpack to more than memory holds.
+        facts = ParquetFile(source).metadata
+        unpacked = sum(
+            facts.row_group(i).column(k).total_uncompressed_size
+            for i in range(facts.num_row_groups)
+            for k in range(facts.num_columns)
+        )
+        rows = facts.num_rows
+        if not 0 <= rows <= MAX_ROWS:
+            raise InputError(f"{source}: more than {MAX_ROWS:,} rows; split the table")
+        check_size(source, what, unpacked, MOST_BYTES)
         frame = pd.read_parquet(source)
+    except InputError:
+        raise
     except ImportError:
         raise InputError(
             f"{source}: reading Parquet needs pyarrow; run 'pip install pyarrow', or save the "

@@ -101,7 +101,7 @@ def export(
 
 def _tell(done: Exported) -> None:
     """What the file holds and what not, for people."""
-    from elastocal.report.formatting import printable
+    from elastocal.text import printable
 
     screen = console()
     cost, (name, in_title) = done.cost, NAMES[done.format]
@@ -154,8 +154,9 @@ def _rounding(metres: float | None) -> str:
 
 
 def _cost_table(title: str, cost: Cost) -> Table:
-    from elastocal.report.formatting import length, printable
+    from elastocal.report.formatting import length
     from elastocal.report.terminal import titled
+    from elastocal.text import printable
 
     table = titled(title)
     for head in ("effect", "markers rms", "max", "flange rms", "max", ""):

@@ -28,7 +28,7 @@ from elastocal.report.diagnosis_view import (
     pair_rows,
     untested_rows,
 )
-from elastocal.report.formatting import ShownTable, capital, length, printable
+from elastocal.report.formatting import ShownTable, capital, length
 from elastocal.report.identification_view import (
     ParameterRow,
     Truth,
@@ -43,6 +43,7 @@ from elastocal.report.identification_view import (
 )
 from elastocal.report.method_and_noise import candidate_rows, size_rows
 from elastocal.report.plan_view import curve_rows, interval_rows, plan_lines, pose_rows, reason_rows
+from elastocal.text import printable
 
 PRINTED_WIDTH = 100  # columns of a result as plain text
 
