@@ -585,23 +585,9 @@ def _read_parquet(source: str, choose: ChooseLayout, what: str) -> RawTable:
     with open_input(source, what, MOST_BYTES) as handle:
         if handle.read(4) != b"PAR1":
             raise InputError(f"{source}: is not a Parquet file; check it, or name a CSV .csv")
+    _check_unpacked(source, what)
     try:
-        from pyarrow.parquet import ParquetFile
-
-        # A few kilobytes may unpack to more than memory holds.
-        facts = ParquetFile(source).metadata
-        unpacked = sum(
-            facts.row_group(i).column(k).total_uncompressed_size
-            for i in range(facts.num_row_groups)
-            for k in range(facts.num_columns)
-        )
-        rows = facts.num_rows
-        if not 0 <= rows <= MAX_ROWS:
-            raise InputError(f"{source}: more than {MAX_ROWS:,} rows; split the table")
-        check_size(source, what, unpacked, MOST_BYTES)
         frame = pd.read_parquet(source)
-    except InputError:
-        raise
     except ImportError:
         raise InputError(
             f"{source}: reading Parquet needs pyarrow; run 'pip install pyarrow', or save the "
@@ -623,6 +609,23 @@ def _read_parquet(source: str, choose: ChooseLayout, what: str) -> RawTable:
     )
     table.check_labels()
     return table
+
+
+def _check_unpacked(source: str, what: str) -> None:
+    """Raise InputError where a Parquet file of some kilobytes would unpack beyond all bounds."""
+    try:
+        from pyarrow.parquet import ParquetFile
+
+        facts = ParquetFile(source).metadata
+        groups = [facts.row_group(i) for i in range(facts.num_row_groups)]
+        columns = range(facts.num_columns)
+        unpacked = sum(g.column(k).total_uncompressed_size for g in groups for k in columns)
+        rows = facts.num_rows
+    except Exception:  # missing or damaged, which its reader says
+        return
+    if rows > MAX_ROWS:
+        raise InputError(f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out")
+    check_size(source, what, unpacked, MOST_BYTES)
 
 
 def _parquet_numbers(source: str, name: str, column: pd.Series) -> Array:
