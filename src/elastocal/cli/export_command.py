@@ -16,8 +16,8 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
 )
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -93,10 +93,10 @@ def export(
         done = run(calibrated, wish, progress)
     atomic_write_text(output, done.text)
     if as_json:
-        typer.echo(json_text({"output": str(output)} | done.to_json()))
+        say(json_text({"output": str(output)} | done.to_json()))
         return
     _tell(done)
-    typer.echo(f"wrote {output}")
+    say(f"wrote {output}")
 
 
 def _tell(done: Exported) -> None:

@@ -18,9 +18,9 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
     repeated,
 )
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -124,13 +124,13 @@ def identify(
         )  # fmt: skip
         write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
-        typer.echo(json_text(result.to_json()))
+        say(json_text(result.to_json()))
         return
     from elastocal.report.terminal import print_result
 
     print_result(console(), result)
     for path in written:
-        typer.echo(f"wrote {path}")
+        say(f"wrote {path}")
 
 
 def write_results(
