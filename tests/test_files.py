@@ -1,18 +1,98 @@
-"""Writing: whole files or none."""
+"""Reading: regular files of a bounded size.  Writing: whole files or none."""
 
 from __future__ import annotations
 
 import os
+import time
 
+import numpy as np
 import pytest
 
+from elastocal.config import read_toml
 from elastocal.errors import InputError
 from elastocal.files import (
+    DEEPEST,
     atomic_binary_writer,
     atomic_write_bytes,
     atomic_write_text,
     atomic_writer,
+    check_exists,
+    read_bytes,
+    read_json,
+    read_text,
 )
+from elastocal.measurements import read_matrix
+
+NESTED = {
+    "lists": "a = {}1{}".format("[" * 400_000, "]" * 400_000),
+    "tables": "a = " + "{a = " * 150_000 + "1" + "}" * 150_000,
+    "dots": ".".join("a" * 400_000) + " = 1",
+    "quoted": ".".join(['"a"', " 'b' "] * 50_000) + " = 1",
+    "header": "[" + ".".join("a" * 400_000) + "]",
+}
+
+
+@pytest.mark.parametrize("reader", [read_bytes, read_text, read_toml])
+def test_a_pipe_or_device_is_refused_and_not_waited_for(tmp_path, reader):
+    os.mkfifo(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "pipe"), ("/dev/zero", "device")):
+        with pytest.raises(InputError, match=f"is a {kind}.*not a regular file; save the cell"):
+            reader(path, "cell", 1000)
+        with pytest.raises(InputError, match=f"key robot.dh names .* which is a {kind}"):
+            check_exists(tmp_path / path, "robot.dh", tmp_path / "cell.toml")
+
+
+def test_a_large_file_is_refused_before_it_is_read(tmp_path):
+    with open(tmp_path / "large", "wb") as file:
+        os.truncate(file.fileno(), 1 << 40)
+    with pytest.raises(InputError, match=r"larger than 0\.001 MB, which no cell is"):
+        read_bytes(tmp_path / "large", "cell", 1000)
+
+
+@pytest.mark.parametrize("kind", NESTED)
+def test_nesting_is_refused_at_once_with_its_line(tmp_path, kind):
+    (tmp_path / "cell.toml").write_text(f"name = 'arm'  # [[[\n{NESTED[kind]}\n")
+    begun = time.perf_counter()
+    with pytest.raises(InputError, match=f"line 2: nested more than {DEEPEST} deep"):
+        read_toml(tmp_path / "cell.toml", "cell")
+    assert time.perf_counter() - begun < 5.0
+
+
+def test_brackets_and_dots_in_texts_and_comments_are_no_nesting(tmp_path):
+    text = f'# {"[" * 99}\na = \'{"[" * 99}\'\nb = "\\"{"{" * 99}"\nc = """\n{"[." * 99}\n"""\n'
+    text += f"d = '{'a.' * 99}'\n" + "".join(
+        f"e{k} = [[1.5, 2.5], [0.5, 1e3]]\n" for k in range(99)
+    )
+    (tmp_path / "cell.toml").write_text(text)
+    assert len(read_toml(tmp_path / "cell.toml", "cell")) == 103
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": NaN}', '{"a": 1,}', "Infinity", "{"])
+def test_what_is_no_strict_json_is_refused_with_the_remedy(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(InputError, match=r"a\.json.*; write it anew"):
+        read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew")
+
+
+def test_a_whole_number_of_five_thousand_digits_is_read_as_a_float(tmp_path):
+    (tmp_path / "a.json").write_text(f"[{'9' * 5000}, -{'9' * 40}, 12]")
+    found = read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew")
+    assert found == [float("inf"), -1e40, 12]
+
+
+def test_a_matrix_that_states_more_than_it_holds_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.eye(3))
+    assert np.array_equal(read_matrix(tmp_path / "a.npy", "noise covariance"), np.eye(3))
+    data = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "b.npy").write_bytes(data.replace(b"(3, 3), }", b"(9999999, 9999999), }", 1))
+    np.save(tmp_path / "c.npy", np.array([["a"]]))
+    np.save(tmp_path / "d.npy", np.array([[1.0, np.inf]]))
+    (tmp_path / "e.csv").write_text("1, 2\n3, inf\n")
+    (tmp_path / "f.csv").write_text("1, 2\n3\n")
+    (tmp_path / "g.csv").write_text(" \n")
+    for name in ("b.npy", "c.npy", "d.npy", "e.csv", "f.csv", "g.csv"):
+        with pytest.raises(InputError, match=name):
+            read_matrix(tmp_path / name, "noise covariance")
 
 
 def test_text_is_written_as_utf8_and_nothing_else_is_left(tmp_path):

@@ -40,6 +40,21 @@ def quoted(found: object) -> str:
     return text if isinstance(found, str) else text[1:-1]
 
 
+def printable(text: str) -> str:
+    """`text` with what a terminal would obey or a reader could not see as escapes: \\x1b, \\u202e.
+
+    The one way in which names from files and arguments are shown.  Text that is shown already
+    stays as it is.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        c if c.isprintable() or unicodedata.category(c) == "Zs"
+        else c.encode("unicode_escape").decode()
+        for c in text
+    )  # fmt: skip
+
+
 def is_label(text: str) -> bool:
     """Can this text stand in a table cell and be read back: one line, no blanks at its ends?"""
     return (

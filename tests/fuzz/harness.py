@@ -23,6 +23,7 @@ import traceback
 import unicodedata
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -82,13 +83,11 @@ def load_everything() -> None:
     for module in pkgutil.walk_packages(elastocal.__path__, "elastocal."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
-    for name in ("cvxpy", "clarabel", "matplotlib.pyplot", "plotly.graph_objects", "pyarrow.parquet",
-                 "scipy.optimize", "scipy.stats", "pandas", "pinocchio", "pyvrp", "mujoco",
-                 "rich.progress", "rich.table"):  # fmt: skip
-        try:
+    for name in ("cvxpy", "clarabel", "matplotlib.pyplot", "plotly.graph_objects", "pandas",
+                 "scipy.optimize", "scipy.stats", "pinocchio", "pyvrp", "rich.progress",
+                 "rich.table", "mujoco", "pyarrow.parquet"):  # fmt: skip
+        with suppress(ImportError):  # an optional one; commands say so themselves
             importlib.import_module(name)
-        except ImportError:
-            pass  # an optional one; commands say so themselves
 
 
 def make(seed: int, base: Path, folder: Path, verbs: tuple[str, ...] = ()) -> Case:
@@ -123,7 +122,7 @@ def run(case: Case) -> Case:
 def execute(
     case: Case, prepare: Callable[[], object] = lambda: None, longest: float = WALL
 ) -> Case:
-    """Run the case in a child, which calls `prepare` before the command; killed after `longest` s."""
+    """Run the case in a child, which calls `prepare` first and is killed after `longest` s."""
     out, err = case.folder.parent / "stdout", case.folder.parent / "stderr"
     begun = time.monotonic()
     sys.stdout.flush(), sys.stderr.flush()
@@ -149,8 +148,8 @@ def _child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) -> N
         for number, path in ((1, out), (2, err)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
-        sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)
+        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+        sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         room = pages * os.sysconf("SC_PAGE_SIZE") + 2 * MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (room, room))
@@ -188,10 +187,8 @@ def _waited(child: int, deadline: float) -> tuple[int, resource.struct_rusage]:
             break
         time.sleep(pause)
         pause = min(2 * pause, 0.05)
-    try:
+    with suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)  # processes that it started
-    except (ProcessLookupError, PermissionError):
-        pass
     return status, usage
 
 
@@ -220,7 +217,7 @@ def _complaints(case: Case, before: dict[str, bytes | None]) -> Iterator[str]:
         yield "traceback"
     if found := re.search(r"\b[A-Z]\w+Warning\b|Exception ignored", case.stderr):
         yield f"raw warning {found[0]}"
-    odd = {c for c in told if c != "\n" and (unicodedata.category(c) in ("Cc", "Cs") or c in DIRECTIONS)}
+    odd = {c for c in told if unicodedata.category(c) in ("Cc", "Cs") or c in DIRECTIONS} - {"\n"}
     if odd:
         yield f"raw characters {sorted(map(ascii, odd))}"
     after = seen(case.folder)

@@ -1,4 +1,4 @@
-"""How valid input is spoilt: bytes, numbers, names, lines, columns, trees, arguments, file kinds."""
+"""How valid input is spoilt: bytes, numbers, names, lines, columns, trees, words, kinds of file."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ NUMBERS = (
 NAMES = (
     "", " ", "a", "M1", "joint1", "joint2", "base", "all", "nan", "0", "=1+1", "@x", "+1", "-x",
     "x" * 300, "x" * 20_000, "\x1b]0;title\x07", "\x1b[31mred", "\u202egnp", "\u200b", "é", "🤖",
-    "\u0301", "a\tb", "a\x00b", "\ufeff", "\u2028", "a,b", 'a"b', "a'b", "..", "../..", "~", "\udcff",
-    "/dev/null", "%s%s", "{0}", "<script>", "&amp;", "[bold]", "$HOME", "__class__", "\\u0000",
+    "\u0301", "a\tb", "a\x00b", "\ufeff", "\u2028", "a,b", 'a"b', "a'b", "..", "../..", "~",
+    "\udcff", "/dev/null", "%s%s", "{0}", "<script>", "&amp;", "[bold]", "$HOME", "__class__", "\\u0000",
 )  # fmt: skip
 BYTES = (
     b"\x00", b"\xff", b"\xfe\xff", b"\xef\xbb\xbf", b"\x1b[2J", b"\xed\xa0\x80", b"\xc3\x28",
@@ -100,8 +100,8 @@ def _replace(text: str, pattern: re.Pattern[str], make: Callable[[re.Match[str]]
     found = list(pattern.finditer(text))
     if not found:
         return text
-    chosen = sorted(rng.sample(found, min(rng.randint(1, most), len(found))), key=lambda m: m.start())
-    for match in reversed(chosen):
+    chosen = rng.sample(found, min(rng.randint(1, most), len(found)))
+    for match in sorted(chosen, key=lambda m: -m.start()):
         text = text[: match.start()] + make(match) + text[match.end() :]
     return text
 
@@ -159,7 +159,8 @@ def table_changed(text: str, rng: Random) -> str:
     width = max(len(rows[0]), 1)
     a, b = rng.randrange(width), rng.randrange(width)
     how = rng.randrange(12)
-    value, factor = rng.choice(NUMBERS), rng.choice((1e3, 1e-3, 1e6, 57.29578, 0.0174533, -1.0, 0.0))
+    value = rng.choice(NUMBERS)
+    factor = rng.choice((1e3, 1e-3, 1e6, 57.29578, 0.0174533, -1.0, 0.0))
     line = rng.randrange(len(rows))
     for i, row in enumerate(rows):
         if len(row) < width:
@@ -168,9 +169,7 @@ def table_changed(text: str, rng: Random) -> str:
             del row[a]
         elif how == 1:
             row.insert(b, row[a])
-        elif how == 2:
-            row[a], row[b] = row[b], row[a]
-        elif how == 3 and i:  # swapped, but not in the header
+        elif how == 2 or (how == 3 and i):  # swapped, with the header or without it
             row[a], row[b] = row[b], row[a]
         elif how == 4 and i:
             row[a] = value

@@ -16,9 +16,9 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
 )
 from elastocal.errors import InputError, require
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -153,15 +153,15 @@ def compensate(
                 atomic_write_text(path, text)
     if as_json:
         both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
-        typer.echo(json_text(both))
+        say(json_text(both))
         return
     from elastocal.report.terminal import print_compensation
 
     print_compensation(console(), content)
     for path in written:
-        typer.echo(f"wrote {path}")
+        say(f"wrote {path}")
     if output is not None:
-        typer.echo(
+        say(
             f"Next: run the commands of {output.name} (its q columns) and measure some: the tool "
             "should lie within two or three std_um, and the tracker's noise, of its targets."
         )

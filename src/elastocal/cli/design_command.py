@@ -21,10 +21,10 @@ from elastocal.cli.app import (
     command,
     console,
     files_of,
-    progress_line,
     repeated,
 )
 from elastocal.errors import InputError, require
+from elastocal.screen import progress_line, say
 
 if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell
@@ -166,13 +166,13 @@ def design(
                 write_page(plan, report, list(dict.fromkeys(files)), repeated())
         checkpoint.clear()
     if as_json:
-        typer.echo(summary.read_text(encoding="utf-8"), nl=False)
+        say(summary.read_text(encoding="utf-8"), end="")
         return
     from elastocal.report.terminal import print_plan
 
     print_plan(console(), plan)
     for path in written:
-        typer.echo(f"wrote {path}")
+        say(f"wrote {path}")
 
 
 def _target(target: float | None, poses: int | None) -> float | None:

@@ -20,10 +20,10 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
     repeated,
 )
 from elastocal.errors import require
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -109,13 +109,13 @@ def diagnose(
                     again = shlex.join(["elastocal", "identify", str(cell_out), str(data)])
                     told.append(f"to go on: {again} -o result.json")
     if as_json:
-        typer.echo(json_text(publish(found, found.model, found.data)))
+        say(json_text(publish(found, found.model, found.data)))
         return
     from elastocal.report.terminal import print_diagnosis
 
     print_diagnosis(console(), found, kinds)
     for line in told:
-        typer.echo(line)
+        say(line)
 
 
 def _write_extra_poses(

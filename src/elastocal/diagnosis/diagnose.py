@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import tomli_w
 
 from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.config import read_toml
 from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import SumAnswer
@@ -86,8 +86,7 @@ def write_extended_cell(
     """
     source, target = Path(source), Path(target)
     cell = read_cell(source)
-    text = source.read_text(encoding="utf-8-sig")
-    data = {"name": cell.name} | tomllib.loads(text)
+    data = {"name": cell.name} | read_toml(source, "cell file")
     _redirect(data, source.parent, target.parent)
     if found:
         _switch_on(data.setdefault("model", {}), found)

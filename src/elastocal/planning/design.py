@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from elastocal import __version__
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.files import atomic_write_bytes
+from elastocal.files import atomic_write_bytes, open_input
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_limits
@@ -120,7 +120,9 @@ def key_of(files: Iterable[Path], **options: object) -> str:
     """A hash of everything a design depends on: input files, options, the version."""
     digest = hashlib.sha256(__version__.encode())
     for path in files:
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+        with open_input(path, "input file") as handle:
+            digest.update(path.name.encode(errors="surrogateescape") + b"\0")
+            digest.update(hashlib.file_digest(handle, "sha256").digest())  # type: ignore[arg-type]
     digest.update(json.dumps(options, sort_keys=True, default=str).encode())
     return digest.hexdigest()
 

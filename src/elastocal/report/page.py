@@ -45,7 +45,7 @@ from elastocal.report.figures import (
     share_bars,
     unknown_curves,
 )
-from elastocal.report.formatting import minus, printable
+from elastocal.report.formatting import minus
 from elastocal.report.identification_view import Published, Truth, identification_contents
 from elastocal.report.notebook import view_of
 from elastocal.report.plan_view import plan_contents
@@ -62,6 +62,7 @@ from elastocal.report.residual_view import (
     residuals_of,
     summary_of,
 )
+from elastocal.text import printable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
