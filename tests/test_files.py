@@ -20,6 +20,7 @@ from elastocal.files import (
     read_bytes,
     read_json,
     read_text,
+    together,
 )
 from elastocal.measurements import read_matrix
 
@@ -159,3 +160,44 @@ def test_permissions_follow_the_umask(tmp_path):
     finally:
         os.umask(old)
     assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o644
+
+
+def test_what_replaces_a_file_is_as_secret_as_it_was(tmp_path):
+    (tmp_path / "a.txt").write_text("old")
+    (tmp_path / "a.txt").chmod(0o600)
+    atomic_write_text(tmp_path / "a.txt", "new")
+    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o600
+
+
+def test_files_written_together_appear_at_the_end(tmp_path):
+    first, second, other = (tmp_path / name for name in ("a.txt", "b.bin", "cache"))
+    first.write_text("old")
+    with together([first, second]):
+        atomic_write_text(first, "new")
+        atomic_write_bytes(second, b"new")
+        atomic_write_text(other, "at once")
+        assert (first.read_text(), second.exists(), other.exists()) == ("old", False, True)
+    assert (first.read_text(), second.read_bytes()) == ("new", b"new")
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.bin", "cache"]
+    atomic_write_text(first, "later")
+    assert first.read_text() == "later"
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_of_files_written_together_none_appears_where_one_fails(tmp_path, failure):
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(failure), together([tmp_path / "a.txt", tmp_path / "b.txt"]):
+        atomic_write_text(tmp_path / "a.txt", "new")
+        atomic_write_text(tmp_path / "b.txt", "new")
+        raise failure
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_files_written_together_follow_links(tmp_path):
+    (tmp_path / "target").write_text("old")
+    (tmp_path / "link").symlink_to("target")
+    with together([tmp_path / "link"]):
+        atomic_write_text(tmp_path / "link", "new")
+        assert (tmp_path / "target").read_text() == "old"
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "target").read_text() == "new"

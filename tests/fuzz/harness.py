@@ -40,7 +40,7 @@ DIRECTIONS = "\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069
 # Folders that a run which fails may leave: tasks that were done, an example half copied.
 KEPT = {"study": ("results", "results.md"), "demo": ("demo_out",)}
 # What a message may name: an option, a parameter or its place, a key.
-NAMED = re.compile(r"--?\w|\bjoint\d|\bmarker\b|\[\w+\]|`\w+`|\bkey\b|\bcolumn\b|'[^']+'")
+NAMED = re.compile(r"argument|--?\w|\bjoint\d|\bmarker\b|\[\w+\]|`\w+`|\bkey\b|\bcolumn\b|'[^']+'")
 
 
 @dataclass
@@ -234,11 +234,13 @@ def _complaints(case: Case, before: dict[str, bytes | None]) -> Iterator[str]:
     if any(name.endswith(".tmp") for name in after):
         yield "a temporary file is left"
     if case.code == 0:
+        # With -o and --report exchanged a name does not say what is in the file.
+        meant = {b for a, b in pairwise(shlex.split(case.command.line)) if (a, b) in pairs(case)}
         for name in sorted(new):
             content = after[name]
-            if problem := None if content is None else malformed(name, content):
+            if content is not None and name in meant and (problem := malformed(name, content)):
                 yield f"{name}: {problem}"
-        if _as_json(case.words) and (problem := malformed("x.json", case.stdout.encode())):
+        if _as_json(case) and (problem := malformed("x.json", case.stdout.encode())):
             yield f"stdout: {problem}"
 
 
@@ -256,9 +258,13 @@ def _message_complaints(case: Case) -> Iterator[str]:
         yield "names no culprit"
 
 
-def _as_json(words: list[str]) -> bool:
+def pairs(case: Case) -> set[tuple[str, str]]:
+    return set(pairwise(case.words))
+
+
+def _as_json(case: Case) -> bool:
     """Is --json an option there, not the value of another one?"""
-    before = [above for above, word in pairwise(words) if word == "--json"]
+    before = [above for above, word in pairs(case) if word == "--json"]
     return any(not above.startswith("-") or above == "-q" for above in before)
 
 

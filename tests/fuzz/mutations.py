@@ -31,7 +31,8 @@ NAMES = (
     "", " ", "a", "M1", "joint1", "joint2", "base", "all", "nan", "0", "=1+1", "@x", "+1", "-x",
     "x" * 300, "x" * 20_000, "\x1b]0;title\x07", "\x1b[31mred", "\u202egnp", "\u200b", "é", "🤖",
     "\u0301", "a\tb", "a\x00b", "\ufeff", "\u2028", "a,b", 'a"b', "a'b", "..", "../..", "~",
-    "\udcff", "/dev/null", "%s%s", "{0}", "<script>", "&amp;", "[bold]", "$HOME", "__class__", "\\u0000",
+    "\udcff", "/dev/null", "%s%s", "{0}", "<script>", "&amp;", "[bold]", "$HOME",
+    "__class__", "\\u0000",
 )  # fmt: skip
 BYTES = (
     b"\x00", b"\xff", b"\xfe\xff", b"\xef\xbb\xbf", b"\x1b[2J", b"\xed\xa0\x80", b"\xc3\x28",

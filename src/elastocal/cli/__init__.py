@@ -1,6 +1,7 @@
 """The command line: elastocal VERB CELL [DATA] [options]."""
 
 import gc
+import logging
 import os
 
 # Many small matrices: a second thread of the linear algebra library only waits for the first.
@@ -29,6 +30,8 @@ COLLECT_AFTER = 20_000
 def main() -> None:
     """Entry point of the `elastocal` command."""
     gc.set_threshold(COLLECT_AFTER)
+    # Where it keeps its list of fonts, and that there is no place for it, concerns nobody here.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     prepare_streams()
     try:
         # The same name however it is called: completion scripts are made of it.
