@@ -18,14 +18,18 @@ UNITS = (
 )  # fmt: skip
 UNIT = re.compile(rf"_({'|'.join(UNITS)})(?![\w])")
 
-# What stands where a number should.
-NUMBERS = (
-    "0", "-0", "-1", "1", "2", "1e-300", "-1e-300", "5e-324", "1e-12", "1e12", "1e19", "-1e19",
-    "1e300", "1.7976931348623157e308", "1e309", "-1e400", "nan", "NaN", "inf", "-inf", "Infinity",
-    "9223372036854775807", "9223372036854775808", "2147483648", "1" * 400, "7" * 5000,
-    "0." + "0" * 3000 + "1", "text", "", '""', "true", "null", "0x1F", "1_000", "1,5", "１２", "٣",
-    "1e", "--1", "[1, 2, 3]", "{ a = 1 }", "1979-05-27", "1e5", "1000000", "1e-5",
+# What stands where a number should: numbers that are read, and what is none.
+READ = (
+    "0", "-0.0", "-1", "1", "2", "1e-300", "-1e-300", "5e-324", "1e-12", "1e-5", "1e5", "1e12",
+    "1e19", "-1e19", "1e150", "1e300", "-1e300", "1.7976931348623157e308", "1000000", "90", "360",
 )  # fmt: skip
+UNREAD = (
+    "1e309", "-1e400", "nan", "NaN", "inf", "-inf", "Infinity", "9223372036854775808",
+    "9223372036854775807", "2147483648", "1" * 400, "7" * 5000, "0." + "0" * 3000 + "1", "text",
+    "", '""', "true", "null", "0x1F", "1_000", "1,5", "１２", "٣", "1e", "--1", "[1, 2, 3]",
+    "{ a = 1 }", "1979-05-27",
+)  # fmt: skip
+NUMBERS = READ + UNREAD
 # What stands where a name should.
 NAMES = (
     "", " ", "a", "M1", "joint1", "joint2", "base", "all", "nan", "0", "=1+1", "@x", "+1", "-x",
@@ -108,7 +112,7 @@ def _replace(text: str, pattern: re.Pattern[str], make: Callable[[re.Match[str]]
 
 
 def other_number(text: str, rng: Random) -> str:
-    return _replace(text, NUMBER, lambda m: rng.choice(NUMBERS), rng)
+    return _replace(text, NUMBER, lambda m: rng.choice(rng.choice((READ, READ, UNREAD))), rng)
 
 
 def scaled_number(text: str, rng: Random) -> str:
@@ -160,7 +164,7 @@ def table_changed(text: str, rng: Random) -> str:
     width = max(len(rows[0]), 1)
     a, b = rng.randrange(width), rng.randrange(width)
     how = rng.randrange(12)
-    value = rng.choice(NUMBERS)
+    value = rng.choice(rng.choice((READ, READ, UNREAD)))
     factor = rng.choice((1e3, 1e-3, 1e6, 57.29578, 0.0174533, -1.0, 0.0))
     line = rng.randrange(len(rows))
     for i, row in enumerate(rows):
