@@ -26,7 +26,15 @@ from numpy.typing import NDArray
 
 from elastocal.errors import InputError
 from elastocal.files import check_size, decoded, open_input
-from elastocal.text import did_you_mean, is_label, listed, quoted
+from elastocal.text import (
+    cell_meaning,
+    cell_text,
+    did_you_mean,
+    is_label,
+    listed,
+    printable,
+    quoted,
+)
 from elastocal.units import Array, IntArray, to_si
 
 if TYPE_CHECKING:
@@ -465,7 +473,8 @@ def joined_labels(pieces: Iterable[Coded]) -> Labels:
     code_of: dict[str, int] = {}
     codes = []
     for piece, names in pieces:
-        new = [code_of.setdefault(str(n).strip(), len(code_of)) for n in names]
+        texts = (cell_meaning(str(name).strip()) for name in names)
+        new = [code_of.setdefault(text.strip(), len(code_of)) for text in texts]
         codes.append(np.array(new, dtype=np.int64)[piece])
     return Labels(np.concatenate(codes), tuple(code_of))
 
@@ -618,12 +627,10 @@ def _check_unpacked(source: str, what: str) -> None:
 
         facts = ParquetFile(source).metadata
         groups = [facts.row_group(i) for i in range(facts.num_row_groups)]
-        columns = range(facts.num_columns)
-        unpacked = sum(g.column(k).total_uncompressed_size for g in groups for k in columns)
-        rows = facts.num_rows
+        unpacked = sum(group.total_byte_size for group in groups)
     except Exception:  # missing or damaged, which its reader says
         return
-    if rows > MAX_ROWS:
+    if facts.num_rows > MAX_ROWS:
         raise InputError(f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out")
     check_size(source, what, unpacked, MOST_BYTES)
 
@@ -775,10 +782,10 @@ def write_csv(
     comments: Iterable[str] = (),
 ) -> None:
     """Write a table as CSV, each of `comments` on a line of its own above it, after #."""
-    handle.writelines(f"# {comment}\n" for comment in comments)
+    handle.writelines(f"# {printable(comment)}\n" for comment in comments)
     writer = csv.writer(handle, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerow(map(cell_text, header))
+    writer.writerows(map(cell_text, row) for row in rows)
 
 
 def csv_text(

@@ -105,6 +105,10 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
                 # numpy's, of overflows: what comes of them is judged where a number must be one.
                 warnings.simplefilter("ignore", RuntimeWarning)
                 command(*args, **kwargs)
+                # Nothing else of the model is loaded for this.
+                cache = sys.modules.get("elastocal.model.function_cache")
+                for told in getattr(cache, "refused", ()):
+                    complain(told)
         except ElastocalError as error:
             complain(str(error))
             raise typer.Exit(error.exit_code) from None

@@ -62,6 +62,7 @@ from elastocal.report.residual_view import (
     residuals_of,
     summary_of,
 )
+from elastocal.screen import shown
 from elastocal.text import printable
 
 if TYPE_CHECKING:
@@ -136,6 +137,8 @@ def environment() -> Environment:
     made = Environment(
         loader=FunctionLoader(resource),
         autoescape=True,
+        # Texts come from files; what is marked as markup was made by this package.
+        finalize=lambda value: shown(value) if type(value) is str else value,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
