@@ -21,6 +21,8 @@ sys.path[:0] = [str(Path(__file__).parents[2] / "src"), str(Path(__file__).paren
 
 from fuzz import campaign, harness, kills  # noqa: E402
 
+BEGIN, END = "<!-- cases: written by tests/fuzz/run.py -->", "<!-- end of cases -->"
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -30,6 +32,7 @@ def main() -> int:
     parser.add_argument("--verb", action="append", default=[], help="only this verb; repeatable")
     parser.add_argument("--kills", type=int, default=0, help="kill each command so many times")
     parser.add_argument("--full", type=int, default=0, help="fill its disk so many times")
+    parser.add_argument("--write", type=Path, help="page whose table this run replaces")
     parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-"))
@@ -42,31 +45,60 @@ def main() -> int:
         case = harness.run(harness.make(asked.case, base, folder / "case", tuple(asked.verb)))
         print(f"cd {case.folder}\n{case.told()}\nstdout:\n{case.stdout[-3000:]}")
         return int(bool(case.complaints))
-    ends: Counter[tuple[str, int]] = Counter()
-    broken, slowest, largest, begun = 0, 0.0, 0, time.monotonic()
+    tally, begun = Tally(), time.monotonic()
     for seed in range(asked.seed, asked.seed + asked.cases):
         if time.monotonic() - begun > asked.seconds:
             break
-        case = harness.run(harness.make(seed, base, folder / str(seed), tuple(asked.verb)))
+        tally.take(harness.run(harness.make(seed, base, folder / str(seed), tuple(asked.verb))))
         shutil.rmtree(folder / str(seed), ignore_errors=True)
-        ends[case.command.verb, case.code] += 1
-        slowest, largest = max(slowest, case.seconds), max(largest, case.resident)
-        if case.complaints:
-            broken += 1
-            print(case.told(), flush=True)
     if asked.kills or asked.full:
         found, tried = kills.run_kills(base, folder, asked.seed, asked.kills, asked.full)
-        broken += found
-        for (verb, how), n in tried.items():
-            print(f"{verb:12} {how}: {n}")
+        tally.count.update(tried)
+        tally.broken += found
     shutil.rmtree(folder, ignore_errors=True)
-    for (verb, code), n in sorted(ends.items()):
-        print(f"{verb:12} exit {code}: {n}")
-    print(
-        f"{sum(ends.values())} cases, {broken} with a finding; slowest {slowest:.1f} s of "
-        f"processor, largest {largest / 1e6:.0f} MB; {time.monotonic() - begun:.0f} s in all"
-    )
-    return int(bool(broken))
+    print(tally.table())
+    print(tally.sentence(asked.seed, time.monotonic() - begun))
+    if asked.write is not None:
+        told = f"{tally.table()}\n\n{tally.sentence(asked.seed, time.monotonic() - begun)}\n"
+        page = asked.write.read_text(encoding="utf-8")
+        before, rest = page.split(f"{BEGIN}\n")
+        _, after = rest.split(END)
+        asked.write.write_text(f"{before}{BEGIN}\n\n{told}\n{END}{after}", encoding="utf-8")
+    return int(bool(tally.broken))
+
+
+class Tally:
+    """What was tried and how it ended."""
+
+    def __init__(self) -> None:
+        self.count: Counter[tuple[str, str]] = Counter()
+        self.broken, self.slowest, self.largest = 0, 0.0, 0
+
+    def take(self, case: harness.Case) -> None:
+        self.count[case.command.verb, f"exit {case.code}"] += 1
+        self.slowest = max(self.slowest, case.seconds)
+        self.largest = max(self.largest, case.resident)
+        if case.complaints:
+            self.broken += 1
+            print(case.told(), flush=True)
+
+    def table(self) -> str:
+        """One row per verb (Markdown)."""
+        columns = ("exit 0", "exit 1", "exit 2", "killed", "disk full")
+        rows = ["| verb | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+        for verb in sorted({verb for verb, _ in self.count}):
+            numbers = (self.count[verb, column] for column in columns)
+            rows.append(f"| `{verb}` | " + " | ".join(str(n or "") for n in numbers) + " |")
+        return "\n".join(rows)
+
+    def sentence(self, seed: int, seconds: float) -> str:
+        cases = sum(n for (_, how), n in self.count.items() if how.startswith("exit"))
+        others = self.count.total() - cases
+        return (
+            f"{cases} cases from {seed} on, {others} kills and full disks: {self.broken} with a "
+            f"finding. Slowest case {self.slowest:.1f} s of processor time, largest "
+            f"{self.largest / 1e6:.0f} MB; {seconds:.0f} s in all."
+        )
 
 
 if __name__ == "__main__":
