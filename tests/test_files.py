@@ -1,18 +1,99 @@
-"""Writing: whole files or none."""
+"""Reading: regular files of a bounded size.  Writing: whole files or none."""
 
 from __future__ import annotations
 
 import os
+import time
 
+import numpy as np
 import pytest
 
+from elastocal.config import read_toml
 from elastocal.errors import InputError
 from elastocal.files import (
+    DEEPEST,
     atomic_binary_writer,
     atomic_write_bytes,
     atomic_write_text,
     atomic_writer,
+    check_exists,
+    read_bytes,
+    read_json,
+    read_text,
+    together,
 )
+from elastocal.measurements import read_matrix
+
+NESTED = {
+    "lists": "a = {}1{}".format("[" * 400_000, "]" * 400_000),
+    "tables": "a = " + "{a = " * 150_000 + "1" + "}" * 150_000,
+    "dots": ".".join("a" * 400_000) + " = 1",
+    "quoted": ".".join(['"a"', " 'b' "] * 50_000) + " = 1",
+    "header": "[" + ".".join("a" * 400_000) + "]",
+}
+
+
+@pytest.mark.parametrize("reader", [read_bytes, read_text, read_toml])
+def test_a_pipe_or_device_is_refused_and_not_waited_for(tmp_path, reader):
+    os.mkfifo(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "pipe"), ("/dev/zero", "device")):
+        with pytest.raises(InputError, match=f"is a {kind}.*not a regular file; save the cell"):
+            reader(path, "cell", 1000)
+        with pytest.raises(InputError, match=f"key robot.dh names .* which is a {kind}"):
+            check_exists(tmp_path / path, "robot.dh", tmp_path / "cell.toml")
+
+
+def test_a_large_file_is_refused_before_it_is_read(tmp_path):
+    with open(tmp_path / "large", "wb") as file:
+        os.truncate(file.fileno(), 1 << 40)
+    with pytest.raises(InputError, match=r"larger than 0\.001 MB, which no cell is"):
+        read_bytes(tmp_path / "large", "cell", 1000)
+
+
+@pytest.mark.parametrize("kind", NESTED)
+def test_nesting_is_refused_at_once_with_its_line(tmp_path, kind):
+    (tmp_path / "cell.toml").write_text(f"name = 'arm'  # [[[\n{NESTED[kind]}\n")
+    begun = time.perf_counter()
+    with pytest.raises(InputError, match=f"line 2: nested more than {DEEPEST} deep"):
+        read_toml(tmp_path / "cell.toml", "cell")
+    assert time.perf_counter() - begun < 5.0
+
+
+def test_brackets_and_dots_in_texts_and_comments_are_no_nesting(tmp_path):
+    text = f'# {"[" * 99}\na = \'{"[" * 99}\'\nb = "\\"{"{" * 99}"\nc = """\n{"[." * 99}\n"""\n'
+    text += f"d = '{'a.' * 99}'\n" + "".join(
+        f"e{k} = [[1.5, 2.5], [0.5, 1e3]]\n" for k in range(99)
+    )
+    (tmp_path / "cell.toml").write_text(text)
+    assert len(read_toml(tmp_path / "cell.toml", "cell")) == 103
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": NaN}', '{"a": 1,}', "Infinity", "{"])
+def test_what_is_no_strict_json_is_refused_with_the_remedy(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(InputError, match=r"a\.json.*; write it anew"):
+        read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew")
+
+
+def test_a_whole_number_of_five_thousand_digits_is_read_as_a_float(tmp_path):
+    (tmp_path / "a.json").write_text(f"[{'9' * 5000}, -{'9' * 40}, 12]")
+    found = read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew")
+    assert found == [float("inf"), -1e40, 12]
+
+
+def test_a_matrix_that_states_more_than_it_holds_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.eye(3))
+    assert np.array_equal(read_matrix(tmp_path / "a.npy", "noise covariance"), np.eye(3))
+    data = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "b.npy").write_bytes(data.replace(b"(3, 3), }", b"(9999999, 9999999), }", 1))
+    np.save(tmp_path / "c.npy", np.array([["a"]]))
+    np.save(tmp_path / "d.npy", np.array([[1.0, np.inf]]))
+    (tmp_path / "e.csv").write_text("1, 2\n3, inf\n")
+    (tmp_path / "f.csv").write_text("1, 2\n3\n")
+    (tmp_path / "g.csv").write_text(" \n")
+    for name in ("b.npy", "c.npy", "d.npy", "e.csv", "f.csv", "g.csv"):
+        with pytest.raises(InputError, match=name):
+            read_matrix(tmp_path / name, "noise covariance")
 
 
 def test_text_is_written_as_utf8_and_nothing_else_is_left(tmp_path):
@@ -79,3 +160,44 @@ def test_permissions_follow_the_umask(tmp_path):
     finally:
         os.umask(old)
     assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o644
+
+
+def test_what_replaces_a_file_is_as_secret_as_it_was(tmp_path):
+    (tmp_path / "a.txt").write_text("old")
+    (tmp_path / "a.txt").chmod(0o600)
+    atomic_write_text(tmp_path / "a.txt", "new")
+    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o600
+
+
+def test_files_written_together_appear_at_the_end(tmp_path):
+    first, second, other = (tmp_path / name for name in ("a.txt", "b.bin", "cache"))
+    first.write_text("old")
+    with together([first, second]):
+        atomic_write_text(first, "new")
+        atomic_write_bytes(second, b"new")
+        atomic_write_text(other, "at once")
+        assert (first.read_text(), second.exists(), other.exists()) == ("old", False, True)
+    assert (first.read_text(), second.read_bytes()) == ("new", b"new")
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.bin", "cache"]
+    atomic_write_text(first, "later")
+    assert first.read_text() == "later"
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_of_files_written_together_none_appears_where_one_fails(tmp_path, failure):
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(failure), together([tmp_path / "a.txt", tmp_path / "b.txt"]):
+        atomic_write_text(tmp_path / "a.txt", "new")
+        atomic_write_text(tmp_path / "b.txt", "new")
+        raise failure
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_files_written_together_follow_links(tmp_path):
+    (tmp_path / "target").write_text("old")
+    (tmp_path / "link").symlink_to("target")
+    with together([tmp_path / "link"]):
+        atomic_write_text(tmp_path / "link", "new")
+        assert (tmp_path / "target").read_text() == "old"
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "target").read_text() == "new"

@@ -9,7 +9,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.text import json_text
+from elastocal.tables import NUMBER, csv_text
+from elastocal.text import cell_meaning, cell_text, is_label, json_text, printable
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -46,3 +47,22 @@ def test_numpy_numbers_and_arrays_are_plain_ones():
 def test_it_loads_no_numpy_as_the_help_texts_come_by_it():
     program = "import sys, elastocal.text; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program]).returncode == 0
+
+
+CELLS = st.text(st.sampled_from("=+-@'1.5e,ab \u202e\x1bµ"))
+
+
+@given(CELLS)
+def test_no_cell_of_text_is_a_formula_and_each_is_read_back(text):
+    written = cell_text(text)
+    assert NUMBER.fullmatch(written) or not written.startswith(("=", "+", "-", "@"))
+    assert cell_meaning(written) == printable(text)
+    assert not is_label(text) or printable(text) == text
+
+
+def test_a_table_of_names_and_numbers_keeps_the_numbers():
+    rows = [["=1+1", "-2.5", -2.5], ["@x", "+1e3", 1e3], ["'=y", "-x", 0]]
+    text = csv_text(["=name", "a", "b"], rows, ["made of \x1b]0;x"])
+    assert text.splitlines() == [
+        "# made of \\x1b]0;x", "'=name,a,b", "'=1+1,-2.5,-2.5", "'@x,+1e3,1000.0", "''=y,'-x,0",
+    ]  # fmt: skip

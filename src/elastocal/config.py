@@ -21,11 +21,11 @@ from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationErr
 from pydantic_core import PydanticCustomError
 
 from elastocal.errors import InputError
-from elastocal.files import read_text
+from elastocal.files import check_nesting, read_text
 from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array
 
-MAX_BYTES = 5_000_000
+MAX_BYTES = 1_000_000
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 UNIT_SUFFIX = re.compile(
     r"_(um|mm|cm|m|deg|rad|urad|mrad|ppm|N|kN|Nm|N_per_m|N_per_mm|s|min|si"
@@ -106,9 +106,15 @@ Vector3 = Annotated[Array, numbers(3), Field(description="three numbers")]
 def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """Returns the parsed TOML file of at most `max_bytes`; `what` names it in messages.
 
-    Raises InputError where it cannot be read, is larger, is not UTF-8, or is no TOML.
+    Raises InputError where it cannot be read, is larger, is not UTF-8, nests too deep, or is no
+    TOML.
     """
-    text = read_text(path, what, max_bytes)
+    return parsed_toml(path, read_text(path, what, max_bytes))
+
+
+def parsed_toml(path: str | Path, text: str) -> dict[str, Any]:
+    """The same of the `text` of a file."""
+    check_nesting(path, text)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:

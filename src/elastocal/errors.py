@@ -10,8 +10,9 @@ argument, on the command line the flag.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from elastocal.text import did_you_mean, listed, quoted
 
@@ -79,6 +80,55 @@ def options_as_flags() -> Iterator[None]:
         yield
     finally:
         _flags = before
+
+
+# Set, the command line shows the traceback of what no message foresees.
+TRACEBACK = "ELASTOCAL_TRACEBACK"
+INTERNAL = 70  # what sysexits.h calls a fault of the software
+
+
+def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
+    """What a library raised as a sentence that names the files `read`, and the exit code.
+
+    Memory that ends and numbers that cannot be computed with come from the input; whatever else
+    is raised by code of elastocal is a fault of its own, and asked to be reported.
+    """
+    import traceback
+
+    named = [str(p) for p in read if p is not None for p in (p if isinstance(p, list) else [p])]
+    files = listed(map(str, named)) or "the options"
+    what = f"{type(error).__name__}: {error}".rstrip(": ")
+    where = traceback.extract_tb(error.__traceback__)[-1:]
+    ours = any(Path(frame.filename).is_relative_to(Path(__file__).parent) for frame in where)
+    numbers = isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError"
+    if isinstance(error, MemoryError):
+        return (
+            f"{files}: memory ends ({what}); give fewer readings, or ask for less by the options",
+            1,
+        )
+    if numbers or (isinstance(error, ValueError | RuntimeError) and not ours):
+        return (
+            f"{files}: holds numbers, or options give some, that cannot be computed with ({what}); "
+            "look for values far too large or too small, or in another unit",
+            1,
+        )
+    place = "".join(f" at {Path(f.filename).name}, line {f.lineno}" for f in where)
+    return (
+        f"{files}: not foreseen: {what}{place}. Please report this fault of elastocal with the "
+        f"command and its files ({TRACEBACK}=1 shows where)",
+        INTERNAL,
+    )
+
+
+@contextmanager
+def computing(what: str, remedy: str) -> Iterator[None]:
+    """Within it, what a library raises over numbers is an InputError: `what`, why, `remedy`."""
+    try:
+        yield
+    except ElastocalError:
+        raise
+    except (ArithmeticError, ValueError, RuntimeError, MemoryError) as error:
+        raise InputError(f"{what}: {type(error).__name__}: {error}; {remedy}") from error
 
 
 def require(condition: bool, message: str) -> None:

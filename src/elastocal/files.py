@@ -1,11 +1,17 @@
-"""Files at the edge: reading small text files, and writing that never leaves half a file."""
+"""Files at the edge: the one reader of input files, and writing that never leaves half a file.
+
+Every input is sized before it is read, and only regular files are: a pipe would be waited for
+without end, and a device such as /dev/zero has no end.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -14,23 +20,62 @@ from elastocal.errors import InputError
 
 # What is being written ends so; a process that was killed leaves it.
 UNFINISHED = ".tmp"
+# Lists and tables within each other, and parts of a dotted key: a file that people write has six.
+# tomllib takes time and memory that grow with the square of them.
+DEEPEST = 32
+_TOKEN = re.compile(
+    r'"""(?:[^\\]|\\.)*?"""|'
+    r"'''.*?'''|"
+    r'"(?:[^"\\\n]|\\.)*"|'
+    r"'[^'\n]*'"
+    r"|#[^\n]*|[\[{]|[\]}]|\.|[\w-]+|[ \t]+|[^\w\s]|\n+|\s",
+    re.DOTALL,
+)
+LONGEST_INTEGER = 18  # digits; a longer one is read as a float
+
+
+def check_regular(path: str | Path, what: str) -> int:
+    """The size in bytes of an existing regular file; `what` names it in messages.
+
+    Raises InputError where it is absent, a directory, a pipe or device, or cannot be reached.
+    """
+    _check_path(path)
+    with _read_errors(path, what):
+        found = os.stat(path)
+        if stat.S_ISDIR(found.st_mode):
+            raise InputError(f"{path}: is a directory; give the {what} itself")
+        if not stat.S_ISREG(found.st_mode):
+            raise InputError(
+                f"{path}: is {_kind(found.st_mode)}, not a regular file; save the {what} to disk "
+                "first"
+            )
+        return found.st_size
 
 
 @contextmanager
-def open_input(path: str | Path, what: str) -> Iterator[BinaryIO]:
-    """An existing regular file opened for binary reading; `what` names it in messages.
+def open_input(path: str | Path, what: str, max_bytes: int | None = None) -> Iterator[BinaryIO]:
+    """An existing regular file of at most `max_bytes`, opened for binary reading.
 
-    Raises InputError where it is absent, a directory, no regular file, or unreadable, and
-    where reading it fails within the `with` block.
+    Raises InputError as `check_regular` does, where the file is larger, and where reading it
+    fails within the `with` block.
     """
-    _check_path(path)
+    check_size(path, what, check_regular(path, what), max_bytes)
+    with _read_errors(path, what), open(path, "rb") as handle:
+        yield handle
+
+
+def check_size(path: str | Path, what: str, size: int, max_bytes: int | None) -> None:
+    """Raise InputError where `size` is more than `max_bytes`."""
+    if max_bytes is not None and size > max_bytes:
+        raise InputError(
+            f"{path}: larger than {max_bytes / 1e6:g} MB, which no {what} is; check the path"
+        )
+
+
+@contextmanager
+def _read_errors(path: str | Path, what: str) -> Iterator[None]:
     try:
-        if stat.S_ISDIR(os.stat(path).st_mode):
-            raise InputError(f"{path}: is a directory; give the {what} itself")
-        if not stat.S_ISREG(os.stat(path).st_mode):
-            raise InputError(f"{path}: is not a regular file; save the {what} to disk first")
-        with open(path, "rb") as handle:
-            yield handle
+        yield
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path of the {what}") from None
     except PermissionError:
@@ -39,18 +84,76 @@ def open_input(path: str | Path, what: str) -> Iterator[BinaryIO]:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
+def _kind(mode: int) -> str:
+    if stat.S_ISFIFO(mode):
+        return "a pipe (FIFO)"
+    return "a socket" if stat.S_ISSOCK(mode) else "a device"
+
+
+def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
+    """The content of a regular file of at most `max_bytes`, sized before it is read.
+
+    Raises InputError as `open_input` does.
+    """
+    with open_input(path, what, max_bytes) as handle:
+        data = handle.read(max_bytes + 1)  # a file may grow, and those of /proc tell no size
+    check_size(path, what, len(data), max_bytes)
+    return data
+
+
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
     """The text of a UTF-8 file (a byte order mark is dropped) of at most `max_bytes`.
 
     Raises InputError where the file cannot be read, is larger, or is not UTF-8.
     """
-    with open_input(path, what) as handle:
-        data = handle.read(max_bytes + 1)
-    if len(data) > max_bytes:
-        raise InputError(
-            f"{path}: larger than {max_bytes / 1e6:.0f} MB, which no {what} is; check the path"
-        )
-    return decoded(str(path), data, f"save the {what} as UTF-8")
+    return decoded(str(path), read_bytes(path, what, max_bytes), f"save the {what} as UTF-8")
+
+
+def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
+    """What a JSON file of at most `max_bytes` holds; whole numbers too long for that are floats.
+
+    Raises InputError, with `remedy`, where it is no strict JSON: names the line where there is one.
+    """
+    text = read_text(path, what, max_bytes)
+
+    def whole(digits: str) -> int | float:
+        return int(digits) if len(digits) <= LONGEST_INTEGER else float(digits)
+
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no number of JSON")
+
+    try:
+        return json.loads(text, parse_int=whole, parse_constant=refuse)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}); {remedy}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON ({error}); {remedy}") from None
+    except RecursionError:
+        raise InputError(f"{path}: lists within lists without end; {remedy}") from None
+
+
+def check_nesting(path: str | Path, text: str) -> None:
+    """Raise InputError where the TOML `text` nests deeper than DEEPEST, naming the line.
+
+    Lists and tables within each other count, and the parts of a dotted key.
+    """
+    depth = dots = 0
+    for token in _TOKEN.finditer(text):
+        first = token[0][0]
+        if first in "[{":
+            depth += 1
+        elif first in "]}":
+            depth -= 1
+        if first == ".":
+            dots += 1
+        elif not (first in "\"' \t-_" or first.isalnum()):
+            dots = 0
+        if max(depth, dots) >= DEEPEST:
+            line = text.count("\n", 0, token.start()) + 1
+            raise InputError(
+                f"{path}, line {line}: nested more than {DEEPEST} deep; no key needs more than a "
+                "few levels, so check the brackets and dots there"
+            )
 
 
 def decoded(
@@ -88,6 +191,10 @@ def check_exists(path: Path, key: str, owner: Path) -> Path:
         raise InputError(
             f"{owner}: key {key} names {str(path)!r}, a directory; name the file itself"
         )
+    if not stat.S_ISREG(mode):
+        raise InputError(
+            f"{owner}: key {key} names {str(path)!r}, which is {_kind(mode)}; name a regular file"
+        )
     return path
 
 
@@ -114,6 +221,40 @@ def atomic_binary_writer(path: str | Path) -> Iterator[BinaryIO]:
         yield handle
 
 
+# While `together` runs: the files that it holds back, and what is written of them so far.
+_held: set[Path] = set()
+_written: list[tuple[Path, Path]] = []
+
+
+@contextmanager
+def together(paths: Iterable[str | Path]) -> Iterator[None]:
+    """Files under `paths` that are written in the `with` block appear at its end, all of them.
+
+    Where the block fails none does, and what stood there before is untouched.
+    """
+    _held.update(_final(path) for path in paths)
+    try:
+        yield
+        for temporary, target in _written:
+            with _write_errors(target):
+                os.replace(temporary, target)
+    finally:
+        for temporary, _ in _written:
+            with suppress(OSError):
+                temporary.unlink()
+        _held.clear()
+        _written.clear()
+
+
+def temporary_beside(path: Path) -> Path:
+    """A hidden name of its own in the folder of `path`, for what is not finished."""
+    return path.with_name(f".{path.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}")
+
+
+def _final(path: str | Path) -> Path:
+    return Path(os.path.realpath(path))  # a link keeps pointing to what it points to
+
+
 @contextmanager
 def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
     _check_path(path)
@@ -126,14 +267,19 @@ def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
             with open(target, f"w{binary}", **options) as device:
                 yield device
             return
-        target = Path(os.path.realpath(target))  # a link keeps pointing to what it points to
-        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}")
+        target = _final(target)
+        temporary = temporary_beside(target)
         try:
             with open(temporary, f"x{binary}", **options) as handle:
+                if target.exists():  # what others may not read they may not read afterwards
+                    os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
                 yield handle
                 handle.flush()
                 os.fsync(handle.fileno())
-            os.replace(temporary, target)
+            if target in _held:
+                _written.append((temporary, target))
+            else:
+                os.replace(temporary, target)
         except BaseException:
             with suppress(OSError):
                 temporary.unlink()

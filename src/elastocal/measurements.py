@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError
-from elastocal.files import atomic_writer
+from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import (
+    MOST_BYTES,
     NO_UNIT,
     Family,
     Labels,
     Layout,
     RawTable,
     column,
+    first_bad_cell,
     layout_of_columns,
     match_columns,
     read_table,
@@ -501,3 +503,46 @@ def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
     for start in range(0, n, AT_A_TIME):
         some = slice(start, start + AT_A_TIME)
         yield from zip(*(values[some].tolist() for values in columns.values()), strict=True)
+
+
+# A covariance of their noise.
+
+
+def read_matrix(path: str | Path, what: str) -> Array:
+    """A matrix of finite numbers without a header: CSV, or numpy's .npy.
+
+    Raises InputError that names the file and, of a CSV, the line.
+    """
+    if Path(path).suffix.lower() == ".npy":
+        return _read_npy(path, what)
+    rows: list[list[float]] = []
+    text = read_text(path, what, MOST_BYTES)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip():
+            continue
+        cells = list(enumerate(cell.strip() for cell in line.split(",")))
+        columns = {i: f"no. {i + 1}" for i, _ in cells}
+        if problem := first_bad_cell(str(path), [(number, [c for _, c in cells])], columns, False):
+            raise problem
+        rows.append([float(cell) for _, cell in cells])
+        if len(rows[-1]) != len(rows[0]):
+            raise InputError(
+                f"{path}, line {number}: {len(rows[-1])} numbers, the first line has "
+                f"{len(rows[0])}; a {what} is a square table without a header"
+            )
+    if not rows:
+        raise InputError(f"{path}: empty file; a {what} is a square table of numbers")
+    return np.array(rows)
+
+
+def _read_npy(path: str | Path, what: str) -> Array:
+    remedy = "save the matrix with numpy.save, or as CSV"
+    with open_input(path, what, MOST_BYTES) as handle:
+        try:
+            # Mapped, so that a header which states more numbers than the file has reads nothing.
+            found = np.lib.format.open_memmap(handle.name, mode="r")
+        except (ValueError, EOFError, OSError, OverflowError, SyntaxError, TypeError) as error:
+            raise InputError(f"{path}: not a matrix of numbers ({error}); {remedy}") from None
+    if found.dtype.kind not in "fiu" or not np.isfinite(found).all():
+        raise InputError(f"{path}: holds {found.dtype}, not finite numbers; {remedy}")
+    return np.array(found, dtype=float)

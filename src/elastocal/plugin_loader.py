@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 GROUP = "elastocal.plugins"
-MAX_BYTES = 5_000_000
+MAX_BYTES = 1_000_000
 OURS = str(Path(__file__).parent)
 
 _installed: list[str] = []  # entry points that were run

@@ -25,8 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError
-from elastocal.files import decoded, open_input
-from elastocal.text import did_you_mean, is_label, listed, quoted
+from elastocal.files import check_size, decoded, open_input
+from elastocal.text import (
+    cell_meaning,
+    cell_text,
+    did_you_mean,
+    is_label,
+    listed,
+    printable,
+    quoted,
+)
 from elastocal.units import Array, IntArray, to_si
 
 if TYPE_CHECKING:
@@ -38,6 +46,7 @@ if TYPE_CHECKING:
 MAX_LINE = 64 * 1024
 MAX_BLANK_LINES = 10_000
 MAX_ROWS = 5_000_000
+MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
 CHUNK_BYTES = 1 << 20
 DELIMITERS = ",;\t"
 BOM = b"\xef\xbb\xbf"
@@ -464,7 +473,8 @@ def joined_labels(pieces: Iterable[Coded]) -> Labels:
     code_of: dict[str, int] = {}
     codes = []
     for piece, names in pieces:
-        new = [code_of.setdefault(str(n).strip(), len(code_of)) for n in names]
+        texts = (cell_meaning(str(name).strip()) for name in names)
+        new = [code_of.setdefault(text.strip(), len(code_of)) for text in texts]
         codes.append(np.array(new, dtype=np.int64)[piece])
     return Labels(np.concatenate(codes), tuple(code_of))
 
@@ -556,7 +566,7 @@ def read_table(
         return _read_csv(CsvLines(source, BytesIO(text.encode()), what, comments), choose)
     if Path(path).suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(source, choose, what)
-    with open_input(path, what) as handle:
+    with open_input(path, what, MOST_BYTES) as handle:
         return _read_csv(CsvLines(source, handle, what, comments), choose)
 
 
@@ -581,9 +591,10 @@ def _read_parquet(source: str, choose: ChooseLayout, what: str) -> RawTable:
     """The same of a Parquet file, where pandas finds an engine to read it; rows from 1."""
     import pandas as pd
 
-    with open_input(source, what) as handle:
+    with open_input(source, what, MOST_BYTES) as handle:
         if handle.read(4) != b"PAR1":
             raise InputError(f"{source}: is not a Parquet file; check it, or name a CSV .csv")
+    _check_unpacked(source, what)
     try:
         frame = pd.read_parquet(source)
     except ImportError:
@@ -607,6 +618,21 @@ def _read_parquet(source: str, choose: ChooseLayout, what: str) -> RawTable:
     )
     table.check_labels()
     return table
+
+
+def _check_unpacked(source: str, what: str) -> None:
+    """Raise InputError where a Parquet file of some kilobytes would unpack beyond all bounds."""
+    try:
+        from pyarrow.parquet import ParquetFile
+
+        facts = ParquetFile(source).metadata
+        groups = [facts.row_group(i) for i in range(facts.num_row_groups)]
+        unpacked = sum(group.total_byte_size for group in groups)
+    except Exception:  # missing or damaged, which its reader says
+        return
+    if facts.num_rows > MAX_ROWS:
+        raise InputError(f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out")
+    check_size(source, what, unpacked, MOST_BYTES)
 
 
 def _parquet_numbers(source: str, name: str, column: pd.Series) -> Array:
@@ -756,10 +782,10 @@ def write_csv(
     comments: Iterable[str] = (),
 ) -> None:
     """Write a table as CSV, each of `comments` on a line of its own above it, after #."""
-    handle.writelines(f"# {comment}\n" for comment in comments)
+    handle.writelines(f"# {printable(comment)}\n" for comment in comments)
     writer = csv.writer(handle, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerow(map(cell_text, header))
+    writer.writerows(map(cell_text, row) for row in rows)
 
 
 def csv_text(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import unicodedata
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
@@ -40,13 +41,46 @@ def quoted(found: object) -> str:
     return text if isinstance(found, str) else text[1:-1]
 
 
+def printable(text: str) -> str:
+    """`text` with what a terminal would obey or a reader could not see as escapes: \\x1b, \\u202e.
+
+    The one way in which names from files and arguments are shown.  Text that is shown already
+    stays as it is.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        c if c.isprintable() or unicodedata.category(c) == "Zs"
+        else c.encode("unicode_escape").decode()
+        for c in text
+    )  # fmt: skip
+
+
 def is_label(text: str) -> bool:
-    """Can this text stand in a table cell and be read back: one line, no blanks at its ends?"""
-    return (
-        bool(text)
-        and text == text.strip()
-        and not any(c == "\ufeff" or unicodedata.category(c) in ("Cc", "Cs") for c in text)
-    )
+    """Can this text stand in a table cell and be read back as it is shown: one line, no blanks at
+    its ends, nothing that cannot be seen?"""
+    return bool(text) and text == text.strip() == printable(text)
+
+
+# How a cell begins that a spreadsheet would work out, and the mark that stops it.
+_FORMULA = re.compile(r"'*[=+\-@]")
+_NUMBER = re.compile(r"[+-]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
+
+
+def cell_text(cell: object) -> object:
+    """A cell of a table as it is written: text that no spreadsheet takes for a formula.
+
+    Text that begins with = + - @ and is no number gets an apostrophe before it, as spreadsheets
+    write such text; `cell_meaning` takes it off again.
+    """
+    if not isinstance(cell, str) or _NUMBER.fullmatch(cell):
+        return cell
+    return f"'{printable(cell)}" if _FORMULA.match(cell) else printable(cell)
+
+
+def cell_meaning(cell: str) -> str:
+    """The text that `cell_text` wrote."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def plain(value: Any) -> Any:

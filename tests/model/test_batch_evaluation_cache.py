@@ -71,6 +71,32 @@ def test_a_folder_of_somebody_else_is_no_cache(monkeypatch: pytest.MonkeyPatch) 
     assert fetch(KEY, ".bin") is None
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+@pytest.mark.parametrize("mode", [0o777, 0o750, 0o705, 0o720])
+def test_a_folder_that_others_may_enter_is_refused_with_a_word(folder: Path, mode: int) -> None:
+    assert store(KEY, ".bin", b"content") is not None
+    assert folder.stat().st_mode & 0o777 == 0o700
+    tape_cache.refused.clear()
+    folder.chmod(mode)
+    assert fetch(KEY, ".bin") is None and store(KEY, ".bin", b"content") is None
+    assert [str(folder) in told and "chmod 700" in told for told in tape_cache.refused] == [True]
+    folder.chmod(0o700)
+    assert fetch(KEY, ".bin") is not None
+    folder.parent.chmod(0o777)
+    assert fetch(KEY, ".bin") is None and str(folder.parent) in tape_cache.refused[-1]
+    tape_cache.refused.clear()
+
+
+def test_an_entry_that_is_a_link_or_pipe_is_made_anew(folder: Path, tmp_path: Path) -> None:
+    stored = store(KEY, ".bin", b"content")
+    assert stored is not None
+    stored.rename(tmp_path / "elsewhere")
+    stored.symlink_to(tmp_path / "elsewhere")
+    assert fetch(KEY, ".bin") is None and not stored.is_symlink()
+    os.mkfifo(stored)
+    assert fetch(KEY, ".bin") is None
+
+
 def test_no_part_is_left_behind(folder: Path) -> None:
     store(KEY, ".bin", b"content")
     store(KEY, ".bin", b"content")
@@ -93,14 +119,14 @@ def test_pruning_leaves_files_of_others_alone(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tape_cache, "LARGEST_TOTAL", 0)
-    folder.mkdir()
+    folder.mkdir(mode=0o700)
     (folder / "thesis.final.pdf").write_bytes(bytes(1000))
     assert store(KEY, ".bin", b"content") is not None
     assert (folder / "thesis.final.pdf").exists()
 
 
 def test_abandoned_parts_are_removed(folder: Path) -> None:
-    folder.mkdir()
+    folder.mkdir(mode=0o700)
     old, new = folder / f".{KEY}.old.tmp", folder / f".{KEY}.new.tmp"
     for path in (old, new):
         path.write_bytes(b"half")
@@ -170,3 +196,13 @@ def test_entries_differ_between_versions_of_casadi(monkeypatch: pytest.MonkeyPat
     before = HashedFunction([x], [ca.sin(x)]).digest
     monkeypatch.setattr("elastocal.model.function_cache.casadi_version", lambda: "0")
     assert HashedFunction([x], [ca.sin(x)]).digest != before
+
+
+def test_a_foreign_tape_is_made_anew(folder: Path) -> None:
+    first = backend_instructions.instructions(long_function(3.0))
+    (entry,) = folder.iterdir()
+    key, _, _ = entry.name.partition(".")
+    entry.unlink()
+    store(key, backend_instructions.SUFFIX, b"no archive of numpy")
+    second = backend_instructions.instructions(long_function(3.0))
+    np.testing.assert_array_equal(first[0], second[0])

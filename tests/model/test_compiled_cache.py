@@ -80,6 +80,19 @@ def test_a_damaged_library_is_compiled_anew(folder: Path, damage: str) -> None:
     assert compilations(folder) == 2
 
 
+def test_the_whole_library_of_another_function_is_not_loaded_but_replaced(folder: Path) -> None:
+    finished(started(2.0))
+    (library,) = libraries(folder)
+    key = library.name.split(".")[0]
+    finished(started(3.0))
+    (other,) = (path for path in libraries(folder) if path != library)
+    library.unlink()
+    # Its name states the digest of its content truly, as one that means harm would see to.
+    other.rename(other.with_name(f"{key}{other.name[len(key) :]}"))
+    assert finished(started(2.0)) == (expected(2.0), False)
+    assert finished(started(2.0)) == (expected(2.0), True)
+
+
 def test_two_processes_at_once(folder: Path) -> None:
     both = [started(3.0), started(3.0)]
     assert [finished(process)[0] for process in both] == [expected(3.0)] * 2

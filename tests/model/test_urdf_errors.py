@@ -131,19 +131,31 @@ def test_base_and_flange_names_are_checked(tmp_path: Path) -> None:
 
 
 def test_unreadable_files_are_explained(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such URDF file; check the path"):
+    with pytest.raises(InputError, match="no such file; check the path of the URDF file"):
         read_urdf(tmp_path / "nothing.urdf")
     with pytest.raises(InputError, match="is a directory; give the URDF file itself"):
         read_urdf(tmp_path)
     large = tmp_path / "large.urdf"
     with large.open("wb") as file:
         os.truncate(file.fileno(), 60_000_000)
-    with pytest.raises(InputError, match="60 MB is too large for a URDF"):
+    with pytest.raises(InputError, match="larger than 10 MB, which no URDF file is"):
         read_urdf(large)
     binary = tmp_path / "mesh.urdf"
     binary.write_bytes(b"\x00\x81solid\xff" * 10)
     with pytest.raises(InputError, match="not XML"):
         read_urdf(binary)
+    entities = tmp_path / "entities.urdf"
+    entities.write_text('<!DOCTYPE robot [<!ENTITY a "aa">]><robot name="&a;"/>')
+    with pytest.raises(InputError, match="has a <!DOCTYPE>"):
+        read_urdf(entities)
+    deep = tmp_path / "deep.urdf"
+    deep.write_text("<robot>" + "<a>" * 300_000 + "</a>" * 300_000 + "</robot>")
+    with pytest.raises(InputError, match="<a> is nested more than 32 deep"):
+        read_urdf(deep)
+    many = tmp_path / "many.urdf"
+    many.write_text("<robot>" + "".join(f'<link name="{k}"/>' for k in range(3000)) + "</robot>")
+    with pytest.raises(InputError, match="more than 2000 links"):
+        read_urdf(many)
     encoded = tmp_path / "encoded.urdf"
     encoded.write_bytes(b'<?xml version="1.0" encoding="shift_jis"?><robot/>')
     with pytest.raises(InputError, match=r"not XML|has no <link>"):

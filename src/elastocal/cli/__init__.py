@@ -1,6 +1,7 @@
 """The command line: elastocal VERB CELL [DATA] [options]."""
 
 import gc
+import logging
 import os
 
 # Many small matrices: a second thread of the linear algebra library only waits for the first.
@@ -19,6 +20,7 @@ from elastocal.cli import (  # noqa: F401
     study_command,
 )
 from elastocal.cli.app import app
+from elastocal.screen import close_streams, prepare_streams
 
 # New containers between two searches for garbage in cycles.  Python's own 700 has every import and
 # every fit walked through all that is loaded, 0.07 s each time, and finds nothing.
@@ -28,5 +30,11 @@ COLLECT_AFTER = 20_000
 def main() -> None:
     """Entry point of the `elastocal` command."""
     gc.set_threshold(COLLECT_AFTER)
-    # The same name however it is called: completion scripts are made of it.
-    app(prog_name="elastocal")
+    # Where it keeps its list of fonts, and that there is no place for it, concerns nobody here.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    prepare_streams()
+    try:
+        # The same name however it is called: completion scripts are made of it.
+        app(prog_name="elastocal")
+    finally:
+        close_streams()

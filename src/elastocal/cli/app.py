@@ -8,8 +8,10 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+import traceback
+import warnings
+from collections.abc import Callable, Iterable
+from io import StringIO
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -18,7 +20,8 @@ import typer
 from typer.core import TyperGroup
 
 from elastocal import __version__
-from elastocal.errors import ElastocalError, InputError, options_as_flags
+from elastocal.errors import TRACEBACK, ElastocalError, InputError, explained, options_as_flags
+from elastocal.screen import complain, interrupts, safe_console, say
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,6 +36,14 @@ VERBS = (
 )  # fmt: skip
 
 
+INTERRUPTED = 130  # 128 + SIGINT, as shells count
+# Arguments and options that name what a command reads.
+READ = (
+    "cell", "data", "result", "targets", "files", "folder", "test", "covariance", "knowledge",
+    "augment", "mapping",
+)  # fmt: skip
+
+
 class InOrder(TyperGroup):
     """Commands in the order of the work, not of their registration."""
 
@@ -41,24 +52,24 @@ class InOrder(TyperGroup):
         known = super().list_commands(ctx)
         return sorted(known, key=lambda name: VERBS.index(name) if name in VERBS else len(VERBS))
 
-    def make_context(self, *args: Any, **kwargs: Any) -> Any:
-        """As inherited; Ctrl-C is told of, which typer passes over."""
-        with _telling_of_ctrl_c():
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: Any) -> Any:
-        """As inherited; Ctrl-C before the command itself begins is told of."""
-        with _telling_of_ctrl_c():
-            return super().invoke(ctx)
-
-
-@contextmanager
-def _telling_of_ctrl_c() -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt:
-        _complain("interrupted")
-        raise typer.Exit(130) from None
+    def main(self, *args: Any, standalone_mode: bool = True, **extra: Any) -> Any:
+        """As inherited; but however it ends, one message says why, with names escaped."""
+        told = StringIO()
+        try:
+            code = super().main(*args, standalone_mode=False, **extra)
+        except (typer.Abort, KeyboardInterrupt, EOFError):
+            code = INTERRUPTED
+        except Exception as error:
+            if not hasattr(error, "show"):
+                raise
+            error.show(told)  # of typer's own: a usage error
+            say(told.getvalue(), error=True, end="")
+            code = getattr(error, "exit_code", 2)
+        if code == INTERRUPTED:
+            complain("interrupted")
+        if not standalone_mode:
+            return code
+        sys.exit(code or 0)
 
 
 app = typer.Typer(
@@ -90,50 +101,49 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
         try:
-            with _telling_of_ctrl_c(), options_as_flags():
+            with options_as_flags(), warnings.catch_warnings():
+                # numpy's, of overflows: what comes of them is judged where a number must be one.
+                warnings.simplefilter("ignore", RuntimeWarning)
                 command(*args, **kwargs)
+                # Nothing else of the model is loaded for this.
+                cache = sys.modules.get("elastocal.model.function_cache")
+                for told in getattr(cache, "refused", ()):
+                    complain(told)
         except ElastocalError as error:
-            _complain(str(error))
+            complain(str(error))
             raise typer.Exit(error.exit_code) from None
         except BrokenPipeError:
             # The reader of stdout went away (… | head): nothing is wrong with the input.
-            sys.stderr.close()
             raise typer.Exit(0) from None
         except OSError as error:
-            _complain(f"{error.filename or 'file'}: {error.strerror or error}")
+            complain(f"{error.filename or 'file'}: {error.strerror or error}")
             raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+        except (typer.Exit, typer.Abort):
+            raise
+        except Exception as error:
+            if hasattr(error, "show"):  # of typer's own: a usage error
+                raise
+            if interrupts:  # which a library has turned into an error of its own
+                raise typer.Exit(INTERRUPTED) from None
+            if os.environ.get(TRACEBACK):
+                traceback.print_exc()
+            message, code = explained(error, [kwargs.get(name) for name in READ])
+            complain(message)
+            raise typer.Exit(code) from None
 
     return run
 
 
-def _complain(message: str) -> None:
-    typer.echo(f"elastocal: {message}", err=True)
-
-
 def console(stderr: bool = False) -> Console:
-    """A rich console; colours respect NO_COLOR and are off where the output is no terminal."""
-    from rich.console import Console
-
-    return Console(stderr=stderr, highlight=False)
-
-
-@contextmanager
-def progress_line(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """A status line on stderr; silent where that is no terminal and `quiet` is asked for."""
-    if quiet:
-        yield lambda message: None
-        return
-    screen = console(stderr=True)
-    if not screen.is_terminal:
-        yield lambda message: screen.print(f"… {message}")
-        return
-    with screen.status("starting") as status:
-        yield lambda message: status.update(message)
+    """A console; colours respect NO_COLOR and are off where the output is no terminal."""
+    return safe_console(stderr=stderr)
 
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"elastocal {__version__}")
+        say(f"elastocal {__version__}")
         raise typer.Exit
 
 
@@ -181,15 +191,17 @@ def check_outputs(*paths: Path | None) -> list[Path]:
 
 def check_apart(written: list[Path], read: Iterable[Path | None], cell: Cell | None = None) -> None:
     """Refuse to write over an input or a file that the `cell` names, or two outputs into one."""
-    inputs = {path.resolve() for path in read if path is not None}
-    inputs |= set() if cell is None else {path.resolve() for path in files_of(cell)}
-    taken: set[Path] = set()
+    # Not Path.resolve, which raises RuntimeError where links go round in a circle.
+    inputs = {os.path.realpath(path) for path in read if path is not None}
+    inputs |= set() if cell is None else {os.path.realpath(path) for path in files_of(cell)}
+    taken: set[str] = set()
     for path in written:
-        if path.resolve() in inputs:
+        real = os.path.realpath(path)
+        if real in inputs:
             raise InputError(f"{path} is read and would be written over; name another output")
-        if path.resolve() in taken:
+        if real in taken:
             raise InputError(f"{path}: two outputs of the same name; name another one")
-        taken.add(path.resolve())
+        taken.add(real)
 
 
 def files_of(cell: Cell) -> list[Path]:

@@ -16,9 +16,9 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
 )
 from elastocal.errors import InputError, require
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def compensate(
     """
     from elastocal import verbs
     from elastocal.compensation.tool import one_target, tool_point
-    from elastocal.files import atomic_write_text
+    from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
 
@@ -148,19 +148,20 @@ def compensate(
             corrections = correction_table(arm, lines, where, force, start, seed, progress)
             content["table"], texts[table] = _table(corrections, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
-        for path, text in texts.items():
-            atomic_write_text(path, text)
+        with together(written):
+            for path, text in texts.items():
+                atomic_write_text(path, text)
     if as_json:
         both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
-        typer.echo(json_text(both))
+        say(json_text(both))
         return
     from elastocal.report.terminal import print_compensation
 
     print_compensation(console(), content)
     for path in written:
-        typer.echo(f"wrote {path}")
+        say(f"wrote {path}")
     if output is not None:
-        typer.echo(
+        say(
             f"Next: run the commands of {output.name} (its q columns) and measure some: the tool "
             "should lie within two or three std_um, and the tracker's noise, of its targets."
         )

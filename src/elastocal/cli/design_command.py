@@ -21,10 +21,10 @@ from elastocal.cli.app import (
     command,
     console,
     files_of,
-    progress_line,
     repeated,
 )
-from elastocal.errors import ElastocalError, InputError, require
+from elastocal.errors import InputError, require
+from elastocal.screen import progress_line, say
 
 if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell
@@ -114,6 +114,7 @@ def design(
 
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
+    from elastocal.files import together
     from elastocal.planning.design import Checkpoint, key_of
     from elastocal.planning.design import design as run
     from elastocal.verbs import design_request
@@ -151,26 +152,27 @@ def design(
             plan = run(wanted, options, checkpoint, progress)
         except Exception as error:
             interrupts.check()
-            if isinstance(error, ElastocalError):
+            if not isinstance(error, OSError):
                 # The same input ends here again: there is nothing to go on with.
                 checkpoint.drop()
             raise
         interrupts.check()
-        _write_all(plan, output, programs, picture)
-        if report is not None:
-            from elastocal.report.page import write_page
+        with together(written):
+            _write_all(plan, output, programs, picture)
+            if report is not None:
+                from elastocal.report.page import write_page
 
-            progress("writing the report")
-            write_page(plan, report, list(dict.fromkeys(files)), repeated())
+                progress("writing the report")
+                write_page(plan, report, list(dict.fromkeys(files)), repeated())
         checkpoint.clear()
     if as_json:
-        typer.echo(summary.read_text(encoding="utf-8"), nl=False)
+        say(summary.read_text(encoding="utf-8"), end="")
         return
     from elastocal.report.terminal import print_plan
 
     print_plan(console(), plan)
     for path in written:
-        typer.echo(f"wrote {path}")
+        say(f"wrote {path}")
 
 
 def _target(target: float | None, poses: int | None) -> float | None:
@@ -227,14 +229,19 @@ def _check_programs(cell: Cell, programs: list[Path]) -> None:
 
 
 def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | None) -> None:
-    """plan.csv, plan.json, robot programs and picture, each whole or not at all."""
+    """plan.csv, plan.json, robot programs and picture."""
     from elastocal.files import atomic_write_text
+    from elastocal.model.chain import joint_limits
+    from elastocal.planning.programs import check_program, steps_of
     from elastocal.saving import save_plan
 
     chain = plan.model.chain
+    limits = joint_limits(plan.model.cell, chain)
     save_plan(plan, output, repeated())
     for path in programs:
-        text = _program(path, plan.execution, chain, plan.configurations, plan.forces)
+        text = _program(path, plan.execution, chain, plan.configurations, plan.forces, limits)
+        # Before it appears: a program that moves elsewhere than the plan is not left behind.
+        check_program(text, list(steps_of(plan.execution, plan.configurations, plan.forces)))
         atomic_write_text(path, text)
     if picture is not None:
         from elastocal.report.plan_picture import write_plan_picture
@@ -248,12 +255,13 @@ def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | N
 def _program(
     path: Path, execution: Execution, chain: Chain,
     configurations: tuple[str, ...] = (), forces: Array | None = None,
+    limits: tuple[Array, Array] | None = None,
 ) -> str:  # fmt: skip
     """The robot program to write to `path`."""
     from elastocal.planning.programs import krl_program, urscript_program
 
     text = krl_program if path.suffix.lower() == ".src" else urscript_program
     try:
-        return text(execution, chain, configurations, forces, name=path.stem)
+        return text(execution, chain, configurations, forces, name=path.stem, limits=limits)
     except InputError as error:
         raise InputError(f"--program {path}: {error}") from None

@@ -20,10 +20,10 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
     repeated,
 )
 from elastocal.errors import require
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ def diagnose(
     from elastocal import verbs
     from elastocal.diagnosis.diagnose import write_extended_cell
     from elastocal.diagnosis.diagnosis import publish
+    from elastocal.files import together
     from elastocal.model.choice import cell_of
     from elastocal.report.causes_view import added_text
     from elastocal.saving import save_diagnosis
@@ -88,32 +89,33 @@ def diagnose(
         assert found.model is not None  # `diagnose` states it
         kinds = found.model.chain.kinds
         told = []
-        if output is not None:
-            save_diagnosis(found, output)
-            told.append(f"wrote {output}")
-        if report is not None:
-            from elastocal.report.page import write_page
+        with together(written):
+            if output is not None:
+                save_diagnosis(found, output)
+                told.append(f"wrote {output}")
+            if report is not None:
+                from elastocal.report.page import write_page
 
-            write_page(found, report, [cell, data], repeated(), seed)
-            told.append(f"wrote {report}")
-        if plan is not None:
-            told.append(_write_extra_poses(plan, found.extra, kinds, bool(found.groups)))
-        if cell_out is not None:
-            extra = (*found.effects, *found.fields)
-            write_extended_cell(cell, cell_out, extra, found.model_keys)
-            added = added_text(extra)
-            told.append(f"wrote {cell_out} with {added or 'no further effect'}")
-            if added:
-                again = shlex.join(["elastocal", "identify", str(cell_out), str(data)])
-                told.append(f"to go on: {again} -o result.json")
+                write_page(found, report, [cell, data], repeated(), seed)
+                told.append(f"wrote {report}")
+            if plan is not None:
+                told.append(_write_extra_poses(plan, found.extra, kinds, bool(found.groups)))
+            if cell_out is not None:
+                extra = (*found.effects, *found.fields)
+                write_extended_cell(cell, cell_out, extra, found.model_keys)
+                added = added_text(extra)
+                told.append(f"wrote {cell_out} with {added or 'no further effect'}")
+                if added:
+                    again = shlex.join(["elastocal", "identify", str(cell_out), str(data)])
+                    told.append(f"to go on: {again} -o result.json")
     if as_json:
-        typer.echo(json_text(publish(found, found.model, found.data)))
+        say(json_text(publish(found, found.model, found.data)))
         return
     from elastocal.report.terminal import print_diagnosis
 
     print_diagnosis(console(), found, kinds)
     for line in told:
-        typer.echo(line)
+        say(line)
 
 
 def _write_extra_poses(

@@ -16,8 +16,8 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
 )
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -93,15 +93,15 @@ def export(
         done = run(calibrated, wish, progress)
     atomic_write_text(output, done.text)
     if as_json:
-        typer.echo(json_text({"output": str(output)} | done.to_json()))
+        say(json_text({"output": str(output)} | done.to_json()))
         return
     _tell(done)
-    typer.echo(f"wrote {output}")
+    say(f"wrote {output}")
 
 
 def _tell(done: Exported) -> None:
     """What the file holds and what not, for people."""
-    from elastocal.report.formatting import printable
+    from elastocal.text import printable
 
     screen = console()
     cost, (name, in_title) = done.cost, NAMES[done.format]
@@ -154,8 +154,9 @@ def _rounding(metres: float | None) -> str:
 
 
 def _cost_table(title: str, cost: Cost) -> Table:
-    from elastocal.report.formatting import length, printable
+    from elastocal.report.formatting import length
     from elastocal.report.terminal import titled
+    from elastocal.text import printable
 
     table = titled(title)
     for head in ("effect", "markers rms", "max", "flange rms", "max", ""):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,18 +18,15 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
     repeated,
 )
-from elastocal.errors import InputError
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from elastocal.identification.result import Calibration
     from elastocal.report.identification_view import Truth
     from elastocal.report.page import Published
-
-MOST_BYTES = 1_000_000_000  # of a covariance as text: 6000 rows
 
 
 @command()
@@ -110,6 +107,7 @@ def identify(
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
     """
     from elastocal import verbs
+    from elastocal.measurements import read_matrix
     from elastocal.model.choice import cell_of
 
     written = check_outputs(output, report, residuals)
@@ -120,19 +118,19 @@ def identify(
         result = verbs.identify(
             known, data, test=test, fixed=fix or (), method=method, noise=noise,  # type: ignore[arg-type]
             weights=weights, intervals=intervals, outliers=outliers,  # type: ignore[arg-type]
-            covariance=None if covariance is None else _read_covariance(covariance),
+            covariance=None if covariance is None else read_matrix(covariance, "noise covariance"),
             bounded=bounded, physical=physical, knowledge=knowledge, seed=seed, jobs=jobs,
             progress=progress,
         )  # fmt: skip
         write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
-        typer.echo(json_text(result.to_json()))
+        say(json_text(result.to_json()))
         return
     from elastocal.report.terminal import print_result
 
     print_result(console(), result)
     for path in written:
-        typer.echo(f"wrote {path}")
+        say(f"wrote {path}")
 
 
 def write_results(
@@ -145,33 +143,20 @@ def write_results(
     truth: Truth | None = None,
     published: Published | None = None,
 ) -> None:
-    """Write what was asked for, each file whole or not at all.
+    """Write what was asked for, all of it or nothing.
 
     `inputs` are named with their hashes in the report, where `truth` and `published` (SI) stand
     beside the estimates.
     """
+    from elastocal.files import together
     from elastocal.saving import save_residuals, write_json
 
-    if output is not None:
-        write_json(output, result.to_json())
-    if residuals is not None:
-        save_residuals(result, residuals)
-    if report is not None:
-        from elastocal.report.page import write_page
+    with together(path for path in (output, residuals, report) if path is not None):
+        if output is not None:
+            write_json(output, result.to_json())
+        if residuals is not None:
+            save_residuals(result, residuals)
+        if report is not None:
+            from elastocal.report.page import write_page
 
-        write_page(result, report, inputs, repeated(), seed, truth=truth, published=published)
-
-
-def _read_covariance(path: Path) -> Any:
-    import numpy as np
-
-    from elastocal.files import open_input, read_text
-
-    try:
-        if path.suffix == ".npy":
-            with open_input(path, "noise covariance") as handle:
-                return np.load(handle, allow_pickle=False)
-        text = read_text(path, "noise covariance", MOST_BYTES)
-        return np.loadtxt(text.splitlines(), delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise InputError(f"{path}: not a matrix of numbers ({error})") from None
+            write_page(result, report, inputs, repeated(), seed, truth=truth, published=published)

@@ -7,8 +7,15 @@ from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import Json, check_apart, check_outputs, command, console
+from elastocal.cli.app import (
+    Json,
+    check_apart,
+    check_outputs,
+    command,
+    console,
+)
 from elastocal.errors import InputError, require
+from elastocal.screen import say
 from elastocal.text import json_text
 
 PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, kuka, abb, ros"
@@ -61,7 +68,7 @@ def import_(
     from elastocal.model.effects import CATALOGUE
 
     if show_preset is not None:
-        typer.echo(preset_text(show_preset), nl=False)
+        say(preset_text(show_preset), end="")
         return
     paths = list(files or ())
     require(bool(paths), "import needs files: the tracker's export, and the log of the joints")
@@ -82,14 +89,14 @@ def import_(
         check_apart(written, [], known)
     found = import_files(paths, read, known, str(output or "the table"))
     if as_json:
-        typer.echo(json_text(summary(found, output)))
+        say(json_text(summary(found, output)))
     elif preview:
         print_preview(console(), found)
     else:
         for warning in found.warnings:
-            typer.echo(f"Warning: {warning}", err=True)
+            say(f"Warning: {warning}", error=True)
         for line in left_out(found):
-            typer.echo(line, err=True)
+            say(line, error=True)
     if found.refused:
         raise InputError(found.refused)
     if output is None:
@@ -99,7 +106,7 @@ def import_(
     atomic_write_text(output, found.text)
     if not as_json:
         table = found.table
-        typer.echo(
+        say(
             f"wrote {len(table)} readings of {len(table.configuration_labels)} configurations to "
             f"{output}"
         )

@@ -13,9 +13,9 @@ from rich.text import Text
 
 from elastocal.importing.assemble import Imported
 from elastocal.importing.records import Understood
-from elastocal.report.formatting import ShownTable, counted, printable
+from elastocal.report.formatting import ShownTable, counted
 from elastocal.report.terminal import table_of
-from elastocal.text import listed
+from elastocal.text import listed, printable
 
 
 def left_out(found: Imported) -> list[str]:

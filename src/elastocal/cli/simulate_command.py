@@ -16,9 +16,9 @@ from elastocal.cli.app import (
     check_outputs,
     command,
     console,
-    progress_line,
 )
 from elastocal.errors import InputError
+from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 
@@ -56,6 +56,7 @@ def simulate(
     Example: elastocal simulate cell.toml plan.csv -o data.csv --set joint2.compliance=3e-7
     --load 0 0 -2600 --repeats 6
     """
+    from elastocal.files import together
     from elastocal.measurements import write_measurements
     from elastocal.model.manipulator import Model
     from elastocal.saving import write_json
@@ -69,15 +70,16 @@ def simulate(
         model, poses, values=dict(_assignment(text) for text in set_ or ()), draw=draw, load=load,
         repeats=repeats, noise=not no_noise, seed=seed,
     )  # fmt: skip
-    write_measurements(table, output, model.chain.kinds)
     named = dict(zip(model.names, x.tolist(), strict=True))
-    if truth is not None:
-        write_json(truth, named)
+    with together(written):
+        write_measurements(table, output, model.chain.kinds)
+        if truth is not None:
+            write_json(truth, named)
     if as_json:
         summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
-        typer.echo(json_text(summary | {"seed": seed, "truth": named}))
+        say(json_text(summary | {"seed": seed, "truth": named}))
         return
-    typer.echo(f"wrote {len(table)} readings of {len(poses)} poses to {output}")
+    say(f"wrote {len(table)} readings of {len(poses)} poses to {output}")
 
 
 def _assignment(text: str) -> tuple[str, float]:
@@ -115,12 +117,12 @@ def demo(
             done.published,
         )  # fmt: skip
     if as_json:
-        typer.echo(json_text(done.result.to_json() | {"truth": done.truth}))
+        say(json_text(done.result.to_json() | {"truth": done.truth}))
         return
     from elastocal.report.terminal import print_result
 
     print_result(console(), done.result, truth=done.truth)
-    typer.echo(
+    say(
         f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"
         f"Report to open: {report.absolute()}"
     )

@@ -9,8 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from elastocal.cli.app import command, console
+from elastocal.cli.app import (
+    command,
+    console,
+)
 from elastocal.errors import require
+from elastocal.screen import say
 
 if TYPE_CHECKING:
     from elastocal.studies.study_run import Ending
@@ -77,7 +81,7 @@ def study(
             prepared, results, jobs=jobs, cluster=cluster, only=only, restart=restart,
             retry_failed=retry_failed, stop=stop, progress=shown.show, tell=shown.tell,
         )  # fmt: skip
-    typer.echo(_told(ending, results))
+    say(_told(ending, results))
     if ending.stopped and not ending.complete:
         raise typer.Exit(130)
     if ending.failed:
@@ -85,7 +89,7 @@ def study(
     if ending.done == len(prepared.tasks):
         text = summarise(prepared, results, page)
         if text is not None:
-            typer.echo(f"\n{text}")
+            say(f"\n{text}")
 
 
 def _told(ending: Ending, results: Path) -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 import tomli_w
 
 from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.config import read_toml
 from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import SumAnswer
@@ -45,7 +45,7 @@ from elastocal.diagnosis.verdict import (
     warnings,
 )
 from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.files import atomic_write_text
+from elastocal.files import atomic_write_text, temporary_beside
 from elastocal.identification.findings import BudgetStep
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
@@ -86,14 +86,21 @@ def write_extended_cell(
     """
     source, target = Path(source), Path(target)
     cell = read_cell(source)
-    text = source.read_text(encoding="utf-8-sig")
-    data = {"name": cell.name} | tomllib.loads(text)
+    data = {"name": cell.name} | read_toml(source, "cell file")
     _redirect(data, source.parent, target.parent)
     if found:
         _switch_on(data.setdefault("model", {}), found)
         data["model"] |= dict(model_keys or {})
-    atomic_write_text(target, tomli_w.dumps(data))
-    return read_cell(target)
+    text = tomli_w.dumps(data)
+    # Read before it appears: a cell that cannot be read is not left behind.
+    trial = temporary_beside(target)
+    try:
+        atomic_write_text(trial, text)
+        cell = replace(read_cell(trial), path=target)
+    finally:
+        trial.unlink(missing_ok=True)
+    atomic_write_text(target, text)
+    return cell
 
 
 def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +10,7 @@ from elastocal.errors import InputError
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
+from elastocal.tables import csv_text
 
 COLUMNS = (
     "effect", "where", "follows", "position_deg", "time_s", "component", "unit", "value", "half95",
@@ -39,12 +38,7 @@ def corrections_csv(calibrated: CalibratedArm, note: str) -> str:
             f"{calibrated.source}: this arm has no smooth function to be written as corrections; "
             "elastocal diagnose finds those that the readings show"
         )
-    text = io.StringIO()
-    text.write(f"# {note}\n")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text(COLUMNS, rows, [note])
 
 
 def _rows(calibrated: CalibratedArm, group: SmoothGroup) -> Iterator[tuple[str, ...]]:

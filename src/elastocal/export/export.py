@@ -34,6 +34,7 @@ from elastocal.export.exportable import (
 )
 from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
 from elastocal.export.urdf_file import BASE, FLANGE, Frames, calibrated_urdf, new_urdf
+from elastocal.files import atomic_write_text
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain
 from elastocal.model.effects import effect_of
@@ -256,7 +257,7 @@ def check_chain(
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"written{ending}"
-        path.write_text(text, encoding="utf-8", newline="\n")
+        atomic_write_text(path, text)
         back = read(path)
     q = random_table(kept.full.model, kept.conditions, 100, seed).q
     apart = (flanges(back, q) - flanges(chain, q))[:, :3] @ CORNERS

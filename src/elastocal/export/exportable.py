@@ -23,6 +23,7 @@ from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
+from elastocal.model.urdf import urdf_bytes
 from elastocal.simulation.mujoco_arm import numbers
 from elastocal.units import Array
 
@@ -360,7 +361,7 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
     import pinocchio as pin
 
     try:
-        robot = pin.buildModelFromXML(path.read_text(encoding="utf-8-sig"))
+        robot = pin.buildModelFromXML(urdf_bytes(path).decode("utf-8-sig"))
     except (ValueError, RuntimeError):
         return ()
     moving = {joint.name for joint in chain.joints}

@@ -18,7 +18,7 @@ from elastocal.errors import InputError, option
 from elastocal.export.exportable import ExportNumbers, origin_attributes
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.placements import link_ends
-from elastocal.model.urdf import Tree, UrdfJoint, check_urdf
+from elastocal.model.urdf import Tree, UrdfJoint, check_urdf, urdf_bytes
 from elastocal.simulation.mujoco_arm import numbers
 from elastocal.units import Array
 
@@ -119,7 +119,7 @@ def read_urdf_text(path: Path) -> UrdfText:
 
 
 def _as_utf8(path: Path) -> bytes:
-    data = path.read_bytes()
+    data = urdf_bytes(path)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         name = "utf-16"
     else:

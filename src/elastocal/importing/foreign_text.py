@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from elastocal.errors import InputError
-from elastocal.files import decoded, open_input
+from elastocal.files import decoded, read_bytes
 from elastocal.importing.mapping_file import TextSourceKeys
 from elastocal.tables import MAX_LINE, NUMBER, first_bad_cell
 from elastocal.text import quoted
@@ -56,10 +56,7 @@ def read_lines(path: str | Path, encoding: str = "auto") -> Text:
     Raises InputError where the file cannot be read, is empty, no text, or not in `encoding`.
     """
     source = str(path)
-    with open_input(path, "export") as handle:
-        data = handle.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise InputError(f"{source}: larger than {MAX_BYTES // 10**6} MB; export fewer readings")
+    data = read_bytes(path, "export", MAX_BYTES)
     if not data.strip():
         raise InputError(f"{source}: empty file; export it again")
     if data.startswith(_BINARY):

@@ -28,6 +28,7 @@ from elastocal.model.function_cache import (
     HashedFunction,
     casadi_version,
     content_key,
+    entry_bytes,
     fetch,
     row_by_row,
     store,
@@ -202,9 +203,9 @@ def compile_library(compiler: Compiler, source: str) -> bytes:
     """
     with tempfile.TemporaryDirectory(prefix="elastocal-") as folder:
         text, library = Path(folder, "rows.c"), Path(folder, f"rows{SUFFIX}")
-        text.write_text(source)
         command = [*compiler.command, *FLAGS, text.name, "-o", library.name, *LIBRARIES]
         try:
+            text.write_text(source)
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, errors="replace",
                 timeout=TIME_LIMIT,
@@ -262,12 +263,16 @@ def find_compiled(function: HashedFunction) -> Compiled | None:
     Raises NoCompiler without a compiler.
     """
     compiler = find_compiler()
-    library = fetch(_key(function, compiler), SUFFIX)
+    key = _key(function, compiler)
+    library = fetch(key, SUFFIX)
     if library is None:
         return None
     try:
-        return _loaded(library, compiler, cached=True)
-    except NoCompiler:  # whole, but not for this system
+        # Before it is loaded, which runs code of it: that of another function is none of this.
+        if _mark(key).encode() in entry_bytes(library):
+            return _loaded(library, compiler, cached=True)
+        raise NoCompiler("another function's")
+    except (NoCompiler, OSError):  # whole, but not for this system or function
         with suppress(OSError):
             library.unlink()
         return None
@@ -287,8 +292,10 @@ def compile_function(function: HashedFunction) -> Compiled:
         raise NoCompiler(
             f"CasADi {casadi_version()} writes C that is not known here ({error})"
         ) from None
-    data = compile_library(compiler, source)
-    library = store(_key(function, compiler), SUFFIX, data)
+    key = _key(function, compiler)
+    mark = f'\nCASADI_SYMBOL_EXPORT const char elastocal_made_for[] = "{_mark(key)}";\n'
+    data = compile_library(compiler, source + mark)
+    library = store(key, SUFFIX, data)
     if library is not None:
         return _loaded(library, compiler, cached=False)
     # Without a cache the file is needed only until it is loaded, where the system allows that.
@@ -303,6 +310,11 @@ def _loaded(library: Path, compiler: Compiler, cached: bool) -> Compiled:
         return Compiled(library, compiler, cached)
     except (OSError, AttributeError) as error:
         raise NoCompiler(f"the library that {compiler} made cannot be loaded ({error})") from None
+
+
+def _mark(key: str) -> str:
+    """What a library holds that was compiled for this key."""
+    return f"elastocal library {key}"
 
 
 def _key(function: HashedFunction, compiler: Compiler) -> str:

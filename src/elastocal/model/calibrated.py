@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,13 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from elastocal.above import Saved
 from elastocal.errors import InputError
-from elastocal.files import read_text
+from elastocal.files import read_json
 from elastocal.model.chain import Chain
 from elastocal.model.choice import cell_of
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import nominal_flange
 from elastocal.model.smooth_groups import smooth_groups
+from elastocal.text import quoted
 from elastocal.units import Array
 
 SCHEMA = "elastocal/identification/1"
@@ -177,7 +177,7 @@ def _check_robot(model: Model, stated: Any, cell: str | Path, result: str | Path
     here = np.array(nominal_flange_rows(model.chain))
     try:
         there = np.array(stated, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         there = np.zeros(0)
     if there.shape != here.shape or not np.isfinite(there).all():
         raise InputError(
@@ -194,23 +194,11 @@ def _check_robot(model: Model, stated: Any, cell: str | Path, result: str | Path
 
 
 def _read_result(path: Path) -> dict[str, Any]:
-    try:
-        result = json.loads(read_text(path, "result of identify", MOST_BYTES))
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"{path}, line {error.lineno}: not JSON ({error.msg}); "
-            "give the file that identify wrote"
-        ) from None
-    except RecursionError:
-        raise InputError(
-            f"{path}: lists within lists without end; give the file that identify wrote"
-        ) from None
+    remedy = "give the file that identify wrote"
+    result = read_json(path, "result of identify", MOST_BYTES, remedy)
     found = result.get("schema") if isinstance(result, dict) else None
     if found != SCHEMA:
-        raise InputError(
-            f"{path}: schema is {found!r}, and {SCHEMA!r} is needed; "
-            "give the file that identify wrote"
-        )
+        raise InputError(f"{path}: schema is {quoted(found)}, and {SCHEMA!r} is needed; {remedy}")
     return dict(result)
 
 
@@ -222,7 +210,7 @@ def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
     for k, entry in enumerate(entries):
         try:
             name, value = str(entry["name"]), float(entry["held"])
-        except (TypeError, KeyError, ValueError):
+        except (TypeError, KeyError, ValueError, OverflowError):
             raise InputError(
                 f"{path}: parameters[{k}] needs a name and a number under held; "
                 "write the result anew with identify"
@@ -243,7 +231,7 @@ def _covariance(
     try:
         determined = tuple(map(str, names))
         covariance = np.array(rows, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(
             f"{path}: covariance is no table of numbers, or covariance_of no list of names; "
             "write the result anew with identify"
@@ -253,6 +241,8 @@ def _covariance(
             f"{path}: covariance of {covariance.size} numbers for {len(determined)} names "
             "in covariance_of; write the result anew with identify"
         )
+    if np.isinf(covariance).any():
+        raise InputError(f"{path}: covariance holds numbers beyond all measure; write it anew")
     return determined, covariance.reshape(len(determined), len(determined))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import stat
 import sys
 import time
 from collections.abc import Sequence
@@ -79,14 +80,17 @@ def row_by_row(sparsity: ca.Sparsity) -> list[int]:
 
 # The user's cache folder: entries under a content key that are whole or not there.
 #
-# An entry is one file `KEY.SHA256.SUFFIX`.  Its name holds the digest of its bytes, so a damaged or
-# truncated file is noticed before it is used; it appears by one rename, so that of two processes
-# writing the same entry each reads a whole one.  No cache is no error: everything in it can be
-# made again.
+# What is in it is run as code, with the user's rights.  So the folder must be the user's own and
+# nobody else's to enter (mode 0700), and an entry a file of the user's.  An entry is one file
+# `KEY.SHA256.SUFFIX`.  Its name holds the digest of its bytes, so a damaged or truncated file is
+# noticed before it is used; it appears by one rename, so that of two processes writing the same
+# entry each reads a whole one.  No cache is no error: everything in it can be made again.
 
 # Part of every key: raise it when the meaning of an entry changes.
 FORMAT = "1"
 LARGEST_TOTAL = 200_000_000  # bytes
+# No link is followed, no pipe waited for; on Windows bytes are taken as they are.
+HOW_TO_OPEN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
 ABANDONED = 3600.0  # s; a temporary file this old belongs to a process that died
 
 
@@ -116,19 +120,50 @@ def cache_folder() -> Path:
     return base / "elastocal"
 
 
-def usable_folder() -> Path | None:
-    """The cache folder, made where it is absent; None where it cannot be written.
+# Why a cache folder was refused, in words for the user; the command line says them.
+refused: list[str] = []
 
-    A folder of somebody else's is not used: libraries are loaded from it.
-    """
+
+def usable_folder() -> Path | None:
+    """The cache folder, made where it is absent; None where it cannot be written or trusted."""
     try:
         folder = cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if hasattr(os, "getuid") and folder.stat().st_uid != os.getuid():
+        if reason := _untrusted(folder):
+            told = f"{folder}: compiled code is not kept there, since {reason}"
+            if told not in refused:
+                refused.append(told)
             return None
         return folder if os.access(folder, os.W_OK | os.X_OK) else None
     except (OSError, RuntimeError):  # RuntimeError: no home folder
         return None
+
+
+def _untrusted(folder: Path) -> str:
+    """Why libraries may not be loaded from `folder`, "" where they may."""
+    if not hasattr(os, "getuid"):
+        return ""
+    found = folder.stat()
+    if found.st_uid != os.getuid():
+        return "the folder is another user's; name one of your own in ELASTOCAL_CACHE"
+    if found.st_mode & 0o077:
+        return "others may enter the folder; run: chmod 700 on it"
+    for above in folder.resolve().parents:
+        mode = above.stat().st_mode
+        if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+            return f"everybody may replace what is in {above}; run: chmod o-w on it"
+    return ""
+
+
+def entry_bytes(path: Path) -> bytes:
+    """The content of an entry.  Raises OSError where it is a link, or no file of the user's."""
+    descriptor = os.open(path, os.O_RDONLY | HOW_TO_OPEN)
+    with open(descriptor, "rb") as handle:
+        found = os.fstat(descriptor)
+        own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+        if not stat.S_ISREG(found.st_mode) or not own or found.st_size > LARGEST_TOTAL:
+            raise OSError(f"{path} is no entry of this cache")
+        return handle.read()
 
 
 def fetch(key: str, suffix: str) -> Path | None:
@@ -138,7 +173,11 @@ def fetch(key: str, suffix: str) -> Path | None:
         return None
     for path in sorted(folder.glob(f"{key}.*{suffix}")):
         with suppress(OSError):
-            if _digest(path.read_bytes()) == path.name[len(key) + 1 : -len(suffix)]:
+            try:
+                whole = _digest(entry_bytes(path)) == path.name[len(key) + 1 : -len(suffix)]
+            except OSError:
+                whole = False
+            if whole:
                 os.utime(path)
                 return path
             path.unlink()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import operator
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -101,8 +103,8 @@ def instructions(function: HashedFunction) -> tuple[NDArray[np.int32], NDArray, 
         try:
             with np.load(found, allow_pickle=False) as saved:
                 return saved["table"], saved["constants"], int(saved["registers"])
-        except (OSError, ValueError, KeyError):
-            pass  # another process removed it
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+            pass  # another process removed it, or it is none of ours
     table, constants, registers = _extracted(function)
     data = io.BytesIO()
     np.savez(data, table=table, constants=constants, registers=registers)

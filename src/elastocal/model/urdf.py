@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import InputError, require
+from elastocal.files import DEEPEST, read_bytes
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, LinkMass
-from elastocal.text import did_you_mean, listed
+from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
 
 Vector = tuple[float, float, float]
@@ -28,7 +29,8 @@ MOVING = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
-MAX_BYTES = 50_000_000
+MAX_BYTES = 10_000_000
+MOST_LINKS = 2000
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
@@ -311,11 +313,13 @@ def check_urdf(path: str | Path) -> Tree:
     root = _without_namespace(path, _parse(path))
     links: dict[str, LinkMass] = {}
     for element in root.findall("link"):
+        require(len(links) < MOST_LINKS, f"{path}: more than {MOST_LINKS} links; remove some")
         name = _name(path, element, links)
         links[name] = _mass(f"{path}: link '{name}'", element.find("inertial"))
     require(bool(links), f"{path}: <robot> has no <link>; a robot needs links and joints")
     joints: dict[str, UrdfJoint] = {}
     for element in root.findall("joint"):
+        require(len(joints) < MOST_LINKS, f"{path}: more than {MOST_LINKS} joints; remove some")
         name = _name(path, element, joints)
         joints[name] = _joint(f"{path}: joint '{name}'", name, element, links)
     for joint in joints.values():
@@ -328,21 +332,9 @@ def check_urdf(path: str | Path) -> Tree:
 
 
 def _parse(path: Path) -> ET.Element:
+    data = urdf_bytes(path)
     try:
-        require(not path.is_dir(), f"{path}: is a directory; give the URDF file itself")
-        size = path.stat().st_size
-        require(
-            size <= MAX_BYTES,
-            f"{path}: {size / 1e6:.0f} MB is too large for a URDF (at most 50 MB); is this a mesh?",
-        )
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such URDF file; check the path") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be read ({reason})") from None
-    try:
-        return ET.fromstring(data)
+        return ET.fromstring(data, ET.XMLParser(target=_Bounded(path)))
     except ET.ParseError as error:
         if "unbound prefix" in str(error) and b"<xacro:" in data:
             raise InputError(_xacro(path, "<xacro:…> elements")) from None
@@ -353,6 +345,41 @@ def _parse(path: Path) -> ET.Element:
         ) from None
     except (LookupError, ValueError) as error:
         raise InputError(f"{path}: not XML: {error}; save it as UTF-8") from None
+
+
+def urdf_bytes(path: Path) -> bytes:
+    """The content of a URDF file.  Raises InputError where it cannot be read or is too large."""
+    return read_bytes(path, "URDF file", MAX_BYTES)
+
+
+class _Bounded(ET.TreeBuilder):
+    """The tree of a file that nests no deeper than a robot does and declares no entities.
+
+    A parser that calls itself, as those of other libraries do, would end with the stack.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path, self._depth = path, 0
+
+    def start(self, tag: Any, attributes: Any) -> Any:
+        """As inherited; raises InputError beyond DEEPEST."""
+        self._depth += 1
+        require(
+            self._depth <= DEEPEST,
+            f"{self._path}: <{printable(tag)}> is nested more than {DEEPEST} deep; a URDF needs "
+            "five levels",
+        )
+        return super().start(tag, attributes)
+
+    def end(self, tag: str) -> Any:
+        """As inherited."""
+        self._depth -= 1
+        return super().end(tag)
+
+    def doctype(self, name: str, public: str | None, system: str | None) -> None:
+        """Raise InputError: entities may stand for more text than memory holds."""
+        raise InputError(f"{self._path}: has a <!DOCTYPE>, which a URDF does not; remove it")
 
 
 def _without_namespace(path: Path, root: ET.Element) -> ET.Element:

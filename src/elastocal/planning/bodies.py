@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError
+from elastocal.files import check_regular, check_size
 from elastocal.model.chain import Chain
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
 # What a solid is to geometry: its hull, its support function and its coal shape.
 
+MOST_MESH_BYTES = 100_000_000
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
@@ -130,8 +132,10 @@ def _mesh_hull(
     import coal
     from scipy.spatial import ConvexHull, QhullError
 
-    if not path.is_file():
-        raise InputError(f"mesh '{path}' of body '{name}' does not exist")
+    try:
+        check_size(path, "mesh", check_regular(path, "mesh"), MOST_MESH_BYTES)
+    except InputError as error:
+        raise InputError(f"mesh of body '{name}': {error}") from None
     try:
         vertices = np.array(coal.MeshLoader().load(str(path), np.array(scale)).vertices())
         found = ConvexHull(vertices)

@@ -7,6 +7,7 @@ import io
 import json
 import shutil
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -18,8 +19,8 @@ from numpy.typing import NDArray
 
 from elastocal import __version__
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, option, require
-from elastocal.files import atomic_write_bytes
+from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.files import atomic_write_bytes, open_input
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_limits
@@ -120,7 +121,9 @@ def key_of(files: Iterable[Path], **options: object) -> str:
     """A hash of everything a design depends on: input files, options, the version."""
     digest = hashlib.sha256(__version__.encode())
     for path in files:
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+        with open_input(path, "input file") as handle:
+            digest.update(path.name.encode(errors="surrogateescape") + b"\0")
+            digest.update(hashlib.file_digest(handle, "sha256").digest())  # type: ignore[arg-type]
     digest.update(json.dumps(options, sort_keys=True, default=str).encode())
     return digest.hexdigest()
 
@@ -142,7 +145,7 @@ class Stage:
         try:
             with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as saved:
                 return {name: saved[name] for name in saved.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
             return None
 
     def finished(self, make: Callable[[], State]) -> State:
@@ -161,7 +164,13 @@ class Stage:
         text = io.BytesIO()
         np.savez(text, allow_pickle=False, **{k: np.asarray(v) for k, v in state.items()})
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write_bytes(self.path, text.getvalue())
+        try:
+            atomic_write_bytes(self.path, text.getvalue())
+        except InputError:
+            if self.path.parent.is_dir():
+                raise
+            # Another run of the same design has ended, and cleared the folder that both used.
+            self.save(state)
 
 
 @dataclass(frozen=True)

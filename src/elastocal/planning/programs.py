@@ -1,16 +1,25 @@
-"""Robot programs of a plan: KRL and URScript."""
+"""Robot programs of a plan: KRL and URScript, written, read back and compared with the plan.
+
+A program moves a machine, so nothing of a file's names can become a line of it, every joint value
+lies inside the robot's limits, speeds have a bound, and what was written is read again line by
+line: another kind of line than those here, or a move that is off by more than 1e-6 rad, is an
+error.
+"""
 
 from __future__ import annotations
 
+import math
 import re
+import unicodedata
 from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
 
-from elastocal.errors import InputError, require
+from elastocal.errors import ElastocalError, InputError, require
 from elastocal.model.chain import Chain
 from elastocal.planning.execution import Execution
+from elastocal.text import printable
 from elastocal.units import Array
 
 # Text and numbers as robot controllers read them.
@@ -19,7 +28,7 @@ from elastocal.units import Array
 def plain(text: str) -> str:
     """One line of printable ASCII without quotation marks, so that it can stand in a comment or
     a string of any controller; other characters become ?, quotation marks apostrophes."""
-    line = " ".join(text.split()).replace('"', "'")
+    line = " ".join(text.split()).replace('"', "'").replace("\\", "/")[:LONGEST]
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in line)
 
 
@@ -81,6 +90,124 @@ def load_name(force: Array) -> str:
     return "load of ({:g}, {:g}, {:g}) N".format(*np.asarray(force, dtype=float) + 0.0)
 
 
+LONGEST = 100  # characters of a note; controllers cut or refuse long lines
+# Words of both languages that no module or function can be called; upper and lower case alike.
+RESERVED = frozenset(
+    re.findall(
+        r"\w+",
+        """
+        and break codes continue def do else elif end endfor endif endswitch endwhile
+        enddat enddefct exit for function global goto halt if import in interrupt is
+        local loop endloop main movec movej movel movep not on or pass popup print ptp
+        lin circ pulse repeat resume return run signal sleep socket struct switch
+        textmsg then thread to true false trigger until wait while with bool int real
+        char frame axis e6axis pos e6pos decl const enum
+        """,
+    )
+)
+
+
+def program_name(text: str, most: int = 24) -> str:
+    """`text` reduced to a name that KRL and URScript allow: letters, digits and underscores,
+    a letter first, at most `most` of them, and none of their own words."""
+    ascii_only = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", ascii_only).strip("_")
+    name = name if name[:1].isalpha() else f"p_{name}".rstrip("_")
+    name = f"{name}_plan" if name.lower() in RESERVED or name == "p" else name
+    return name[:most]
+
+
+def check_driven(steps: Sequence[Step], chain: Chain, limits: Limits | None) -> None:
+    """Raise InputError where a joint value lies outside `limits` (lower, upper; rad), by default
+    the robot's, or a stop would last for no time or more than a day."""
+    lower, upper = limits or (
+        np.array([joint.lower for joint in chain.joints]),
+        np.array([joint.upper for joint in chain.joints]),
+    )
+    for k, step in enumerate(steps):
+        if step[0] == "measure":
+            require(0 <= step[1] <= LONGEST_STOP, f"a stop of {step[1]:g} s; give 0 to 86400 s")
+        elif step[0] == "move":
+            beyond = ~((step[1] >= lower - SAME) & (step[1] <= upper + SAME))
+            if beyond.any():
+                j = int(np.argmax(beyond))
+                value, low, high = np.degrees([step[1][j], lower[j], upper[j]])
+                raise InputError(
+                    f"step {k + 1} moves joint {j + 1} to {value:.6g}°, outside its limits "
+                    f"[{low:.6g}, {high:.6g}]°; give poses inside them"
+                )
+
+
+def limits_text(chain: Chain, limits: Limits | None) -> str:
+    """The limits that every joint value was checked against, in degrees."""
+    ends = zip(*limits, strict=True) if limits else ((j.lower, j.upper) for j in chain.joints)
+    shown = (
+        f"J{i} {math.degrees(a):.4g} to {math.degrees(b):.4g}" for i, (a, b) in enumerate(ends, 1)
+    )
+    return ", ".join(shown)
+
+
+# What was written, read back.
+
+SAME = 1e-6  # rad, between a value of the plan and of the program
+LONGEST_STOP = 86_400.0  # s
+Limits = tuple[Array, Array]
+_NUMBER = r"-?[0-9]+(?:\.[0-9]+)?"
+_NOTE = r"[ !#-\[\]-~]*"  # printable ASCII without quotation marks and backslashes
+# Every kind of line that a program has; the first group of a move holds its numbers.
+_KRL_LINES = {
+    "move": rf"PTP \{{((?:A[1-6] {_NUMBER}(?:, )?){{6}})\}}",
+    "load": "HALT",
+    "measure": rf"WAIT SEC ({_NUMBER})",
+    "": r"&ACCESS RVP|&REL 1|DEF \w+\(\)|END|DECL INT AXIS_NO|FOR AXIS_NO = 1 TO 6|ENDFOR"
+    rf"|  \$(?:VEL|ACC)_AXIS\[AXIS_NO\] = [0-9]+|; {_NOTE}",
+}
+_URSCRIPT_LINES = {
+    "move": rf"  movej\(\[((?:{_NUMBER}(?:, )?){{6}})\], a={_NUMBER}, v={_NUMBER}\)",
+    "load": rf'  popup\("{_NOTE}", title="Load", blocking=True\)',
+    "measure": rf"  sleep\(({_NUMBER})\)",
+    "": rf'(?:  )?# {_NOTE}|def \w+\(\):|end||\w+\(\)|  textmsg\("{_NOTE}"\)',
+}
+
+
+def program_steps(text: str) -> list[tuple[str, Array]]:
+    """The steps of a program that was written here: ("move", joints (6,) rad), ("load", empty) or
+    ("measure", seconds (1,)), in their order.
+
+    Raises ElastocalError, with the line, where a line is of no kind that is written here.
+    """
+    krl = text.startswith("&ACCESS")
+    kinds = _KRL_LINES if krl else _URSCRIPT_LINES
+    steps = []
+    for number_of, line in enumerate(text.removesuffix("\n").split("\n"), start=1):
+        matches = ((k, re.fullmatch(kinds[k], line, re.ASCII)) for k in kinds)
+        kind, match = next(((k, m) for k, m in matches if m), ("", None))
+        if match is None:
+            raise ElastocalError(
+                f"the robot program's line {number_of} is none that is written: {printable(line)}; "
+                "do not run it"
+            )
+        if kind:
+            held = re.sub(r"A[1-6] ", "", match[1]) if kind != "load" else ""
+            values = np.array([float(v) for v in held.split(", ") if v])
+            steps.append((kind, np.radians(values) if krl and kind == "move" else values))
+    return steps
+
+
+def check_program(text: str, planned: Sequence[Step]) -> None:
+    """Raise ElastocalError unless the program, read back, does what the plan's `steps_of` say:
+    the same steps in the same order, every joint within 1e-6 rad, every stop within 1 ms."""
+    found = program_steps(text)
+    same = [kind for kind, _ in found] == [step[0] for step in planned]
+    for (kind, values), step in zip(found, planned, strict=False):
+        if kind == "move" and same:
+            same = bool(np.all(np.abs(values - step[1]) <= SAME))
+        elif kind == "measure" and same:
+            same = abs(values[0] - float(step[1])) <= 1e-3  # type: ignore[arg-type]
+    if not same:
+        raise ElastocalError("the robot program does not do what the plan says; do not run it")
+
+
 def check_six_axes(chain: Chain, language: str) -> None:
     """Raise InputError unless the arm has six revolute joints, which is what `language` moves."""
     sliding = [joint.name for joint in chain.joints if joint.kind != "revolute"]
@@ -94,7 +221,6 @@ def check_six_axes(chain: Chain, language: str) -> None:
 
 # KUKA robot language: a .src file of PTP moves in axis angles.
 
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,23}", re.ASCII)
 PERCENT = 10  # of the axes' greatest speed and acceleration
 
 
@@ -106,26 +232,32 @@ def krl_program(
     *,
     name: str = "elastocal_plan",
     percent: int = PERCENT,
+    limits: Limits | None = None,
 ) -> str:
     """The text of NAME.src: moves, WAIT SEC where the tracker measures, HALT for the load.
 
     Axis angles are the plan's joint values in degrees, A1 … A6 being joints 1 … 6.  `percent` of
     the axes' greatest speed and acceleration.  Moves are exact stops (no C_PTP), so the checked
-    paths are those that are driven.  No .dat file is needed.  Raises InputError for an arm of
-    other joints than six revolute ones, and for a name that is no module's name.
+    paths are those that are driven.  No .dat file is needed.  `name` is reduced to one that KRL
+    allows.  Raises InputError for an arm of other joints than six revolute ones, for joint values
+    outside `limits` (lower, upper; rad; by default the robot's), and for a speed above 100 %;
+    ElastocalError where the text, read back, is not the plan.
     """
     check_six_axes(chain, "KRL")
-    require(
-        NAME.fullmatch(name) is not None,
-        f"{name!r} is no name of a KRL module, which is also its file's name; use a letter and up "
-        "to 23 letters, digits or underscores",
-    )
     require(1 <= percent <= 100, f"the speed is 1 to 100 % of the axes' greatest; found {percent}")
+    module = program_name(name)
+    steps = list(steps_of(execution, configurations, forces))
+    check_driven(steps, chain, limits)
     lines = [
         "&ACCESS RVP",
         "&REL 1",
-        f"DEF {name}()",
+        f"DEF {module}()",
         f"; elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}",
+        f"; This is module {module}: on the controller its file must be {module}.src.",
+        "; Units: axis angles in degrees, stops in s, loads in N along x, y, z of the data's",
+        "; frame.  Axis moves: neither $BASE nor $TOOL changes where they lead.",
+        f"; Inside the limits in degrees: {limits_text(chain, limits)}.",
+        f"; Speed and acceleration: {percent} % of the axes' greatest.",
         "; Axis angles in degrees as the robot description counts them: before the first run,",
         "; compare signs and zeros with the controller, and run in T1.",
         "; The first move begins wherever the arm stands; only the moves after it were checked.",
@@ -135,7 +267,7 @@ def krl_program(
         f"  $ACC_AXIS[AXIS_NO] = {percent}",
         "ENDFOR",
     ]
-    for step in steps_of(execution, configurations, forces):
+    for step in steps:
         match step:
             case "move", q, note:
                 angles = ", ".join(f"A{i + 1} {number(v, 6)}" for i, v in enumerate(np.degrees(q)))
@@ -144,12 +276,14 @@ def krl_program(
                 lines += [f"; {plain(order)}, then start again", "HALT"]
             case "measure", dwell, note:
                 lines += [f"; measure {plain(note)}", f"WAIT SEC {number(dwell, 3)}"]
-    return "\n".join([*lines, "END"]) + "\n"
+    text = "\n".join([*lines, "END"]) + "\n"
+    check_program(text, steps)
+    return text
 
 
 # URScript of Universal Robots: a function of movej moves.
 
-URSCRIPT_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
+MOST_SPEED, MOST_ACCELERATION = 3.14, 10.0  # rad/s, rad/s²: what the arms of this language do
 SPEED, ACCELERATION = 0.5, 0.5  # rad/s, rad/s² of the leading axis
 
 
@@ -162,32 +296,40 @@ def urscript_program(
     name: str = "elastocal_plan",
     speed: float = SPEED,
     acceleration: float = ACCELERATION,
+    limits: Limits | None = None,
 ) -> str:
     """The text of a script: moves, sleep where the tracker measures, a popup for the load.
 
     Joint values in rad, in the order of the chain; `speed` rad/s and `acceleration` rad/s² of
     the leading axis.  Moves are without blend radius, so the checked paths are those that are
-    driven.  Raises InputError for an arm of other joints than six revolute ones, for a name that
-    is no function's name, and for a speed or acceleration below 0.001.
+    driven.  `name` is reduced to one that a function can have.  Raises InputError for an arm of
+    other joints than six revolute ones, for joint values outside `limits` (lower, upper; rad; by
+    default the robot's), and for a speed outside 0.001 to 3.14 rad/s or an acceleration outside
+    0.001 to 10 rad/s²; ElastocalError where the text, read back, is not the plan.
     """
     check_six_axes(chain, "URScript")
-    require(
-        URSCRIPT_NAME.fullmatch(name) is not None,
-        f"{name!r} is no name of a URScript function; use letters, digits and underscores",
-    )
-    require(
-        speed >= 1e-3 and acceleration >= 1e-3,
-        f"speed and acceleration must be at least 0.001; found {speed:g} and {acceleration:g}",
-    )
+    for what, value, most in (
+        ("speed", speed, MOST_SPEED), ("acceleration", acceleration, MOST_ACCELERATION),
+    ):  # fmt: skip
+        require(
+            1e-3 <= value <= most,
+            f"the {what} must be at least 0.001 and at most {most:g}; found {value:g}",
+        )
+    function = program_name(name)
+    steps = list(steps_of(execution, configurations, forces))
+    check_driven(steps, chain, limits)
     lines = [
         f"# elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}",
         "# Joint values in rad as the robot description counts them: before the first run,",
         "# compare signs and zeros with the controller, and run at reduced speed.",
         "# The first move begins wherever the arm stands; only the moves after it were checked.",
-        f"def {name}():",
+        "# Units: rad, rad/s, rad/s^2, s; loads in N along x, y, z of the data's frame.  Joint",
+        "# moves: neither the TCP nor a feature plane changes where they lead.",
+        f"# Inside the limits in degrees: {limits_text(chain, limits)}.",
+        f"def {function}():",
     ]
     motion = f"a={number(acceleration, 4)}, v={number(speed, 4)}"
-    for step in steps_of(execution, configurations, forces):
+    for step in steps:
         match step:
             case "move", q, note:
                 joints = ", ".join(number(v, 9) for v in q)
@@ -197,4 +339,6 @@ def urscript_program(
                 lines.append(f'  popup("{text}, then continue", title="Load", blocking=True)')
             case "measure", dwell, note:
                 lines += [f'  textmsg("measure {plain(note)}")', f"  sleep({number(dwell, 3)})"]
-    return "\n".join([*lines, "end", "", f"{name}()"]) + "\n"
+    text = "\n".join([*lines, "end", "", f"{function}()"]) + "\n"
+    check_program(text, steps)
+    return text

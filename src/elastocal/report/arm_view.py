@@ -27,8 +27,9 @@ from elastocal.planning.bodies import (
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, drawn
-from elastocal.report.formatting import joint_heads, joint_texts, length, printable, short_name
+from elastocal.report.formatting import joint_heads, joint_texts, length, short_name
 from elastocal.report.plan_view import first_stops
+from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:

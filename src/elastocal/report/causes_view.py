@@ -20,10 +20,10 @@ from elastocal.report.formatting import (
     counted,
     display,
     length,
-    printable,
     significant,
     together,
 )
+from elastocal.text import printable
 
 # What an error of each family goes with.
 FAMILIES = {

@@ -53,10 +53,10 @@ from elastocal.report.formatting import (
     joint_heads,
     joint_texts,
     length,
-    printable,
     significant,
     together,
 )
+from elastocal.text import printable
 
 
 def repeatabilities(noise: NoiseFloor, kinds: Iterable[str]) -> str:

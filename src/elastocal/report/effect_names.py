@@ -7,7 +7,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Candidate, EffectAt, FoundEffect
-from elastocal.report.formatting import printable, significant, together, with_uncertainty
+from elastocal.report.formatting import significant, together, with_uncertainty
+from elastocal.text import printable
 
 # Places that are the only one their effects have: "base drift", not "base drift at base".
 SINGLE = ("base", "wrist", "load", "tracker", "arm")

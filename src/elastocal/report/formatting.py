@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from elastocal.text import printable
+
 # SI unit → (factor, unit shown).
 SHOWN = {
     "m": (1e3, "mm"),
@@ -118,11 +120,6 @@ def _end(value: float, half: float) -> str:
 def _round(value: float, decimals: int) -> float:
     """Rounded, and never -0."""
     return round(value, decimals) + 0.0
-
-
-def printable(text: str) -> str:
-    """Names from files may hold control characters, which a terminal would obey."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def short_name(name: str, most: int = 12) -> str:

@@ -41,7 +41,6 @@ from elastocal.report.formatting import (
     gap_table,
     length,
     plain,
-    printable,
     resolution,
     rounded_alike,
     significant,
@@ -65,6 +64,7 @@ from elastocal.report.method_and_noise import (
     size_rows,
 )
 from elastocal.report.smooth_view import counted_functions, smooth_lines, smooth_table
+from elastocal.text import printable
 
 LARGEST_TERMS = 4
 Truth = dict[str, float]

@@ -15,7 +15,8 @@ from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.model.observations import available_noise
-from elastocal.report.formatting import display, length, plain, printable, significant
+from elastocal.report.formatting import display, length, plain, significant
+from elastocal.text import printable
 
 MOST_NAMED = 6
 METHODS = {

@@ -33,7 +33,7 @@ from elastocal.report.diagnosis_view import (
     hypothesis_rows,
 )
 from elastocal.report.effect_names import effect_at, name_of
-from elastocal.report.formatting import display, length, minus, printable
+from elastocal.report.formatting import display, length, minus
 from elastocal.report.identification_view import (
     combination_rows,
     judgement,
@@ -49,7 +49,7 @@ from elastocal.report.terminal import (
     identification_text,
     plan_text,
 )
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import cell_meaning, did_you_mean, listed, printable, quoted
 from elastocal.units import Array
 
 if TYPE_CHECKING:
@@ -472,7 +472,10 @@ def _commands(c: Compensation) -> pd.DataFrame:
     import pandas as pd
 
     text = io.StringIO(commands_csv(c, c.chain.kinds))
-    return pd.read_csv(text, dtype={"configuration": str}, keep_default_na=False, na_values=[""])
+    frame = pd.read_csv(text, dtype={"configuration": str}, keep_default_na=False, na_values=[""])
+    if "configuration" in frame:
+        frame["configuration"] = frame["configuration"].map(cell_meaning, na_action="ignore")
+    return frame
 
 
 VIEWS: dict[type, View] = {

@@ -45,7 +45,7 @@ from elastocal.report.figures import (
     share_bars,
     unknown_curves,
 )
-from elastocal.report.formatting import minus, printable
+from elastocal.report.formatting import minus
 from elastocal.report.identification_view import Published, Truth, identification_contents
 from elastocal.report.notebook import view_of
 from elastocal.report.plan_view import plan_contents
@@ -62,6 +62,8 @@ from elastocal.report.residual_view import (
     residuals_of,
     summary_of,
 )
+from elastocal.screen import shown
+from elastocal.text import printable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -135,6 +137,8 @@ def environment() -> Environment:
     made = Environment(
         loader=FunctionLoader(resource),
         autoescape=True,
+        # Texts come from files; what is marked as markup was made by this package.
+        finalize=lambda value: shown(value) if type(value) is str else value,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -16,9 +16,9 @@ from elastocal.report.formatting import (
     display,
     joint_heads,
     joint_texts,
-    printable,
     significant,
 )
+from elastocal.text import printable
 
 TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "serves (standard deviation without it)"

@@ -12,7 +12,8 @@ from elastocal.identification.residuals import ResidualSummary, groupings, summa
 from elastocal.identification.result import Calibration
 from elastocal.identification.weighted_problem import WeightKind, weights_for
 from elastocal.model.observations import COMPONENTS, Observations
-from elastocal.report.formatting import ShownTable, printable, significant
+from elastocal.report.formatting import ShownTable, significant
+from elastocal.text import printable
 from elastocal.units import Array
 
 MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice of them

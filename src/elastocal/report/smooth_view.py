@@ -9,7 +9,8 @@ import numpy as np
 from elastocal.identification.result import Calibration
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.report.figures import FAINT, SERIES, drawn
-from elastocal.report.formatting import ShownTable, counted, display, printable, significant
+from elastocal.report.formatting import ShownTable, counted, display, significant
+from elastocal.text import printable
 from elastocal.units import Array
 
 if TYPE_CHECKING:

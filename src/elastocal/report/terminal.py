@@ -28,7 +28,7 @@ from elastocal.report.diagnosis_view import (
     pair_rows,
     untested_rows,
 )
-from elastocal.report.formatting import ShownTable, capital, length, printable
+from elastocal.report.formatting import ShownTable, capital, length
 from elastocal.report.identification_view import (
     ParameterRow,
     Truth,
@@ -43,6 +43,8 @@ from elastocal.report.identification_view import (
 )
 from elastocal.report.method_and_noise import candidate_rows, size_rows
 from elastocal.report.plan_view import curve_rows, interval_rows, plan_lines, pose_rows, reason_rows
+from elastocal.screen import safe_console
+from elastocal.text import printable
 
 PRINTED_WIDTH = 100  # columns of a result as plain text
 
@@ -73,7 +75,7 @@ def compensation_text(c: Compensation) -> str:
 
 def _plain_text(printed: Callable[[Console], None]) -> str:
     """What is printed, without colours and trailing blanks."""
-    console = Console(file=StringIO(), width=PRINTED_WIDTH, color_system=None, highlight=False)
+    console = safe_console(file=StringIO(), width=PRINTED_WIDTH, color_system=None)
     with console.capture() as capture:
         printed(console)
     return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())

@@ -5,13 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.cells import kr270_chain, random_poses
 from support.discs import Discs
 
 from elastocal.cell.plan_wishes import Motion
-from elastocal.errors import InputError
+from elastocal.errors import ElastocalError, InputError
 from elastocal.model import Chain
 from elastocal.planning import krl_program, load_name, number, plain, schedule, urscript_program
+from elastocal.planning.programs import (
+    RESERVED,
+    check_program,
+    program_name,
+    program_steps,
+    steps_of,
+)
 
 FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
 HOME = np.radians([0.0, -90, 90, 0, 45, 0])
@@ -134,13 +143,59 @@ def test_other_arms_than_six_revolute_joints_are_refused(chain, write):
         write(execution, sliding, NAMES)
 
 
-@pytest.mark.parametrize("name", ["", "1plan", "my plan", "a" * 25, "plän", "a\nb"])
-def test_names_that_no_module_can_have(chain, name):
-    with pytest.raises(InputError, match="name of a KRL module"):
-        krl_program(execution_of(chain), chain, NAMES, name=name)
-    if name != "a" * 25:
-        with pytest.raises(InputError, match="name of a URScript function"):
-            urscript_program(execution_of(chain), chain, NAMES, name=name)
+@given(st.text() | st.sampled_from(["", "1plan", "my plan", "a" * 25, "plän", "a\nb", "END", "p"]))
+def test_any_name_is_reduced_to_one_that_both_languages_allow(name):
+    reduced = program_name(name)
+    assert re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,23}", reduced, re.ASCII)
+    assert reduced.lower() not in RESERVED
+    assert program_name(reduced) == reduced
+
+
+@pytest.mark.parametrize("write", [krl_program, urscript_program])
+def test_the_header_states_module_units_frames_and_limits(chain, write):
+    text = write(execution_of(chain), chain, NAMES, FORCES, name="my plan\n;HALT")
+    head = text[: text.index("configuration")]
+    for told in ("my_plan_HALT()", "Units: ", "frame", "J1 -185 to 185", "s; loads in N", "limits"):
+        assert told in head.replace("stops in s, loads", "s; loads"), told
+
+
+@pytest.mark.parametrize("write", [krl_program, urscript_program])
+def test_a_joint_value_outside_the_limits_is_refused(chain, write):
+    execution = execution_of(chain)
+    beyond = replace(execution.stops[2], q=execution.stops[2].q + np.array([0, 0, 9.0, 0, 0, 0]))
+    stops = (*execution.stops[:2], beyond, *execution.stops[3:])
+    for wrong in (
+        replace(execution, stops=stops),
+        replace(execution, stops=(replace(beyond, q=np.full(6, np.nan)),)),
+    ):
+        with pytest.raises(InputError, match=r"moves joint \d to .*, outside its limits"):
+            write(wrong, chain, NAMES, FORCES)
+    tight = np.full(6, -1e-3), np.full(6, 1e-3)
+    with pytest.raises(InputError, match="outside its limits"):
+        write(execution, chain, NAMES, FORCES, limits=tight)
+
+
+@pytest.mark.parametrize("write", [krl_program, urscript_program])
+def test_a_program_read_back_is_the_plan_to_a_millionth_of_a_radian(chain, write):
+    execution = execution_of(chain, home=HOME, both_directions=True)
+    text = write(execution, chain, NAMES, FORCES)
+    steps = list(steps_of(execution, NAMES, FORCES))
+    check_program(text, steps)
+    moves = [values for kind, values in program_steps(text) if kind == "move"]
+    assert np.abs(np.array(moves) - planned(execution)).max() < 1e-7
+    move = next(line for line in text.splitlines() if re.search(r"[\[{].*-?\d\.\d{3}", line))
+    value = re.search(r"\d\.\d{3}", move)
+    digit = value.end() - 1
+    moved = move[:digit] + str((int(move[digit]) + 5) % 10) + move[digit + 1 :]
+    wait = next(line for line in text.splitlines() if "WAIT" in line or "sleep" in line)
+    for wrong in (
+        text.replace(move, moved, 1), text.replace(move + "\n", "", 1),
+        text.replace(wait, f"{wait}\n{move}", 1), text.replace(wait, wait.replace("30", "31"), 1),
+        text.replace(wait, f"{wait}\n$OV_PRO = 100", 1), text + "set_digital_out(0, True)\n",
+    ):  # fmt: skip
+        assert wrong != text
+        with pytest.raises(ElastocalError, match="do not run it"):
+            check_program(wrong, steps)
 
 
 def test_speeds_out_of_range(chain):
@@ -148,6 +203,9 @@ def test_speeds_out_of_range(chain):
         krl_program(execution_of(chain), chain, NAMES, percent=0)
     with pytest.raises(InputError, match="at least"):
         urscript_program(execution_of(chain), chain, NAMES, speed=0.0)
+    for wrong in ({"speed": 4.0}, {"acceleration": 11.0}, {"speed": np.nan}):
+        with pytest.raises(InputError, match="at most"):
+            urscript_program(execution_of(chain), chain, NAMES, **wrong)
 
 
 def test_numbers_and_text_for_controllers():

@@ -1,0 +1,140 @@
+"""The terminal: the one place that everything shown to a person passes.
+
+Names come from files and arguments, and a terminal obeys what stands in them: escape sequences
+that change its title or colours, marks that turn the direction of writing round.  What is shown
+here is shown as it can be read (`elastocal.text.printable`), in letters that the terminal has.
+"""
+
+from __future__ import annotations
+
+import codecs
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from elastocal.text import printable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+# What stands for letters that a stream cannot write, in ASCII and latin-1.
+SPELT = {
+    "µ": "u", "°": "deg", "²": "^2", "³": "^3", "·": "*", "×": "x", "±": "+/-", "−": "-", "–": "-",
+    "—": "-", "…": "...", "≤": "<=", "≥": ">=", "∞": "inf", "’": "'", "‘": "'", "“": '"',
+    "”": '"', "→": "->", "σ": "sigma", "ρ": "rho", "χ": "chi", "Δ": "Delta", "₀": "0",
+    "\u00a0": " ", "\u202f": " ", "\u2009": " ",
+}  # fmt: skip
+
+
+def _spelt(error: UnicodeError) -> tuple[str, int]:
+    """The error handler of streams: letters spelt out, or as escapes."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    part = error.object[error.start : error.end]
+    return "".join(SPELT.get(c) or ascii(c)[1:-1] for c in part), error.end
+
+
+codecs.register_error("elastocal", _spelt)
+
+
+def prepare_streams() -> None:
+    """Have stdout and stderr spell out what their encoding lacks, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="elastocal")
+
+
+def close_streams() -> None:
+    """Write what is left; a reader that went away (… | head) is no error."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None:
+                stream.flush()
+        except (OSError, ValueError):
+            # Python flushes once more at its end, and would complain.
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+# Ctrl-C: noted besides being raised, since libraries swallow it or make another error of it.
+
+interrupts: list[int] = []
+
+
+@contextmanager
+def noting_interrupts() -> Iterator[list[int]]:
+    """In a `with` block a SIGINT that would raise KeyboardInterrupt is noted too."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # not ignored, as under nohup
+        signal.signal(signal.SIGINT, _note)
+    yield interrupts
+
+
+def _note(number: int, frame: FrameType | None) -> None:
+    interrupts.append(number)
+    signal.default_int_handler(number, frame)
+
+
+def end_at_once() -> None:
+    """All is written: from here on Ctrl-C ends the process with its one line and no traceback."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os.write(2, b"elastocal: interrupted\n")
+        os._exit(128 + number)
+
+    if signal.getsignal(signal.SIGINT) is _note:
+        signal.signal(signal.SIGINT, end)
+
+
+def shown(text: str) -> str:
+    """`text` of several lines, each as it can be read."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+def say(text: str, error: bool = False, end: str = "\n") -> None:
+    """Show `text` on stdout, or on stderr where it tells of an `error`."""
+    stream = sys.stderr if error else sys.stdout
+    if stream is not None:
+        stream.write(shown(text) + end)
+        stream.flush()
+
+
+def complain(message: str) -> None:
+    """The one line on stderr by which a command says why it ended."""
+    say(f"elastocal: {' '.join(printable(line) for line in message.splitlines())}", error=True)
+
+
+def safe_console(**how: Any) -> Console:
+    """A rich console that shows texts as they can be read and takes none as its markup."""
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
+
+    class SafeConsole(Console):
+        def render(
+            self, renderable: RenderableType, options: ConsoleOptions | None = None
+        ) -> Iterable[Segment]:
+            """As inherited; `control` segments are rich's own."""
+            for text, style, control in super().render(renderable, options):
+                yield Segment(text if control else shown(text), style, control)
+
+    return SafeConsole(highlight=False, markup=False, emoji=False, **how)
+
+
+@contextmanager
+def progress_line(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A status line on stderr; silent where that is no terminal and `quiet` is asked for."""
+    if quiet:
+        yield lambda message: None
+        return
+    from rich.text import Text
+
+    screen = safe_console(stderr=True)
+    if not screen.is_terminal:
+        yield lambda message: screen.print(f"… {message}")
+        return
+    with screen.status("starting") as status:
+        yield lambda message: status.update(Text(message))

@@ -1,0 +1,131 @@
+"""Wherever it runs: streams without some letters, no home, no terminal, no compiler, no reader."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.files import write_campaign
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders and pipes of POSIX")
+
+SOURCE = Path(__file__).parents[2] / "src"
+UNSET = ("HOME", "TERM", "LANG", "LC_CTYPE", "XDG_CACHE_HOME", "ELASTOCAL_CACHE", "PYTHONUTF8",
+         "MPLCONFIGDIR", "NO_COLOR", "FORCE_COLOR")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("campaign")
+    write_campaign(folder)
+    return folder
+
+
+def elastocal(
+    folder: Path, *words: str, python: tuple[str, ...] = (), unset: tuple[str, ...] = UNSET,
+    shell: str = '"$@"', **environment: str,
+) -> subprocess.CompletedProcess[bytes]:  # fmt: skip
+    """The command as a shell starts it; `shell` says where its streams lead."""
+    clean = {k: v for k, v in os.environ.items() if k not in unset}
+    clean["PYTHONPATH"] = str(SOURCE)
+    command = [sys.executable, *python, "-m", "elastocal", *words]
+    return subprocess.run(
+        ["/bin/bash", "-o", "pipefail", "-c", shell, "bash", *command],
+        capture_output=True, cwd=folder, env=clean | environment, timeout=300,
+    )  # fmt: skip
+
+
+def identified(folder: Path, *words: str, **how) -> subprocess.CompletedProcess[bytes]:
+    return elastocal(folder, "identify", "cell.toml", "data.csv", *words, **how)
+
+
+def test_everything_missing_at_once(campaign, tmp_path):
+    """No terminal, locale or compiler, 20 columns, a home without a place for caches; and any
+    warning would be an error."""
+    page, result = tmp_path / "page.html", tmp_path / "result.json"
+    (tmp_path / "file").write_text("")
+    done = identified(
+        campaign, "-q", "-o", str(result), "--report", str(page), python=("-W", "error"),
+        # Below a file there can be no folder, for root neither.
+        PATH="/nowhere", HOME=str(tmp_path / "file" / "home"), LC_ALL="C", COLUMNS="20",
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert sorted(os.listdir(tmp_path)) == ["file", "page.html", "result.json"]
+    assert page.stat().st_size > 100_000 and result.stat().st_size > 1000
+    # Paths may be longer; nothing that is laid out is.
+    laid_out = [line for line in done.stdout.decode().splitlines() if not line.startswith("wrote")]
+    assert laid_out and max(map(len, laid_out)) <= 20
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_streams_that_lack_letters(campaign, encoding):
+    """And no home at all."""
+    done = identified(campaign, PYTHONIOENCODING=encoding)
+    assert done.returncode == 0, done.stderr.decode()
+    told = done.stdout.decode(encoding)
+    assert "joint1.offset" in told and b"Traceback" not in done.stderr
+
+
+def test_a_compiler_that_is_asked_for_and_absent(campaign):
+    done = elastocal(
+        campaign, "--backend", "compiled", "identify", "cell.toml", "data.csv", PATH="/nowhere"
+    )
+    assert done.returncode == 2 and b"no C compiler" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("shell", "code"),
+    [
+        ('"$@" | head -n 1 > /dev/null', 0),
+        ('"$@" >&-', 0),
+        ('"$@" 2>&-', 0),
+        ('"$@" <&-', 0),
+        ('"$@" > /dev/full', 2),
+    ],
+)
+def test_streams_that_are_closed_or_full(campaign, tmp_path, shell, code):
+    if "full" in shell and not Path("/dev/full").exists():
+        pytest.skip("this system has no /dev/full")
+    result = tmp_path / "result.json"
+    done = identified(campaign, "-q", "-o", str(result), "--json", shell=shell)
+    assert done.returncode == code, done.stderr.decode()
+    assert b"Traceback" not in done.stderr and b"Exception" not in done.stderr
+    assert result.stat().st_size > 1000  # written before anything is told
+    if code:
+        assert b"No space left on device" in done.stderr
+
+
+def test_a_wheel_runs_outside_the_checkout(tmp_path):
+    """Built, unpacked where nothing else of the project is, and its command run as a user does."""
+    setuptools = pytest.importorskip("setuptools", minversion="77", reason="pip install .[test]")
+    del setuptools
+    root, source, place = SOURCE.parent, tmp_path / "source", tmp_path / "place"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copyfile(root / name, source / name)
+    shutil.copytree(root / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info"))
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index",
+               "--no-build-isolation", "--target", str(place), str(source)]  # fmt: skip
+    subprocess.run(install, check=True, capture_output=True, cwd=tmp_path)
+    shutil.rmtree(source)
+    environment = os.environ | {"PYTHONPATH": str(place)}
+
+    def run(*words: str) -> str:
+        done = subprocess.run(
+            [str(place / "bin" / "elastocal"), *words],
+            cwd=tmp_path, env=environment, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    where = [sys.executable, "-c", "import elastocal; print(elastocal.__file__)"]
+    found = subprocess.run(where, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert Path(found.stdout.strip()).is_relative_to(place)
+    assert "Report to open" in run("demo", "-q")
+    again = ("demo_out/cell.toml", "demo_out/data.csv", "-o", "result.json", "-q")
+    assert "wrote report.html" in run("identify", *again, "--report", "report.html")
+    assert (tmp_path / "report.html").stat().st_size > 100_000

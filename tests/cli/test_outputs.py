@@ -1,0 +1,111 @@
+"""Where outputs go: over an input, into a folder that cannot be written, from two runs at once."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fuzz import campaign
+from fuzz.campaign import COMMANDS
+from typer.testing import CliRunner
+
+from elastocal.cli.app import app
+
+WRITING = [c for c in COMMANDS if c.outputs and not any(
+    other.verb == c.verb for other in COMMANDS[: COMMANDS.index(c)]
+)]  # fmt: skip
+PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    campaign.write(folder)
+    return folder
+
+
+@pytest.mark.parametrize("how", ["itself", "another way", "symbolic link", "named by the cell"])
+@pytest.mark.parametrize("command", WRITING, ids=lambda c: c.verb)
+def test_no_output_goes_over_an_input(inputs, monkeypatch, tmp_path, command, how):
+    words = shlex.split(command.line)
+    read = [word for word in words if (inputs / word).is_file()]
+    target = inputs / (read[-1] if how != "named by the cell" else command.named[0]) \
+        if command.named or how != "named by the cell" else None  # fmt: skip
+    if target is None:
+        pytest.skip("reads no other file")
+    content = target.read_bytes()
+    place = {"itself": target.name, "another way": f"study/../{target.name}"}.get(how)
+    if how == "symbolic link":
+        (tmp_path / "link").symlink_to(target)
+        place = str(tmp_path / "link")
+    option = words.index("-o") + 1
+    words[option] = place or target.name
+    monkeypatch.chdir(inputs)
+    before = sorted(os.listdir(inputs))
+    done = CliRunner().invoke(app, [command.verb, *words])
+    assert done.exit_code == 2 and target.read_bytes() == content
+    assert sorted(os.listdir(inputs)) == before
+
+
+def test_a_hard_link_to_an_input_is_parted_from_it(inputs, monkeypatch, tmp_path):
+    """Its content is replaced by name, so that the input keeps its own."""
+    monkeypatch.chdir(inputs)
+    content = (inputs / "data.csv").read_bytes()
+    os.link(inputs / "data.csv", inputs / "linked.csv")
+    words = ["simulate", "deflecting.toml", "poses.csv", "-o", "linked.csv"]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert (inputs / "data.csv").read_bytes() == content
+    assert (inputs / "linked.csv").read_bytes() != content
+    (inputs / "linked.csv").unlink()
+
+
+def elastocal(*words: str, cwd: Path, **how) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "elastocal", *words], cwd=cwd, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, **how,
+    )  # fmt: skip
+
+
+def without_override() -> None:
+    """In a child: root obeys the permissions of folders like anybody else."""
+    if os.geteuid() == 0 and ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0):
+        os._exit(99)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="capabilities of Linux")
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(inputs, tmp_path):
+    (tmp_path / "closed").mkdir()
+    (tmp_path / "closed" / "result.json").write_text("old")
+    (tmp_path / "closed").chmod(0o555)
+    words = ("identify", "deflecting.toml", "data.csv", "-o", str(tmp_path / "closed/result.json"))
+    process = elastocal(*words, cwd=inputs, preexec_fn=without_override)
+    _, told = process.communicate()
+    (tmp_path / "closed").chmod(0o755)
+    if process.returncode == 99:
+        pytest.skip("root here keeps the right to write everywhere")
+    assert process.returncode == 2
+    assert told.startswith("elastocal: ") and "no permission to write" in told
+    assert os.listdir(tmp_path / "closed") == ["result.json"]
+    assert (tmp_path / "closed" / "result.json").read_text() == "old"
+
+
+def test_two_runs_at_once_leave_one_whole_result_and_one_whole_cache(inputs, tmp_path):
+    cache = tmp_path / "cache"
+    environment = os.environ | {"ELASTOCAL_CACHE": str(cache)}
+    words = ("--backend", "compiled", "identify", "deflecting.toml", "data.csv", "-q", "-o")
+    both = [elastocal(*words, str(tmp_path / "result.json"), cwd=inputs, env=environment)
+            for _ in range(2)]  # fmt: skip
+    for process in both:
+        _, told = process.communicate()
+        if "no C compiler" in told:
+            pytest.skip("no C compiler here")
+        assert (process.returncode, told) == (0, "")
+    assert json.loads((tmp_path / "result.json").read_text())["converged"]
+    assert sorted(os.listdir(tmp_path)) == ["cache", "result.json"]
+    assert not [name for name in os.listdir(cache) if name.endswith(".tmp")]

@@ -1,0 +1,105 @@
+"""Long runs of the fuzzer: python tests/fuzz/run.py --cases 5000 --seed 100000.
+
+Each case follows from its number, so that `--case N` is that case again, whatever ran before.
+Exit code 1 where something broke.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+sys.path[:0] = [str(Path(__file__).parents[2] / "src"), str(Path(__file__).parents[1])]
+
+from fuzz import campaign, harness, kills  # noqa: E402
+
+BEGIN, END = "<!-- cases: written by tests/fuzz/run.py -->", "<!-- end of cases -->"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", type=int, default=1000, help="most cases to run")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="longest time")
+    parser.add_argument("--seed", type=int, default=0, help="number of the first case")
+    parser.add_argument("--verb", action="append", default=[], help="only this verb; repeatable")
+    parser.add_argument("--kills", type=int, default=0, help="kill each command so many times")
+    parser.add_argument("--full", type=int, default=0, help="fill its disk so many times")
+    parser.add_argument("--write", type=Path, help="page whose table this run replaces")
+    parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
+    asked = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-"))
+    os.environ.setdefault("ELASTOCAL_CACHE", str(folder / "cache"))
+    base = folder / "campaign"
+    base.mkdir()
+    campaign.write(base)
+    harness.load_everything()
+    if asked.case is not None:
+        case = harness.run(harness.make(asked.case, base, folder / "case", tuple(asked.verb)))
+        print(f"cd {case.folder}\n{case.told()}\nstdout:\n{case.stdout[-3000:]}")
+        return int(bool(case.complaints))
+    tally, begun = Tally(), time.monotonic()
+    for seed in range(asked.seed, asked.seed + asked.cases):
+        if time.monotonic() - begun > asked.seconds:
+            break
+        tally.take(harness.run(harness.make(seed, base, folder / str(seed), tuple(asked.verb))))
+        shutil.rmtree(folder / str(seed), ignore_errors=True)
+    if asked.kills or asked.full:
+        found, tried = kills.run_kills(base, folder, asked.seed, asked.kills, asked.full)
+        tally.count.update(tried)
+        tally.broken += found
+    shutil.rmtree(folder, ignore_errors=True)
+    print(tally.table())
+    print(tally.sentence(asked.seed, time.monotonic() - begun))
+    if asked.write is not None:
+        told = f"{tally.table()}\n\n{tally.sentence(asked.seed, time.monotonic() - begun)}\n"
+        page = asked.write.read_text(encoding="utf-8")
+        before, rest = page.split(f"{BEGIN}\n")
+        _, after = rest.split(END)
+        asked.write.write_text(f"{before}{BEGIN}\n\n{told}\n{END}{after}", encoding="utf-8")
+    return int(bool(tally.broken))
+
+
+class Tally:
+    """What was tried and how it ended."""
+
+    def __init__(self) -> None:
+        self.count: Counter[tuple[str, str]] = Counter()
+        self.broken, self.slowest, self.largest = 0, 0.0, 0
+
+    def take(self, case: harness.Case) -> None:
+        self.count[case.command.verb, f"exit {case.code}"] += 1
+        self.slowest = max(self.slowest, case.seconds)
+        self.largest = max(self.largest, case.resident)
+        if case.complaints:
+            self.broken += 1
+            print(case.told(), flush=True)
+
+    def table(self) -> str:
+        """One row per verb (Markdown)."""
+        columns = ("exit 0", "exit 1", "exit 2", "killed", "disk full")
+        rows = ["| verb | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+        for verb in sorted({verb for verb, _ in self.count}):
+            numbers = (self.count[verb, column] for column in columns)
+            rows.append(f"| `{verb}` | " + " | ".join(str(n or "") for n in numbers) + " |")
+        return "\n".join(rows)
+
+    def sentence(self, seed: int, seconds: float) -> str:
+        cases = sum(n for (_, how), n in self.count.items() if how.startswith("exit"))
+        others = self.count.total() - cases
+        return (
+            f"{cases} cases from {seed} on, {others} kills and full disks: {self.broken} with a "
+            f"finding. Slowest case {self.slowest:.1f} s of processor time, largest "
+            f"{self.largest / 1e6:.0f} MB; {seconds:.0f} s in all."
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

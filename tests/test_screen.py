@@ -1,0 +1,154 @@
+"""What reaches a terminal is readable text, whatever names it is made of."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import unicodedata
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.table import Table
+from rich.text import Text
+from typer.testing import CliRunner
+
+from elastocal.cli.app import app, reporting_errors
+from elastocal.errors import InputError, computing
+from elastocal.screen import complain, safe_console, say
+from elastocal.text import printable
+
+TITLE, MARK = "\x1b]0;owned\x07", "\u202egpj.exe"
+HOSTILE = st.text(
+    st.sampled_from(f"ab{TITLE}{MARK}\r\n\t\x9b\u200b\ud800\u2028[red]é°µ "), min_size=1
+)
+
+
+def harmless(text: str) -> bool:
+    return all(c.isprintable() or unicodedata.category(c) == "Zs" for c in text.replace("\n", ""))
+
+
+@given(st.text())
+def test_an_escaped_text_is_harmless_and_stays_as_it_is(text):
+    once = printable(text)
+    assert harmless(once) and "\n" not in once
+    assert printable(once) == once
+    assert once == text or not text.isprintable()
+
+
+@given(HOSTILE)
+def test_no_table_line_or_message_obeys_a_name(name):
+    screen = safe_console(file=io.StringIO(), width=200, force_terminal=True, color_system=None)
+    table = Table(title=name)
+    table.add_column(name)
+    table.add_row(Text(name))
+    table.add_row(name)
+    for thing in (table, Text(name, style="bold"), name):
+        screen.print(thing)
+    told = screen.file.getvalue().replace("\x1b[1m", "").replace("\x1b[3m", "")
+    assert harmless(told.replace("\x1b[0m", "").replace("\x1b[22m", ""))
+
+
+def test_names_are_not_taken_as_markup():
+    screen = safe_console(file=io.StringIO(), width=200)
+    screen.print("a [red]name[/red] [/bold] :smile:")
+    assert "a [red]name[/red] [/bold] :smile:" in screen.file.getvalue()
+
+
+def test_a_message_is_one_line(capsys):
+    complain(f"a\nb{TITLE}\r\n{MARK}")
+    assert capsys.readouterr().err == "elastocal: a b\\x1b]0;owned\\x07 \\u202egpj.exe\n"
+
+
+def test_streams_without_the_letters_spell_them_out():
+    program = "from elastocal.screen import *; prepare_streams(); say('σ ≤ 3 µm, 20 °, é, \\u202e')"
+    environment = os.environ | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, env=environment)
+    assert done.stdout == b"sigma <= 3 um, 20 deg, \\xe9, \\u202e\n"
+
+
+def test_usage_errors_are_escaped_too():
+    for arguments in (["identify", "a", "b", f"--{TITLE}"], [f"x{MARK}"], ["study", ".", TITLE]):
+        found = CliRunner().invoke(app, arguments)
+        assert found.exit_code == 2 and harmless(found.output) and found.output
+
+
+def numbers_of_a_library():
+    import numpy as np
+
+    np.linalg.cholesky(-np.eye(2))
+
+
+def memory():
+    raise MemoryError
+
+
+def overflow():
+    float(10**400)
+
+
+def fault():
+    raise KeyError("held")
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "told"),
+    [
+        (numbers_of_a_library, 1, "data.csv: .*cannot be computed with .*not positive definite"),
+        (overflow, 1, "data.csv: .*too large or too small"),
+        (memory, 1, "data.csv: memory ends"),
+        (fault, 70, "data.csv: not foreseen: KeyError: 'held' at .*Please report"),
+    ],
+)
+def test_what_a_library_raises_is_a_sentence_with_the_files(raised, code, told, capsys):
+    import re
+
+    import typer
+
+    with pytest.raises(typer.Exit) as ended:
+        reporting_errors(lambda data: raised())(data="data.csv")
+    error = capsys.readouterr().err
+    assert ended.value.exit_code == code
+    assert re.search(told, error) and error.count("\n") == 1 and "Traceback" not in error
+
+
+def test_an_error_of_a_library_names_what_is_computed():
+    told = pytest.raises(InputError, match=r"box: OverflowError: .*; give a smaller one")
+    with told, computing("box", "give a smaller one"):
+        overflow()
+
+
+def test_warnings_of_numpy_do_not_reach_the_user(recwarn):
+    import numpy as np
+
+    reporting_errors(lambda: np.array([1e300]) * np.array([1e300]))()
+    assert not list(recwarn)
+
+
+def test_an_interrupt_that_a_library_swallows_still_ends_with_one_line():
+    program = """
+import signal, sys
+from elastocal.screen import noting_interrupts
+from elastocal.cli.app import app, command
+signal.signal(signal.SIGINT, signal.default_int_handler)
+def library():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise ImportError("a module is half loaded")
+command("attacked")(lambda: library())
+with noting_interrupts():
+    app(["attacked"])
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "elastocal: interrupted\n")
+
+
+def test_a_closed_pipe_is_no_error(tmp_path):
+    command = f"{sys.executable} -m elastocal --help | head -1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    say("")
