@@ -105,7 +105,9 @@ def test_a_changed_study_is_refused_and_started_anew_on_demand(folder):
     [
         (("--set", "replicats=3"), "did you mean 'replicates'?"),
         (("--set", "scale=big"), "--set scale=big: takes a number, as in study.toml"),
-        (("--cluster", "tcp://nowhere at all"), "--cluster tcp://nowhere at all: no scheduler"),
+        (("--cluster", "tcp://nowhere"), "--cluster tcp://nowhere: leads beyond this host"),
+        (("--cluster", "tcp://nowhere at all", "--unencrypted"), "tcp://nowhere at all: no sched"),
+        (("--cluster", "tls://a:1", "--tls-ca", "absent.pem"), "absent.pem: no such file"),
         (("--jobs", "2", "--cluster", "config"), "--jobs is for this machine"),
         (("-o", "{folder}"), "holds study.py, study.toml, which no study wrote"),
     ],
