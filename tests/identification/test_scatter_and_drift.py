@@ -24,7 +24,7 @@ def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, seed=0):
     model = Model.assembled(random_chain(3), cell_of((*PLACED, "joint_offset"), MARKERS, tracker))
     q = random_poses(model.chain, 36, seed)
     if ordered:
-        q = q[0] + np.cumsum(0.1 * rng.normal(size=q.shape), axis=0)
+        q = np.clip(np.cumsum(0.4 * rng.normal(size=q.shape), axis=0), -2.4, 2.4)
     table = table_at(q, markers=tuple(MARKERS))
     truth = true_values(model, rng, anywhere=False)
     time = np.repeat(60.0 * np.arange(len(q)), len(MARKERS))
