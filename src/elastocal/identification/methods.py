@@ -77,7 +77,9 @@ def _settled(
     for _ in range(ROUNDS):
         before = now
         if good is None:
-            noise = estimate_noise(readings, kind)
+            # So many faulty readings look like anything that scatters or drifts.
+            plain = replace(readings, visits=None) if kind == "auto" else readings
+            noise = estimate_noise(plain, kind)
         else:
             noise, now = settle(readings, kind, now)
         progress(f"fitting with the noise found ({noise.kind})")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import optimize
+from scipy import optimize, stats
 
 from elastocal.measurements import Measurements, visits
 from elastocal.model.effects.driven import JointMotion
@@ -25,8 +25,10 @@ class VisitRecord:
     `visit` (N, m) numbers the arm's visits to a pose (−1: no such row), `motion` (N, m, size,
     joints) is ∂(reading)/∂q there, `share` (N, m) the row's factor in the reading, `place` (N, m)
     its time as a share of the campaign's `span` in s; where the table has no times (`timed`), the
-    order of the rows stands for them.  `turning` (joints,) says which joints are revolute.  Where
-    the model itself has what changes with time, no drift of the noise is looked for (`drifts`).
+    order of the rows stands for them.  `turning` (joints,) says which joints are revolute.  No
+    drift of the noise is looked for (`drifts`) where the model itself has what changes with time,
+    and where rows without times follow each other from pose to neighbouring pose: they err alike
+    because of what the model lacks.
     """
 
     visit: IntArray
@@ -70,7 +72,28 @@ def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord 
     when, span, timed = _when(table)
     turning = np.array([kind != "prismatic" for kind in model.chain.kinds])
     visit = np.where(place, visits(table)[row], -1)
-    return VisitRecord(visit, moved, share, when[row], turning, timed, span)
+    drifts = timed or in_random_order(table)
+    return VisitRecord(visit, moved, share, when[row], turning, timed, span, drifts)
+
+
+SYSTEMATIC = 0.01
+
+
+def in_random_order(table: Measurements) -> bool:
+    """Whether poses that follow each other in the table are no nearer than chance allows at 1 %.
+
+    Σ |q_i+1 − q_i|² / Σ |q_i − q̄|² has the mean 2 and the variance 4 (n − 2)/(n² − 1) for each
+    joint (von Neumann 1941), poses that only the load or a repeat tells apart counted once.
+    """
+    moves = np.abs(np.diff(table.q, axis=0)).max(axis=1, initial=0.0) > 0
+    q = table.q[np.concatenate([[True], moves])] if len(table) else table.q
+    n, spread = len(q), q.std(axis=0)
+    q = q[:, spread > 0] / spread[spread > 0]
+    if n < 3 or not q.shape[1]:
+        return False
+    ratio = (np.diff(q, axis=0) ** 2).sum(axis=0) / n
+    deviation = np.sqrt(4 * (n - 2) / (n**2 - 1) / q.shape[1])
+    return bool(ratio.mean() - 2 > stats.norm.ppf(SYSTEMATIC) * deviation)
 
 
 def _joint_motion(model: Model, table: Measurements, x: Array) -> Array:

@@ -1,0 +1,73 @@
+"""What `identify` says of joints that settle anew at each visit, and of a drift in time."""
+
+from dataclasses import replace
+
+import numpy as np
+from support.calibration import PLACED, cell_of, random_chain, table_at, true_values
+from support.cells import random_poses
+
+from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.identification.identify import identify
+from elastocal.identification.visit_record import in_random_order
+from elastocal.model import Model
+from elastocal.report.method_and_noise import noise_model_line
+from elastocal.simulation.simulate import simulate
+
+SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 1e-4, 1e-4, 0.2
+MARKERS = {"M1": np.array([0.3, 0, 0.1]), "M2": np.array([-0.2, 0.2, 0.1])}
+
+
+def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, seed=0):
+    """36 poses of an arm whose base and markers are unknown."""
+    rng = np.random.default_rng(seed)
+    tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
+    model = Model.assembled(random_chain(3), cell_of((*PLACED, "joint_offset"), MARKERS, tracker))
+    q = random_poses(model.chain, 36, seed)
+    if ordered:
+        q = np.clip(np.cumsum(0.4 * rng.normal(size=q.shape), axis=0), -2.4, 2.4)
+    table = table_at(q, markers=tuple(MARKERS))
+    truth = true_values(model, rng, anywhere=False)
+    time = np.repeat(60.0 * np.arange(len(q)), len(MARKERS))
+    shaken = q + scatter * rng.normal(size=q.shape)
+    read = simulate(model, replace(table, q=np.repeat(shaken, len(MARKERS), axis=0)), truth, rng)
+    K = np.exp(-np.abs(time[:, None] - time) / (LASTING * np.ptp(time)))
+    root = np.linalg.cholesky(K + 1e-10 * np.eye(len(K)))
+    position = read.position + drift * root @ rng.normal(size=(len(K), 3))
+    return identify(model, replace(table, position=position, time=time if timed else None))
+
+
+def test_neither_is_told_where_there_is_none():
+    result = identified()
+    assert result.finding("joint_scatter", "drift") is None
+    assert result.noise.held_out_by == "configurations" and result.noise.drift is None
+    assert all(test["p"] > 0.01 for test in result.to_json()["noise"]["tests"])
+
+
+def test_joints_that_settle_anew_are_told_with_their_size():
+    result = identified(scatter=SCATTER)
+    finding = result.finding("joint_scatter")
+    assert finding is not None and finding.severity == "note"
+    assert abs(finding.listed("sigma_urad")[0] / 100 - 1) < 0.3
+    assert any("settle anew" in warning for warning in result.warnings)
+    assert "µrad" in noise_model_line(result)
+    assert any("sigma_urad" in size for size in result.to_json()["noise"]["variances"])
+
+
+def test_a_drift_is_told_and_whole_blocks_are_left_out():
+    result = identified(drift=DRIFT)
+    finding = result.finding("drift")
+    assert finding is not None and finding.severity == "care" and "time" in result.noise.kind
+    assert finding.numbers["by"] == "times" and finding.number("lasting_s") > 60
+    noise = result.to_json()["noise"]
+    assert noise["held_out_by"] == "blocks in time" and noise["drift"]["seconds"] > 60
+    assert any("drift" in warning and "reference pose" in warning for warning in result.warnings)
+    assert np.isfinite(result.heldout_rms)
+
+
+def test_without_times_the_order_of_the_rows_stands_for_them_unless_it_is_one_of_poses():
+    told = identified(drift=DRIFT, timed=False).finding("drift")
+    assert told is not None and told.numbers["by"] == "order of the rows"
+    assert "record times" in told.remedy
+    along = identified(drift=DRIFT, timed=False, ordered=True)
+    assert along.finding("drift") is None
+    assert not in_random_order(along.observations.table)
