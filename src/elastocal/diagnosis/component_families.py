@@ -25,7 +25,7 @@ from elastocal.units import Array, IntArray
 # Lengths in rad of a joint's curve that are tried; what the poses do not resolve is left to lines.
 SHORTEST, LONGEST = 0.06, 3.0
 RESOLVED = 2.0  # times the mean distance of a joint's angles
-MOVED = 0.05  # rad that a joint has to move for its curve to be tried
+MOVED = 0.05  # rad that a joint has to move for its curve and lines to be tried
 CURVE, MOTION = 2e-4, 1e-4  # typical sizes of a curve in rad, of a field in m or rad
 OF_STAGE: dict[Stage, Family] = {
     "transmission": "angle", "geometry": "pose", "load": "load", "compliance": "torque",
@@ -164,6 +164,8 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
         if not isinstance(h.effect, GearRipple):
             continue
         i = index(h.where)
+        if np.ptp(dataset.table.q[:, i]) < MOVED:
+            continue
         own = [c for c in found.components if c.where == h.where]
         if (
             sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
@@ -268,8 +270,9 @@ def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | Non
         components = list(now.components)
         for k, step, known in zip(families, steps, spread, strict=True):
             c = components[k]
-            order = dict(c.settings)["order_1"] + float(step)
-            family = LineFamily(c.where, order, c.width // 4, 0.0, float(known), c.search)
+            m = c.width // 4
+            order = min(max(dict(c.settings)["order_1"] + float(step), LOWEST), HIGHEST / m)
+            family = LineFamily(c.where, order, m, 0.0, float(known), c.search)
             components[k] = _family_component(dataset, family)
         now = replace(now, components=tuple(components))
     return list(found.components) if moved else None
@@ -326,7 +329,7 @@ def _refined(
     """Lowest order of a family, its standard deviation and log evidence, sought within `width` of
     `order`: the curvature of the evidence says how well it is known."""
     for narrowed in width / 4.0 ** np.arange(3):
-        trial = order + np.linspace(-narrowed, narrowed, 17)
+        trial = np.clip(order + np.linspace(-narrowed, narrowed, 17), LOWEST, HIGHEST / m)
         order = float(trial[int(np.argmax(_family_evidence(dataset, grams, h, trial, m)))])
     trial = np.linspace(-width, width, 33)
     each = _family_evidence(dataset, grams, h, order + trial, m)
