@@ -338,7 +338,10 @@ def _fitted(
             f"'{kind.name}' needs the visits of the arm, which these readings do not tell"
         )
     if kind.time and readings.visits is not None and not readings.visits.drifts:
-        raise InputError("smooth functions leave no drift to be found in the noise beside them")
+        raise InputError(
+            "no drift can be told in these readings: the model itself has what changes with time, "
+            "or successive poses are near each other; visit poses in random order"
+        )
     if kind.time and lasting is None:
         if like is None or like.structure.lasting is None:
             tried = [_fitted(readings, kind, like, each) for each in LASTING]
