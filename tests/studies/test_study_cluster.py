@@ -11,7 +11,7 @@ from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
 from elastocal.studies.study_results import read_results
-from elastocal.studies.study_run import ClusterLostError, StudyStop, connect, run_cluster
+from elastocal.studies.study_run import ClusterLostError, StudyStop, Way, connect, run_cluster
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
@@ -185,7 +185,34 @@ def test_no_scheduler_is_told(monkeypatch):
     with pytest.raises(InputError, match="no scheduler answers"):
         connect("tcp://127.0.0.1:9")
     with pytest.raises(InputError, match="cluster='nowhere at all'"):
-        connect("nowhere at all")
+        connect("nowhere at all", Way(unencrypted=True))
+
+
+@pytest.mark.parametrize(
+    ("address", "allowed"),
+    [
+        ("tcp://127.0.0.1:9", True), ("tcp://[::1]:9", True), ("localhost:9", True),
+        ("tls://far.away:9", True), ("wss://far.away:9", True), ("inproc://far/1", True),
+        ("tcp://far.away:9", False), ("far.away:9", False), ("ws://far.away:9", False),
+        ("tcp://127.evil.example:9", False), ("tcp://10.0.0.1:9", False),
+    ],
+)  # fmt: skip
+def test_no_scheduler_beyond_this_host_is_reached_in_the_clear(address, allowed):
+    if allowed:
+        Way().security(distributed, address)
+    else:
+        with pytest.raises(InputError, match="not encrypted, so whoever stands between"):
+            Way().security(distributed, address)
+        Way(unencrypted=True).security(distributed, address)
+
+
+def test_tls_files_reach_dask(tmp_path):
+    files = [tmp_path / name for name in ("ca.pem", "cert.pem", "key.pem")]
+    for path in files:
+        path.write_text("-----BEGIN")
+    found = Way(*files).security(distributed, "tls://far.away:9")
+    held = (found.tls_ca_file, found.tls_client_cert, found.tls_client_key)
+    assert held == tuple(map(str, files))
 
 
 def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path, monkeypatch):

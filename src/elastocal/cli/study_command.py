@@ -13,7 +13,7 @@ from elastocal.cli.app import (
     command,
     console,
 )
-from elastocal.errors import require
+from elastocal.errors import InsufficientDataError, require
 from elastocal.screen import say
 
 if TYPE_CHECKING:
@@ -36,6 +36,16 @@ def study(
             help="Dask scheduler, as in tcp://HOST:8786, or 'config' for Dask's own.",
         ),
     ] = None,
+    tls_ca: Annotated[
+        Path | None, typer.Option(help="Certificate authority (PEM) of a tls:// scheduler.")
+    ] = None,
+    tls_cert: Annotated[
+        Path | None, typer.Option(help="This client's certificate (PEM) for it.")
+    ] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="The key of that (PEM).")] = None,
+    unencrypted: Annotated[
+        bool, typer.Option("--unencrypted", help="Reach another host without TLS.")
+    ] = False,
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed; default: that of study.toml.")
     ] = None,
@@ -64,12 +74,15 @@ def study(
 ) -> None:
     """Run a study's tasks that have no result yet; Ctrl-C stops, the same command goes on.
 
+    study.py in the folder is Python code and runs with your rights, here and on a cluster: run
+    only folders that you trust.
+
     Example: elastocal study experiment_design/coverage --jobs 4
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
     from elastocal.studies.study_folder import read_study
     from elastocal.studies.study_results import arrow
-    from elastocal.studies.study_run import StudyStop, run_study, summarise
+    from elastocal.studies.study_run import StudyStop, Way, run_study, summarise
 
     arrow()
     results = folder / "results" if output is None else output
@@ -79,13 +92,16 @@ def study(
     with StudyStop() as stop, StudyProgress(progress and not quiet) as shown:
         ending = run_study(
             prepared, results, jobs=jobs, cluster=cluster, only=only, restart=restart,
-            retry_failed=retry_failed, stop=stop, progress=shown.show, tell=shown.tell,
+            way=Way(tls_ca, tls_cert, tls_key, unencrypted), retry_failed=retry_failed,
+            stop=stop, progress=shown.show, tell=shown.tell,
         )  # fmt: skip
     say(_told(ending, results))
     if ending.stopped and not ending.complete:
         raise typer.Exit(130)
     if ending.failed:
-        raise typer.Exit(1)
+        raise InsufficientDataError(
+            f"{results}: {ending.failed} of {ending.total} tasks failed; see _failures.log there"
+        )
     if ending.done == len(prepared.tasks):
         text = summarise(prepared, results, page)
         if text is not None:

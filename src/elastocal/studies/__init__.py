@@ -14,7 +14,7 @@ from elastocal import loaded_on_demand
 ROOMS = {
     "study_folder": "Study read_study",
     "study_results": "read_results",
-    "study_run": "ClusterLostError StudyStop run_cluster run_local run_study summarise",
+    "study_run": "ClusterLostError StudyStop Way run_cluster run_local run_study summarise",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]
 __getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

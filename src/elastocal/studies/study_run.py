@@ -17,22 +17,24 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
+from ipaddress import ip_address
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, Self
 
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, option, require
-from elastocal.files import atomic_write_text
+from elastocal.files import atomic_write_text, read_bytes
 from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
 from elastocal.studies.study_results import SOONEST, Recorder, StudyResults, opened, read_results
 from elastocal.text import quoted
 
 GRACE = 30.0  # s that running tasks are waited for
 ANSWER = 10.0  # s in which a scheduler answers
+MOST_PEM_BYTES = 1_000_000
 PATIENCE = 60.0  # s without a scheduler before the run gives up
 # What limits threads of linear algebra: the processes share the cores.
 THREADS = (
@@ -211,13 +213,14 @@ def run_cluster(
     address: str,
     stop: StudyStop,
     tell: Callable[[str], None],
+    way: Way | None = None,
 ) -> Outcomes:
     """Outcomes of tasks on the Dask cluster at `address`, or that of Dask's configuration.
 
     Raises InputError where `connect` does, ClusterLostError where the scheduler goes away.
     """
     if tasks:
-        yield from hand_out(DaskWorkers(connect(address), tell), study.sources, tasks, stop)
+        yield from hand_out(DaskWorkers(connect(address, way), tell), study.sources, tasks, stop)
 
 
 class DaskWorkers:
@@ -274,11 +277,51 @@ class DaskWorkers:
         )
 
 
-def connect(address: str) -> Any:
+@dataclass(frozen=True)
+class Way:
+    """How a scheduler is reached: with the TLS files `ca`, `cert` and `key` (PEM), or those of
+    Dask's configuration; beyond this host only encrypted, unless `unencrypted` allows it.
+
+    Whoever stands between could run code of their own here and there: tasks and results are
+    pickles.
+    """
+
+    ca: Path | None = None
+    cert: Path | None = None
+    key: Path | None = None
+    unencrypted: bool = False
+
+    def security(self, distributed: ModuleType, address: str) -> Any:
+        """Dask's Security for a client of `address`.
+
+        Raises InputError where a file is missing, or the address is another host's without TLS.
+        """
+        for name, path in (("tls_ca", self.ca), ("tls_cert", self.cert), ("tls_key", self.key)):
+            if path is not None:
+                read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)
+        scheme, _, rest = address.rpartition("://")
+        host = rest.rsplit(":", 1)[0].strip("[]")
+        here = scheme == "inproc" or host == "localhost"
+        with suppress(ValueError):  # a name, which may lead anywhere
+            here = here or ip_address(host).is_loopback
+        require(
+            here or self.unencrypted or scheme in ("tls", "wss"),
+            f"{option('cluster', address)}: leads beyond this host and is not encrypted, so "
+            "whoever stands between could run code on both; use tls:// with "
+            f"{option('tls_ca')}, {option('tls_cert')} and {option('tls_key')}, a tunnel to this "
+            f"host, or allow it with {option('unencrypted', True)}",
+        )
+        files = {
+            "tls_ca_file": self.ca, "tls_client_cert": self.cert, "tls_client_key": self.key,
+        }  # fmt: skip
+        return distributed.Security(**{k: str(p) for k, p in files.items() if p is not None})
+
+
+def connect(address: str, way: Way | None = None) -> Any:
     """Returns a client of the scheduler at `address`, or in Dask's configuration ("config").
 
-    Raises InputError where distributed is not installed, there is no scheduler, or a worker
-    lacks this version of elastocal.
+    Raises InputError where distributed is not installed, the way there is not allowed, there is
+    no scheduler, or a worker lacks this version of elastocal.
     """
     distributed = dask_distributed()
     import dask
@@ -290,15 +333,16 @@ def connect(address: str) -> Any:
         "DASK_SCHEDULER_ADDRESS or scheduler-address, or give "
         f"{option('cluster', 'tcp://HOST:8786')}",
     )
+    security = (way or Way()).security(distributed, str(where))
     # Its log lines tell of dead workers with tracebacks; what matters is told by the study.
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
-        client = distributed.Client(where, timeout=ANSWER, set_as_default=False)
-    except (OSError, ValueError) as error:
+        client = distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
             f"{option('cluster', where)}: no scheduler answers ({error}); check the address, or "
-            "start one with: dask scheduler"
+            "start one with: dask scheduler --host 127.0.0.1"
         ) from None
     try:
         found = client.run(_version)
@@ -351,6 +395,7 @@ def run_study(
     *,
     jobs: int | None = None,
     cluster: str | None = None,
+    way: Way | None = None,
     only: int | None = None,
     restart: bool = False,
     retry_failed: bool = False,
@@ -362,10 +407,10 @@ def run_study(
 ) -> Ending:
     """Run the tasks that have no result yet (of the first `only`) and record what comes.
 
-    They run in `jobs` processes (by default one per core), on the Dask scheduler at `cluster`, or
-    as `runner` has it.  `restart` discards the results that are in the folder `output`,
-    `retry_failed` those that are errors; `progress` takes the number of tasks, of those that
-    ended and of those that failed.  However the run ends, what was done by then is written.
+    They run in `jobs` processes (by default one per core), on the Dask scheduler at `cluster`,
+    reached in this `way`, or as `runner` has it.  `restart` discards the results that are in the
+    folder `output`, `retry_failed` those that are errors; `progress` takes the number of tasks, of
+    those that ended and of those that failed.  However the run ends, what was done is written.
 
     Raises InputError where the results in `output` are of another seed, source or task, or the
     cluster cannot be reached; ClusterLostError where the scheduler goes away.
@@ -373,14 +418,16 @@ def run_study(
     stop = stop or StudyStop()
     if runner is None and cluster is not None:
         dask_distributed()
-        runner = partial(run_cluster, study, address=cluster, stop=stop, tell=tell)
+        runner = partial(run_cluster, study, address=cluster, stop=stop, tell=tell, way=way)
     elif runner is None:
         runner = partial(run_local, study, jobs=jobs, stop=stop)
     version = source_version()
     with opened(Path(output)) as results:
         if restart:
             if cluster is not None:
-                connect(cluster).close()  # one that cannot be reached must not cost the results
+                connect(
+                    cluster, way
+                ).close()  # one that cannot be reached must not cost the results
             results.clear()
         failures = _known(study, results)
         if retry_failed and any(failures.values()):
