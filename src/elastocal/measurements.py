@@ -58,6 +58,7 @@ NUMBERS = (
     "approach", "temperature",
 )  # fmt: skip
 DEFAULT_MARKER = "M1"
+LEAST_FORCE, LARGEST_FORCE = 1e-6, 1e7  # N
 QUATERNION_NORM_TOLERANCE = 1e-3
 LARGEST_EXACT_INTEGER = 2.0**53
 AT_A_TIME = 50_000  # rows
@@ -329,6 +330,10 @@ def read_measurements(
     if configuration is None:
         configuration = Labels(np.arange(n), tuple(str(i) for i in range(1, n + 1)))
     force, torque, sigma = raw.si("force"), raw.si("torque"), _sigma(raw)
+    if force is not None:
+        raw.check("force", np.abs(force) <= LARGEST_FORCE, "no arm carries a force this large")
+        # What a subtraction or rotation leaves of no load; scaled by it, numbers overflow.
+        force = np.where(np.linalg.norm(force, axis=1, keepdims=True) < LEAST_FORCE, 0.0, force)
     q, time, temperature = raw.si("q"), raw.si("time"), raw.si("temperature")
     distance = raw.si("distance")
     if distance is not None:

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 AnyModel: TypeAlias = Model | Cell | str | Path
 Table: TypeAlias = Measurements | str | Path
 Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
+MOST = 10_000_000  # of poses, candidates, processes: more is a slip of the key
 Progress: TypeAlias = Callable[[str], None]
 T = TypeVar("T")
 
@@ -705,8 +706,8 @@ def _whole(name: str, given: Any, least: int | None = None) -> int:
     whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
     more = "" if least is None else f", {least} or more"
     require(
-        whole and (least is None or given >= least),
-        f"{option(name)} takes a whole number{more}; found {quoted(given)}",
+        whole and (least is None or given >= least) and abs(given) <= MOST,
+        f"{option(name)} takes a whole number{more} and at most {MOST:,}; found {quoted(given)}",
     )
     return int(given)
 

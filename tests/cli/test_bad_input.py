@@ -316,3 +316,79 @@ def test_covariance_of_the_wrong_size(campaign):
 def test_missing_arguments_are_a_usage_error():
     code, message = run("identify")
     assert code == 2 and "Traceback" not in message
+
+
+# --- nonsense, and numbers beyond all measure ---------------------------------------------------
+
+
+def change_columns(path: Path, changed) -> None:
+    """Apply `changed` to the table of cells below the header, a list of rows."""
+    rows = cells_of(path)
+    write_cells(path, [rows[0], *changed(rows[1:])])
+
+
+def test_swapped_columns_are_no_calibration_and_named(campaign):
+    change_columns(campaign[1], lambda rows: [[*r[:7], r[8], r[7], *r[9:]] for r in rows])
+    told = r"data.csv: after the fit .* m \(median\) .*no arm of .* m could be.*columns .*swapped"
+    refused(1, told, campaign=campaign)
+
+
+def test_readings_of_other_poses_are_no_calibration(campaign):
+    order = [5, 9, 2, 11, 0, 7, 3, 10, 1, 8, 6, 4]
+    change_columns(
+        campaign[1],
+        lambda rows: [[*rows[k][:6], *r[6:]] for k, r in zip(order, rows, strict=True)],
+    )
+    refused(1, "data.csv: after the fit", "which joint values belong", campaign=campaign)
+
+
+@pytest.mark.parametrize("force", ["1e300", "-1e9"])
+def test_a_force_beyond_all_measure_is_refused(campaign, force):
+    rows = cells_of(campaign[1])
+    names = ["force_x_N", "force_y_N", "force_z_N"]
+    write_cells(campaign[1], [[*rows[0], *names], *([*r, "0", "0", force] for r in rows[1:])])
+    refused(2, "line 2, column force_z_N: no arm carries", campaign=campaign)
+
+
+def test_a_force_that_rounding_left_is_none(campaign):
+    rows = cells_of(campaign[1])
+    names = ["force_x_N", "force_y_N", "force_z_N"]
+    write_cells(campaign[1], [[*rows[0], *names], *([*r, "0", "0", "1e-300"] for r in rows[1:])])
+    from elastocal.measurements import read_measurements
+
+    assert not read_measurements(campaign[1], joint_kinds=("revolute",) * 6).force.any()
+
+
+def test_a_covariance_of_text(campaign):
+    path = campaign[0].parent / "noise.csv"
+    path.write_text("a,b\n1,2\n")
+    told = r"noise.csv, line 1, column no. 1: 'a' is not a number"
+    refused(2, told, campaign=campaign, extra=("--covariance", path))
+
+
+def test_everything_held_names_the_cell_and_the_option(campaign):
+    effects = ("base_frame", "joint_offset", "marker_position")
+    held = [part for name in effects for part in ("--fix", name)]
+    told = "cell.toml: nothing is left to identify.*--fix"
+    refused(2, told, campaign=campaign, extra=held)
+
+
+@pytest.mark.parametrize("box", ["500,0,500,500,100,600", "1,2,3,1,2,3"])
+def test_a_box_without_extent_is_refused_at_once(campaign, box):
+    cell, data = campaign
+    result = cell.parent / "result.json"
+    assert run("identify", cell, data, "-o", result, "-q")[0] == 0
+    table = ("--table", cell.parent / "t.csv", "--box", box, "-q")
+    code, message = run("compensate", cell, result, *table)
+    assert code == 2 and "--box: both corners have the same x" in message
+
+
+def test_numbers_beyond_all_measure_in_options(campaign):
+    cell = campaign[0]
+    huge = "9" * 30
+    for arguments in (
+        ("design", cell, "-o", cell.parent / "p.csv", "--poses", huge),
+        ("design", cell, "-o", cell.parent / "p.csv", "--candidates", huge),
+    ):
+        code, message = run(*arguments, "-q")
+        assert code == 2 and arguments[-2] in message and message.count("\n") == 1, message

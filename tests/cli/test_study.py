@@ -91,6 +91,14 @@ def test_failures_end_with_exit_1_and_their_number(tmp_path):
     assert not (folder / "result.md").exists()
 
 
+def test_an_option_that_no_record_holds_is_refused_with_its_key(folder):
+    path = folder / "study.toml"
+    path.write_text(path.read_text().replace("[options]", "[options]\nfarthest = inf"))
+    told = study(folder, "--jobs", 1)
+    assert told.exit_code == 2 and "study.toml: key options.'farthest'" in told.stderr
+    assert not (folder / "results").exists()
+
+
 def test_a_changed_study_is_refused_and_started_anew_on_demand(folder):
     study(folder, "--jobs", 1)
     told = study(folder, "--jobs", 1, "--seed", 4)

@@ -124,7 +124,7 @@ class Victim:
     def refused(self, rng: Random) -> tuple[str, list[str]]:
         """One run on a disk that is full at a byte of `rng`: a message, and nothing has changed."""
         # Room for the message at least, which goes to a file here.
-        number = rng.randrange(2000, max(6000, *self.sizes.values()))
+        number = rng.randrange(2000, max([6000, *self.sizes.values()]))
         case = self.run(lambda: full_disk(number))
         found = list(self.wrong())
         there = seen(self.folder)

@@ -19,6 +19,7 @@ from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.inverse_kinematics import Reaching
 from elastocal.units import Array
 
+LEAST_STEP = 1e-9  # m between levels
 MOST_POINTS = 200_000
 BETWEEN = 512  # points between those of the grid, on which interpolation is measured
 EXACT, FIRST_ORDER = "exact", "first order"
@@ -88,6 +89,13 @@ def box_grid(
             f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
         )
     counts = _counts(counts, 3, "one number, or one each for x, y and z")
+    flat = [name for name, a, b, k in zip("xyz", lower, upper, counts, strict=True)
+            if k > 1 and b - a < LEAST_STEP * k]  # fmt: skip
+    if flat:
+        raise InputError(
+            f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
+            f"level there by {option('grid')}"
+        )
     axes = tuple(_levels(a, b, k) for a, b, k in zip(lower, upper, counts, strict=True))
     return CorrectionGrid(axes, False, rotation)
 

@@ -47,6 +47,7 @@ from elastocal.diagnosis.verdict import (
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_write_text, temporary_beside
 from elastocal.identification.findings import BudgetStep
+from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE, effect_of
@@ -202,6 +203,7 @@ def diagnose(
     model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")
     base = fit_baseline(model, table, options.seed)
+    refuse_nonsense(model, base.observed, base.x, base.residual)
     hypotheses, untested = possible(model, table, options.without)
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))

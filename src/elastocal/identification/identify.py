@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from elastocal.identification.estimates import summarise
 from elastocal.identification.findings import judged
 from elastocal.identification.methods import is_exact, run_method, with_smooth
+from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
 from elastocal.identification.residuals import rms_3d
@@ -80,6 +81,7 @@ def identify(
         faulty, sound = find_faulty(every, refit)
     if 0 < faulty.mean() < 1:
         sound = refit(~faulty, final=True)
+    refuse_nonsense(model, sound.problem.observations, sound.fit.x, sound.fit.residual)
     if smooth:
         found = with_smooth(every, sound, faulty, free, options, progress)
     else:

@@ -152,7 +152,8 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
     free = np.array([i for i in range(len(model.parameters)) if i not in held], dtype=np.int64)
     if not len(free):
         raise InputError(
-            "nothing is left to identify: choose effects with parameters in [model] effects"
+            f"{model.cell.path or model.cell.name}: nothing is left to identify; choose "
+            f"effects with parameters in [model] effects, or hold fewer by {option('fixed')}"
         )
     return free
 

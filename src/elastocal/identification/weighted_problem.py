@@ -175,7 +175,8 @@ def inverse_factor(blocks: Array) -> Array:
         factor = np.linalg.cholesky(blocks)
     except np.linalg.LinAlgError:
         raise InputError(
-            "the noise covariance is not positive definite; check sigmas and covariance"
+            "the noise covariance is not positive definite; check what states it: "
+            f"{option('covariance')}, the sigma columns of the table, or [tracker] of the cell"
         ) from None
     return np.linalg.solve(factor, np.broadcast_to(np.eye(blocks.shape[1]), factor.shape))
 

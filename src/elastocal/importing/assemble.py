@@ -7,19 +7,17 @@ cell.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.identification.start import RegistrationProblem, register
+from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing.joining import (
     DEFAULT,
     Joined,
@@ -49,7 +47,6 @@ from elastocal.importing.records import (
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.choice import load_chain
-from elastocal.model.manipulator import Model
 from elastocal.tables import Family, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, convert, quantities
@@ -402,22 +399,7 @@ def _pairs(table: Measurements) -> list[str]:
     ]
 
 
-FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
-POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
-BETTER = 5.0  # a correction must reduce the error by this factor to be named
 SLACK = 1e-6  # rad or m beyond a limit that rounding explains
-FARTHEST = 1e5  # m; beyond it no fit is worth its overflows, and plausibility speaks
-SAMPLE = 80
-CONFIRMED = 2  # corrections that are tried in earnest
-
-
-@dataclass(frozen=True)
-class NominalFit:
-    """Median distance `error` (m) of the readings from the nominal arm with base and markers
-    fitted; `warning` names what would make them fit, "" where they do."""
-
-    error: float
-    warning: str
 
 
 def against_cell(
@@ -444,124 +426,7 @@ def against_cell(
             f"{len(table)} rows); correct unit, sign, offset_deg or order in [joints], or "
             "the limits of the cell"
         )
-    poses = len(np.unique(table.q, axis=0))
-    if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
-        return None, refused
-    return _fit(cell, table, spherical), refused
-
-
-def _fit(cell: Cell, table: Measurements, spherical: bool) -> NominalFit:
-    # The nominal arm without effects, its markers at the flange.
-    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
-    rigid = Model(replace(cell, tool=tool, model=ModelSpec()))
-    light = np.flatnonzero(~np.any(table.force != 0, axis=1))
-    rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
-    if len(rows) > SAMPLE:
-        rows = np.sort(np.random.default_rng(0).choice(rows, SAMPLE, replace=False))
-    used = table.take(rows)
-    error = _error(rigid, used)
-    if error <= POOR:
-        return NominalFit(error, "")
-    # A registration takes time; the linear one, exact where the base is a rotation, chooses.
-    guesses = sorted(
-        _corrections(used, spherical), key=lambda guess: _linear_error(rigid, guess[1])
-    )
-    tried = [(_error(rigid, changed), words) for words, changed in guesses[:CONFIRMED]]
-    best, words = min(tried, key=lambda t: t[0])
-    said = f"the readings fit the nominal arm only to {error * 1e3:.3g} mm"
-    if best < error / BETTER:
-        return NominalFit(error, f"{said}; {words} they would fit to {best * 1e3:.3g} mm")
-    return NominalFit(
-        error,
-        f"{said}, and neither another unit, sign or coupling of a joint nor a shift by one pose "
-        "mends that: check the robot of the cell, offsets of joints, and which joint values belong "
-        "to which point",
-    )
-
-
-def _error(model: Model, table: Measurements) -> float:
-    T = model.rigid.flange_poses(table)
-    problem = RegistrationProblem(
-        T[:, :3, :3], T[:, :3, 3], np.asarray(table.position), table.marker,
-        np.zeros((len(table.marker_names), 3)), np.ones(len(table.marker_names), dtype=bool),
-        True, np.eye(3), np.zeros(3),
-    )  # fmt: skip
-    return register(problem).error
-
-
-def _linear_error(model: Model, table: Measurements) -> float:
-    """Rms of A p + s - R_i m - t_i over readings p, with any matrix A, shift s and markers m.
-
-    Infinite where A is no rotation at all: it mirrors, or its scale is off by a quarter.
-    """
-    T = model.rigid.flange_poses(table)
-    n, markers = len(table), len(table.marker_names)
-    columns = np.zeros((n, 3, 12 + 3 * markers))
-    for k in range(3):
-        columns[:, k, 3 * k : 3 * k + 3] = table.position
-        columns[:, k, 9 + k] = 1.0
-    for c in range(markers):
-        here = (table.marker == c)[:, None, None]
-        columns[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * T[:, :3, :3])
-    matrix, target = columns.reshape(3 * n, -1), T[:, :3, 3].ravel()
-    x = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
-    volume = float(np.linalg.det(x[:9].reshape(3, 3)))
-    if not 0.75**3 < volume < 1.25**3:
-        return np.inf
-    return float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
-
-
-def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Measurements]]:
-    """Mistakes that are often made, each undone."""
-    other = partial(replace, table)
-    position = np.asarray(table.position)
-    for factor, words in (
-        (1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
-        (1 / 25.4, "mm read as inches"),
-    ):  # fmt: skip
-        yield f"if positions were {words}", other(position=position * factor)
-    # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
-    mirrored = position[:, [1, 0, 2]]
-    if spherical:
-        yield (
-            "with azimuths counted the other way (azimuth = … in [[source]])",
-            other(position=mirrored),
-        )
-        level = np.hypot(*position[:, :2].T)
-        turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
-        yield (
-            "with zenith angles read as elevations or the other way round",
-            other(position=np.column_stack([position[:, :2] * turned[:, None], level])),
-        )
-    yield (
-        "with two columns of the positions swapped, or the sign of one turned round (now they "
-        "make a left-handed frame),",
-        other(position=mirrored),
-    )
-    yield "if joints were degrees read as radians", other(q=np.radians(table.q))
-    yield "if joints were radians read as degrees", other(q=np.degrees(table.q))
-    n = table.q.shape[1]
-    for j in range(n):
-        q = table.q.copy()
-        q[:, j] *= -1
-        yield f"with the sign of joint {j + 1} turned round", other(q=q)
-    for factor in (1.0, -1.0):
-        if n >= 3:
-            q = table.q.copy()
-            q[:, 2] += factor * q[:, 1]
-            yield f"with coupling {{ joint = 3, of = 2, factor = {factor:g} }}", other(q=q)
-    for j in range(n):
-        for degrees in (90, -90, 180):
-            q = table.q.copy()
-            q[:, j] += np.radians(degrees)
-            yield f"with offset_deg {degrees} at joint {j + 1}", other(q=q)
-    visit = np.cumsum(np.r_[0, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
-    poses = np.array([table.q[visit == v][0] for v in range(visit.max() + 1)])
-    for shift, words in ((1, "earlier"), (-1, "later")):
-        yield (
-            f"with the joint values of one pose {words}",
-            other(q=np.roll(poses, shift, axis=0)[visit]),
-        )
+    return nominal_fit(cell, table, spherical), refused
 
 
 @dataclass(frozen=True)

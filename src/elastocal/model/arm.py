@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option
-from elastocal.measurements import Measurements, with_moves
+from elastocal.measurements import LARGEST_FORCE, Measurements, with_moves
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
 
@@ -297,7 +297,8 @@ def given_force(load: ArrayLike | None) -> NDArray[np.float64] | None:
         force = np.asarray(load, dtype=float)
     except (TypeError, ValueError):
         force = np.zeros(0)
-    if force.shape != (3,) or not np.isfinite(force).all():
+    if force.shape != (3,) or not (np.abs(force) <= LARGEST_FORCE).all():
         found = " ".join(f"{v:g}" for v in force) if force.ndim == 1 and len(force) else load
-        raise InputError(f"{option('load')} takes three finite numbers in N; found {found}")
+        most = "" if not np.isfinite(force).all() else f" of at most {LARGEST_FORCE:g}"
+        raise InputError(f"{option('load')} takes three finite numbers in N{most}; found {found}")
     return force

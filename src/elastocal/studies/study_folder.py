@@ -34,9 +34,11 @@ from pydantic import Field
 from elastocal import __version__
 from elastocal.config import Table, checked, read_toml
 from elastocal.errors import InputError, option, require
+from elastocal.files import read_bytes
 from elastocal.text import did_you_mean, listed, quoted
 
 RESERVED = ("task", "task_hash", "task_row", "task_seconds", "elastocal", "task_error")
+MAX_BYTES = 1_000_000_000  # of a file that study.toml names: a table, at most
 TAKEN = f"{', '.join(RESERVED)} are columns of every study"
 # What a column takes, by its unit in study.toml; every other unit is that of a number.
 Row = dict[str, Any]
@@ -168,6 +170,14 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
         )
     seed = stated.seed if seed is None else seed
     chosen = _with_options(path, stated.options, options)
+    for key, value in chosen.items():
+        try:
+            json.dumps(value, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"{path}: key options.{quoted(key)} cannot be recorded ({error}); use finite "
+                "numbers, text, true/false, lists and tables of them"
+            ) from None
     sources = read_sources(folder, stated.files, stated.columns)
     module = load(sources)
     tasks = tuple(_tasks(folder, module, chosen, sources, seed))
@@ -207,7 +217,8 @@ def read_sources(folder: Path, files: Iterable[str], columns: Mapping[str, str])
     names = {path.relative_to(folder) for path in folder.rglob("*.py")}
     hidden = {n for n in names if any(p.startswith(".") or p == "__pycache__" for p in n.parts)}
     parts = sorted({n.as_posix() for n in names - hidden} | set(files))
-    return Sources(folder, {name: (folder / name).read_bytes() for name in parts}, columns)
+    contents = {name: read_bytes(folder / name, "file of a study", MAX_BYTES) for name in parts}
+    return Sources(folder, contents, columns)
 
 
 def _tasks(

@@ -16,7 +16,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 from elastocal.errors import InputError, option, require
-from elastocal.files import UNFINISHED, atomic_binary_writer, atomic_write_text
+from elastocal.files import UNFINISHED, atomic_binary_writer, atomic_write_text, read_json
+from elastocal.screen import shown
 from elastocal.studies.study_folder import Outcome, Study
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 # Names with a leading underscore or dot are no parts to those who read the folder as a dataset.
+MAX_BYTES = 100_000_000  # of the record
 STATEMENT, FAILURES, LOCK = "_study.json", "_failures.log", ".lock"
 SOONEST, LATEST = 5.0, 60.0  # s between parts; a long run writes fewer, or there are thousands
 
@@ -175,8 +177,8 @@ class StudyResults:
     def stated(self) -> dict[str, Any]:
         """Returns what `state` wrote; empty where there is none."""
         try:
-            found = json.loads((self.folder / STATEMENT).read_text("utf-8"))
-        except (OSError, ValueError):
+            found = read_json(self.folder / STATEMENT, "record", MAX_BYTES, "remove it")
+        except InputError:
             return {}
         return found if isinstance(found, dict) else {}
 
@@ -219,7 +221,7 @@ class Recorder:
                 if outcome.error is not None:
                     task = self._tasks[outcome.index].text
                     with open(self._results.folder / FAILURES, "a", encoding="utf-8") as log:
-                        log.write(f"task {outcome.index} {task}\n{outcome.trace}\n")
+                        log.write(shown(f"task {outcome.index} {task}\n{outcome.trace}\n"))
             lines = [line for outcome in outcomes for line in self._lines(outcome)]
             self._results.write(part, arrow().Table.from_pylist(lines, schema=self._schema))
             self._open = (self._results.new_part(), [])

@@ -1,0 +1,198 @@
+"""Mistakes that are often made with a table of readings, found by undoing each.
+
+Units, signs, swapped columns, shifted rows: whether the nominal arm, its base and markers fitted,
+explains the readings at all, and what would have to be otherwise for it to do so.  A calibration
+whose residuals no arm could have ends here, with the likely cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from elastocal.cell.arm_description import ModelSpec, Tool
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InsufficientDataError
+from elastocal.identification.start import RegistrationProblem, register
+from elastocal.measurements import Measurements
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
+from elastocal.units import Array
+
+FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
+POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
+BETTER = 5.0  # a correction must reduce the error by this factor to be named
+FARTHEST = 1e5  # m; beyond it no fit is worth its overflows, and plausibility speaks
+SAMPLE = 80
+CONFIRMED = 2  # corrections that are tried in earnest
+
+
+@dataclass(frozen=True)
+class NominalFit:
+    """Median distance `error` (m) of the readings from the nominal arm with base and markers
+    fitted; `warning` names what would make them fit, "" where they do."""
+
+    error: float
+    warning: str
+
+
+def nominal_fit(cell: Cell, table: Measurements, spherical: bool = False) -> NominalFit | None:
+    """How well readings fit the nominal arm, and which mistake undone would mend it; None where
+    they hold no positions, too few poses, or numbers beyond all measure.
+
+    `spherical`: positions were read as distance and angles, which invites mistakes of their own.
+    """
+    poses = len(np.unique(table.q, axis=0))
+    if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
+        return None
+    # The nominal arm without effects, its markers at the flange.
+    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
+    rigid = Model(replace(cell, tool=tool, model=ModelSpec()))
+    light = np.flatnonzero(~np.any(table.force != 0, axis=1))
+    rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
+    if len(rows) > SAMPLE:
+        rows = np.sort(np.random.default_rng(0).choice(rows, SAMPLE, replace=False))
+    used = table.take(rows)
+    error = _error(rigid, used)
+    if error <= POOR:
+        return NominalFit(error, "")
+    # A registration takes time; the linear one, exact where the base is a rotation, chooses.
+    guesses = sorted(
+        _corrections(used, spherical), key=lambda guess: _linear_error(rigid, guess[1])
+    )
+    tried = [(_error(rigid, changed), words) for words, changed in guesses[:CONFIRMED]]
+    best, words = min(tried, key=lambda t: t[0])
+    said = f"the readings fit the nominal arm only to {error * 1e3:.3g} mm"
+    if best < error / BETTER:
+        return NominalFit(error, f"{said}; {words} they would fit to {best * 1e3:.3g} mm")
+    return NominalFit(
+        error,
+        f"{said}, and neither another unit, sign or coupling of a joint nor a shift by one pose "
+        "mends that: check the robot of the cell, offsets of joints, and which joint values belong "
+        "to which point",
+    )
+
+
+def _error(model: Model, table: Measurements) -> float:
+    T = model.rigid.flange_poses(table)
+    problem = RegistrationProblem(
+        T[:, :3, :3], T[:, :3, 3], np.asarray(table.position), table.marker,
+        np.zeros((len(table.marker_names), 3)), np.ones(len(table.marker_names), dtype=bool),
+        True, np.eye(3), np.zeros(3),
+    )  # fmt: skip
+    return register(problem).error
+
+
+def _linear_error(model: Model, table: Measurements) -> float:
+    """Rms of A p + s - R_i m - t_i over readings p, with any matrix A, shift s and markers m.
+
+    Infinite where A is no rotation at all: it mirrors, or its scale is off by a quarter.
+    """
+    T = model.rigid.flange_poses(table)
+    n, markers = len(table), len(table.marker_names)
+    columns = np.zeros((n, 3, 12 + 3 * markers))
+    for k in range(3):
+        columns[:, k, 3 * k : 3 * k + 3] = table.position
+        columns[:, k, 9 + k] = 1.0
+    for c in range(markers):
+        here = (table.marker == c)[:, None, None]
+        columns[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * T[:, :3, :3])
+    matrix, target = columns.reshape(3 * n, -1), T[:, :3, 3].ravel()
+    x = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
+    volume = float(np.linalg.det(x[:9].reshape(3, 3)))
+    if not 0.75**3 < volume < 1.25**3:
+        return np.inf
+    return float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
+
+
+def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Measurements]]:
+    """Mistakes that are often made, each undone."""
+    other = partial(replace, table)
+    position = np.asarray(table.position)
+    for factor, words in (
+        (1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
+        (1 / 25.4, "mm read as inches"),
+    ):  # fmt: skip
+        yield f"if positions were {words}", other(position=position * factor)
+    # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
+    mirrored = position[:, [1, 0, 2]]
+    if spherical:
+        yield (
+            "with azimuths counted the other way (azimuth = … in [[source]])",
+            other(position=mirrored),
+        )
+        level = np.hypot(*position[:, :2].T)
+        turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
+        yield (
+            "with zenith angles read as elevations or the other way round",
+            other(position=np.column_stack([position[:, :2] * turned[:, None], level])),
+        )
+    yield (
+        "with two columns of the positions swapped, or the sign of one turned round (now they "
+        "make a left-handed frame),",
+        other(position=mirrored),
+    )
+    yield "if joints were degrees read as radians", other(q=np.radians(table.q))
+    yield "if joints were radians read as degrees", other(q=np.degrees(table.q))
+    n = table.q.shape[1]
+    for j in range(n):
+        q = table.q.copy()
+        q[:, j] *= -1
+        yield f"with the sign of joint {j + 1} turned round", other(q=q)
+    for factor in (1.0, -1.0):
+        if n >= 3:
+            q = table.q.copy()
+            q[:, 2] += factor * q[:, 1]
+            yield f"with coupling {{ joint = 3, of = 2, factor = {factor:g} }}", other(q=q)
+    for j in range(n):
+        for degrees in (90, -90, 180):
+            q = table.q.copy()
+            q[:, j] += np.radians(degrees)
+            yield f"with offset_deg {degrees} at joint {j + 1}", other(q=q)
+    visit = np.cumsum(np.r_[0, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
+    poses = np.array([table.q[visit == v][0] for v in range(visit.max() + 1)])
+    for shift, words in ((1, "earlier"), (-1, "later")):
+        yield (
+            f"with the joint values of one pose {words}",
+            other(q=np.roll(poses, shift, axis=0)[visit]),
+        )
+
+
+# What no arm can be.
+
+# Median of what a fitted model leaves, over the length of the arm.  Arms as they come from a
+# factory err by a thousandth of it, those of hobbyists by a hundredth; wrong columns by a third.
+POOREST = 0.05
+LARGEST = 10.0  # a fitted length, over that of the arm and the distance of the readings
+
+
+def refuse_nonsense(model: Model, observed: Observations, x: Array, residual: Array) -> None:
+    """Raise InsufficientDataError, with the likely cause, where a fit is none of this robot.
+
+    `x` (parameters,) and `residual` (N·size,) of the fit in SI units.
+    """
+    parts = residual.reshape(-1, observed.size)[:, :3]
+    error = float(np.median(np.linalg.norm(parts, axis=1))) if len(parts) else 0.0
+    frames = [*(joint.placement for joint in model.chain.joints), model.chain.flange_placement]
+    length = float(sum(np.linalg.norm(frame[:3, 3]) for frame in frames))
+    table = observed.table
+    far = 0.0 if table.position is None else float(np.abs(table.position).max())
+    lengths = np.array([p.unit == "m" for p in model.parameters], dtype=bool)
+    beyond = np.flatnonzero(lengths & ~(np.abs(x) <= LARGEST * (length + far)))
+    if np.isfinite(error) and error <= POOREST * length and not len(beyond):
+        return
+    what = f"after the fit the readings are {error:.3g} m (median) from the model"
+    if len(beyond):
+        k = int(beyond[0])
+        what += f", whose {model.parameters[k].name} is {x[k]:.3g} m"
+    fit = nominal_fit(model.cell, table)
+    cause = fit.warning if fit is not None and fit.warning else (
+        "check the units and the order of the columns, which joint values belong to which point, "
+        "and whether the cell describes this robot"
+    )  # fmt: skip
+    raise InsufficientDataError(
+        f"{table.source}: {what}, which no arm of {length:.3g} m could be; {cause}"
+    )
