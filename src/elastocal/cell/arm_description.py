@@ -146,7 +146,7 @@ class Tool:
             require(
                 is_label(name),
                 f"marker name {quoted(name)} in [tool.markers_m] cannot stand in a table; use a "
-                "non-empty text on one line without blanks at its ends",
+                "non-empty text on one line without blanks at its ends or what cannot be seen",
             )
 
 

@@ -52,11 +52,12 @@ class InOrder(TyperGroup):
         known = super().list_commands(ctx)
         return sorted(known, key=lambda name: VERBS.index(name) if name in VERBS else len(VERBS))
 
-    def main(self, *args: Any, standalone_mode: bool = True, **extra: Any) -> Any:
+    def main(self, *args: Any, **extra: Any) -> Any:
         """As inherited; but however it ends, one message says why, with names escaped."""
-        told = StringIO()
+        told, standalone = StringIO(), extra.pop("standalone_mode", True)
+        extra["standalone_mode"] = False
         try:
-            code = super().main(*args, standalone_mode=False, **extra)
+            code = super().main(*args, **extra)
         except (typer.Abort, KeyboardInterrupt, EOFError):
             code = INTERRUPTED
         except Exception as error:
@@ -67,7 +68,7 @@ class InOrder(TyperGroup):
             code = getattr(error, "exit_code", 2)
         if code == INTERRUPTED:
             complain("interrupted")
-        if not standalone_mode:
+        if not standalone:
             return code
         sys.exit(code or 0)
 

@@ -177,8 +177,11 @@ def refuse_nonsense(model: Model, observed: Observations, x: Array, residual: Ar
     parts = residual.reshape(-1, observed.size)[:, :3]
     error = float(np.median(np.linalg.norm(parts, axis=1))) if len(parts) else 0.0
     frames = [*(joint.placement for joint in model.chain.joints), model.chain.flange_placement]
-    length = float(sum(np.linalg.norm(frame[:3, 3]) for frame in frames))
     table = observed.table
+    sliding = np.array([joint.kind == "prismatic" for joint in model.chain.joints], dtype=bool)
+    tool = max((np.linalg.norm(m) for m in model.cell.tool.markers.values()), default=0.0)
+    length = float(sum(np.linalg.norm(frame[:3, 3]) for frame in frames) + tool)
+    length += float(np.ptp(table.q[:, sliding], axis=0).sum()) if len(table) else 0.0
     far = 0.0 if table.position is None else float(np.abs(table.position).max())
     lengths = np.array([p.unit == "m" for p in model.parameters], dtype=bool)
     beyond = np.flatnonzero(lengths & ~(np.abs(x) <= LARGEST * (length + far)))

@@ -342,7 +342,7 @@ def connect(address: str, way: Way | None = None) -> Any:
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
             f"{option('cluster', where)}: no scheduler answers ({error}); check the address, or "
-            "start one with: dask scheduler --host 127.0.0.1"
+            "start one for this host alone: dask scheduler"
         ) from None
     try:
         found = client.run(_version)
