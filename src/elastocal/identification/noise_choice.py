@@ -258,10 +258,10 @@ class _Choice:
             self.attempt(kind, lasting)
         if not self.best[1].time:
             return
-        lasting = self.best[2].structure.lasting
+        found = self.best[2].structure.lasting
         for less in (kind._replace(shared=False), kind._replace(joints="")):
             if less != kind:
-                self.attempt(less, lasting)
+                self.attempt(less, found)
 
     def p_value(self, part: str) -> float:
         """Of there being none of a part of the noise that the best model lacks."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -545,6 +545,7 @@ def joint_effects(sets: RepeatSets, each: bool) -> tuple[SharedEffect, ...]:
     if record is None:
         return ()
     seen = np.abs(record.motion).max(axis=(0, 1, 2), initial=0.0) > ALIKE
+    groups: list[tuple[str, tuple[int, ...]]]
     if each:
         groups = [(f"joint{j + 1}", (int(j),)) for j in np.flatnonzero(seen)]
     else:
@@ -581,7 +582,7 @@ def with_drift(structure: Structure, lasting: float) -> Structure:
     held = np.concatenate([np.zeros((k, size, p)), np.eye(k * size).reshape(k, size, -1)], axis=2)
     none = np.zeros((k, size, size))
 
-    def tailed(values: Array, tail: Array) -> Array:
+    def tailed(values: Any, tail: Any) -> Any:
         return np.concatenate([values, tail])
 
     # A new configuration for each, so that it is correlated with nothing.

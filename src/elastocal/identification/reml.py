@@ -539,7 +539,8 @@ def score_test(
 def score_test_of_columns(fit: Reml, F: Array) -> float:
     """p-value of V_k = FFᵀ not being part of the covariance; F (C, size, q) of the fit's sets."""
     state = fit.state
-    white, across, right = [], 0.0, 0.0
+    q = F.shape[2]
+    white, across, right = [], np.zeros((len(state.x), q)), np.zeros(q)
     for w in state.whitened:
         own = w.inverse @ F[w.stack.sets].reshape(len(w.B), -1, F.shape[2])
         white.append(own)
