@@ -158,7 +158,6 @@ OPTIONS = {
     "target that is no number": (("--target", "nan"), 2, ("--target", "positive", "nan")),
     "target and number of poses": (("--target", "9", "--poses", "4"), 2, ("--poses 4", "drop one")),
     "program": (("--program", "{}/moves.txt"), 2, ("moves.txt", ".src for KUKA KRL", ".script")),
-    "name of a program": (("--program", "{}/1 move.src"), 2, ("--program .*1 move.src", "letter")),
     "picture": (("--picture", "{}/poses.jpg"), 2, ("poses.jpg", ".png or .svg")),
     "folder of the picture": (("--picture", "{}/none/poses.png"), 2, ("does not exist", "create")),
     "two outputs of one name": (
