@@ -22,6 +22,7 @@ from elastocal.identification.noise_choice import (
     settle,
     weights_of,
 )
+from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_fit
@@ -29,7 +30,8 @@ from elastocal.identification.smooth_fit import fit_smooth, with_functions_free
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.solve import Problem, Solution, fit_kept, held_at_bounds, heldout_of
 from elastocal.identification.weighted_problem import Weights
-from elastocal.model.observations import subset
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations, subset
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # The default method: noise estimated from the residuals, faulty readings judged by that noise.
@@ -69,23 +71,24 @@ def _settled(
     every: Solution, start: Solution, good: BoolArray | None, kind: str, progress: Progress
 ) -> Adapted:
     """The noise and the fit in turn, from `start`; all observations where `good` is None."""
+    asked = "auto" if kind == OF_READINGS else kind
     problem, kept = every.problem, start.reduction.kept
     model, observed = problem.model, problem.observations
     solution, everything = start, np.ones(len(observed.lead), dtype=bool)
-    readings = linearised(model, observed, start.fit.x, kept)
+    readings = _linearised(model, observed, start.fit.x, kept, kind)
     now = everything if good is None else outlier_screening(readings, readings.e, good)
     for _ in range(ROUNDS):
         before = now
         if good is None:
             # So many faulty readings look like anything that scatters or drifts.
-            plain = replace(readings, visits=None) if kind == "auto" else readings
-            noise = estimate_noise(plain, kind)
+            plain = replace(readings, visits=None) if asked == "auto" else readings
+            noise = estimate_noise(plain, asked)
         else:
-            noise, now = settle(readings, kind, now)
+            noise, now = settle(readings, asked, now)
         progress(f"fitting with the noise found ({noise.kind})")
         expected = solution.fit.x[kept] + noise.x
         solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
-        readings = linearised(model, observed, solution.fit.x, kept)
+        readings = _linearised(model, observed, solution.fit.x, kept, kind)
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
         if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
             break
@@ -94,6 +97,16 @@ def _settled(
     final = estimate_noise(fitted, noise.kind, noise)
     final = replace(final, trials=noise.trials, reason=noise.reason, tests=noise.tests)
     return solution, final, now
+
+
+OF_READINGS = "auto, of readings"  # the best noise model but those that know the arm's visits
+
+
+def _linearised(
+    model: Model, observed: Observations, x: Array, kept: IntArray, kind: str
+) -> Readings:
+    readings = linearised(model, observed, x, kept)
+    return replace(readings, visits=None) if kind == OF_READINGS else readings
 
 
 def refined(
@@ -242,11 +255,37 @@ def _reml(
     options: Options,
     progress: Progress,
 ) -> MethodResult:
-    solution, noise, good = _adapted(every, sound, faulty, refit, options.noise, progress)
-    if not good.all() and not _set_aside(~good, options):
-        solution, noise, _ = _settled(every, every, None, options.noise, progress)
+    def found(kind: str) -> Adapted:
+        solution, noise, good = _adapted(every, sound, faulty, refit, kind, progress)
+        if not good.all() and not _set_aside(~good, options):
+            solution, noise, _ = _settled(every, every, None, kind, progress)
+        return solution, noise, good
+
+    solution, noise, good = found(options.noise)
+    warnings: tuple[str, ...] = ()
+    if options.noise == "auto" and Kind.of(noise.kind).by_visit:
+        # What the model lacks looks like scatter of the joints as well.  That is no noise: weights
+        # which make light of it let the fit go where poses left out are predicted worse.
+        progress("comparing with noise of the readings alone")
+        plain = found(OF_READINGS)
+        if _held_out_rms(solution) > WORSE * _held_out_rms(plain[0]):
+            solution, noise, good = plain
+            warnings = (LACKING,)
     intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
-    return MethodResult("reml", solution, intervals, noise, good)
+    return MethodResult("reml", solution, intervals, noise, good, warnings=warnings)
+
+
+WORSE = 1.02  # held-out errors that differ by less are alike
+LACKING = (
+    "The residuals scatter from visit to visit as if joints settled anew, but with weights for "
+    "that poses left out are predicted worse: more likely the model lacks something. Run diagnose."
+)
+
+
+def _held_out_rms(solution: Solution) -> float:
+    """Root mean square length in m of what poses left out are off by."""
+    known = solution.heldout[np.isfinite(solution.heldout)]
+    return float(np.sqrt(np.mean(known**2)))
 
 
 def _published(
