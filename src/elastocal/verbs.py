@@ -705,9 +705,11 @@ def _names(name: str, given: str | Sequence[str]) -> tuple[str, ...]:
 def _whole(name: str, given: Any, least: int | None = None) -> int:
     whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
     more = "" if least is None else f", {least} or more"
+    if whole and abs(given) > MOST:
+        more += f" and at most {MOST:,}"
     require(
         whole and (least is None or given >= least) and abs(given) <= MOST,
-        f"{option(name)} takes a whole number{more} and at most {MOST:,}; found {quoted(given)}",
+        f"{option(name)} takes a whole number{more}; found {quoted(given)}",
     )
     return int(given)
 
