@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -404,26 +404,46 @@ def completed(data: NoisyData, found: FittedSum, components: Sequence[Component]
             kinds.setdefault(c.effect.name, []).append(c)
     for _ in range(COMPLETED):
         present = Counter(c.effect.name for c in found.components)
+        taken = {id(c) for c in found.components}
+        away = {n: [c for c in own if id(c) not in taken] for n, own in kinds.items()}
+        shown = _kinds_that_show(found, away)
         better = None
-        for name, own in kinds.items():
-            away = [c for c in own if not any(c is other for other in found.components)]
-            if not away:
-                continue
+        for name, more in away.items():
             for instead in (None, *(n for n in kinds if n != name and present[n])):
                 gone = [c for c in found.components if c.effect.name == instead]
-                alike = {c.family for c in gone} & {c.family for c in own}
-                if (instead is None and not present[name]) or (gone and not alike):
+                alike = {c.family for c in gone} & {c.family for c in more}
+                if not more or (gone and not alike) or (instead is None and name not in shown):
                     continue
-                fitted = _exchanged(data, found, gone, away, refit_noise=False)
+                fitted = _exchanged(data, found, gone, more, refit_noise=False)
                 if fitted.score > (found if better is None else better).score + GAINED:
                     better = fitted
         if better is None:
-            break
+            # What a kind does at all joints counts as their scatter as long as it is not there.
+            hidden = (more for name, more in away.items() if more and more[0].family in OF_JOINTS)
+            fits = (_exchanged(data, found, [], more) for more in hidden)
+            better = max(fits, key=lambda fit: fit.score, default=found)
+            if better.score <= found.score + GAINED:
+                break
         found = fit_sum(data, better.components, better.noise, better.sizes)
     return found
 
 
 COMPLETED = 3
+OF_JOINTS = ("angle", "move")
+
+
+def _kinds_that_show(found: FittedSum, away: Mapping[str, list[Component]]) -> set[str]:
+    """Kinds that are in the sum at other places, or whose evidence at all of these together is more
+    than what their being there costs."""
+    every = [c for own in away.values() for c in own]
+    beside = Beside(found, [c.columns for c in every])
+    each = dict(zip(map(id, every), beside.evidence(slice(0, 0), beside.spans), strict=True))
+    shown = {c.effect.name for c in found.components}
+    for name, own in away.items():
+        gains = [each[id(c)] for c in own if each[id(c)] > 0]
+        if gains and sum(gains) > presence_cost(own[0].fellows, len(gains)):
+            shown.add(name)
+    return shown
 
 
 def _with_together(dataset: DiagnosisData) -> DiagnosisData:
