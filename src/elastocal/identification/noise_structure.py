@@ -418,16 +418,23 @@ class Kind(NamedTuple):
     time: bool = False
 
     @classmethod
-    def of(cls, name: str) -> Kind:
-        """That of a name, as "axis+configuration+joints+time"; InputError where there is none."""
+    def parsed(cls, name: str) -> Kind:
+        """The parts that a name has, as "axis+configuration+joints+time", known or not."""
         rest, time = name.removesuffix(TIME), name.endswith(TIME)
         joints = next((part for part in (EACH, JOINTS) if rest.endswith(part)), "")
         rest = rest.removesuffix(joints)
+        return cls(rest.removesuffix(SHARED), rest.endswith(SHARED), joints, time)
+
+    @classmethod
+    def of(cls, name: str) -> Kind:
+        """The same; InputError where there is no such noise model."""
+        found = cls.parsed(name)
+        rest = found.own + SHARED * found.shared
         if rest not in noise_models() or (rest == "auto" and rest != name):
             raise InputError(
                 f"there is no noise model '{name}'{did_you_mean(rest, noise_models())}"
             )
-        return cls(rest.removesuffix(SHARED), rest.endswith(SHARED), joints, time)
+        return found
 
     @property
     def name(self) -> str:

@@ -331,7 +331,7 @@ def candidate_rows(noise: Noise) -> list[tuple[str, str, str]]:
 
 
 def kind_in_words(kind: str) -> str:
-    parts = Kind.of(kind)
+    parts = Kind.parsed(kind)
     own = parts.own
     known = KINDS | {name: model.description for name, model in REGISTERED.items()}
     text = printable(known.get(own, own))
