@@ -309,8 +309,8 @@ def test_other_encodings_and_absurd_texts_are_refused(refusal, text):
     refusal(text)
 
 
-def test_a_file_beyond_5_mb_is_refused(refusal):
-    assert "5 MB" in refusal("#" * 5_000_001)
+def test_a_file_beyond_1_mb_is_refused(refusal):
+    assert "1 MB" in refusal("#" * 1_000_001)
 
 
 @pytest.mark.parametrize("name", ["absent.toml", "", "a\0b", "x" * 5000])

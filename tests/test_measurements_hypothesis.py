@@ -29,6 +29,8 @@ HEADER = "q1_rad,q2_rad,x_m,y_m,z_m\n"
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 POSITIVE = st.floats(min_value=1e-300, max_value=1e300)
 LABEL = st.text(max_size=8).filter(is_label)
+# Of a load: none, or what an arm may carry; less than a micronewton is read as none.
+FORCE = st.just(0.0) | st.floats(1e-3, 1e7) | st.floats(-1e7, -1e-3)
 COLUMNS = [c for f in families(KINDS).values() for stem in f.units for c in f.columns(stem)]
 
 
@@ -146,7 +148,7 @@ def tables(draw):
         repeat=draw(arrays(np.int64, n, elements=st.integers(-(2**53), 2**53))),
         marker=draw(arrays(np.int64, n, elements=st.integers(0, len(markers) - 1))),
         marker_names=markers,
-        force=block(3),
+        force=block(3, FORCE),
         position=block(3),
         rotation=maybe(3),
         distance=maybe(None, POSITIVE),

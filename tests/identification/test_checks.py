@@ -212,7 +212,7 @@ def test_everything_fixed_leaves_nothing(model):
 
 def test_a_model_without_parameters_is_refused():
     bare = Model.assembled(planar_chain(), cell_of(()))
-    with pytest.raises(InputError, match="nothing is left to identify: choose effects"):
+    with pytest.raises(InputError, match="nothing is left to identify; choose effects"):
         identify(bare, table_for(bare))
 
 

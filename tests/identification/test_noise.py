@@ -187,7 +187,7 @@ def test_distances_and_poses_need_their_own_sigma():
         (np.eye(35), r"the covariance is \(35, 35\), but there are 36 rows"),
         (np.eye(36) + np.eye(36, k=1), "must be finite and symmetric"),
         (np.diag([np.nan, *np.ones(35)]), "must be finite and symmetric"),
-        (np.diag([-1.0, *np.ones(35)]), "not positive definite; check sigmas and covariance"),
+        (np.diag([-1.0, *np.ones(35)]), "not positive definite; check what states it"),
         (np.ones((36, 36)), "not positive definite"),
     ],
 )
@@ -199,7 +199,7 @@ def test_a_wrong_covariance_is_refused(matrix, message):
 def test_a_zero_sigma_is_refused():
     table = with_sigma(some_table(), "cartesian")
     table.sigma[3, 1] = 0.0
-    with pytest.raises(InputError, match="not positive definite; check sigmas"):
+    with pytest.raises(InputError, match="not positive definite; check what states it"):
         weights_for(observe(table, "position"), AXIS)
 
 

@@ -9,11 +9,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, option, require
 from elastocal.identification.visit_record import VisitRecord
 from elastocal.measurements import Measurements
 from elastocal.plugin_loader import check_registered, same_class
-from elastocal.text import did_you_mean
+from elastocal.text import did_you_mean, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
 # Residuals and B per reading, with the labels that say what readings have in common.
@@ -432,7 +432,8 @@ class Kind(NamedTuple):
         rest = found.own + SHARED * found.shared
         if rest not in noise_models() or (rest == "auto" and rest != name):
             raise InputError(
-                f"there is no noise model '{name}'{did_you_mean(rest, noise_models())}"
+                f"{option('noise')} takes one of {', '.join(noise_models())}, with {JOINTS}, "
+                f"{EACH} or {TIME} after it; found {quoted(name)}{did_you_mean(rest, noise_models())}"
             )
         return found
 
