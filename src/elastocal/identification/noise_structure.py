@@ -433,7 +433,8 @@ class Kind(NamedTuple):
         if rest not in noise_models() or (rest == "auto" and rest != name):
             raise InputError(
                 f"{option('noise')} takes one of {', '.join(noise_models())}, with {JOINTS}, "
-                f"{EACH} or {TIME} after it; found {quoted(name)}{did_you_mean(rest, noise_models())}"
+                f"{EACH} or {TIME} after it; found {quoted(name)}"
+                f"{did_you_mean(rest, noise_models())}"
             )
         return found
 
