@@ -164,7 +164,7 @@ def estimate_noise(
 # worth the fits: a part that a test at this level does not find changes no interval.
 TRACE = 0.05
 MOST_TOGETHER = 300  # rows of a configuration, whose covariance is formed
-FEWEST_VISITS = 8
+FEWEST_VISITS, SEVERAL = 8, 2
 LASTING = (0.2, 0.05, 0.8)  # correlation times tried, as shares of the campaign
 TESTED = 0.2  # the one of them that a drift is looked for with
 
@@ -192,7 +192,8 @@ class _Choice:
         if self.best[1].shared:
             self.attempt(self.best[1]._replace(shared=False))
         if self._knows_visits():
-            self._with_joints(names[0])
+            if self._sees_joints():
+                self._with_joints(names[0])
             if self.readings.visits is not None and self.readings.visits.drifts:
                 self._with_time(names[0])
         _, kind, fit = self.best
@@ -227,6 +228,14 @@ class _Choice:
             return False
         together = np.unique(self.readings.configuration, return_counts=True)[1]
         return int(together.max()) * self.readings.size <= MOST_TOGETHER
+
+    def _sees_joints(self) -> bool:
+        """Are there mostly several readings to a visit?  A single one tells the joints' scatter
+        from its own noise by nothing but how both change from pose to pose, as the model's own
+        errors do."""
+        assert self.readings.visits is not None
+        own = self.readings.visits.visit
+        return bool(np.median(np.unique(own[own >= 0], return_counts=True)[1]) >= SEVERAL)
 
     def _plain(self, first: str) -> list[str]:
         """Structures to add to: the best one, and the `first` one where that has a prior."""

@@ -162,5 +162,5 @@ def test_readings_without_visits_have_neither():
     assert estimate_noise(r).tests == ()
     with pytest.raises(InputError, match="visits"):
         estimate_noise(r, "independent+joints")
-    with pytest.raises(InputError, match="no noise model"):
+    with pytest.raises(InputError, match="takes one of"):
         estimate_noise(r, "axis+sometimes")
