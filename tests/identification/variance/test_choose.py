@@ -117,7 +117,7 @@ def test_description_mentions_only_what_was_found():
 
 
 def test_an_unknown_kind_is_refused_with_the_nearest_name():
-    with pytest.raises(InputError, match=r"no noise model 'axes'.*did you mean 'axis'"):
+    with pytest.raises(InputError, match=r"found 'axes'.*did you mean 'axis'"):
         estimate_noise(readings(BASE, 0), "axes")
 
 
