@@ -10,8 +10,11 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cells import kr270_cell
 from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 
+from elastocal.cell.arm_description import Nominal
+from elastocal.cell.work_cell import Cell
 from elastocal.model import Chain, nominal_flange, read_urdf
 
 
@@ -42,6 +45,18 @@ class Reference:
     def gravity_torques(self, q: np.ndarray) -> np.ndarray:
         tau = pin.computeGeneralizedGravity(self.model, self.data, self.configuration(q))
         return np.array([tau[self.model.joints[i].idx_v] for i in self.ids])
+
+
+def standing_arm(tmp_path: Path, seed: int) -> tuple[Chain, Cell, Reference]:
+    """A random arm, a cell where it stands as its file says, and pinocchio's."""
+    text = random_chain_urdf(seed)
+    path = tmp_path / "chain.urdf"
+    path.write_text(text)
+    chain = read_urdf(path, base="base", flange="flange")
+    reference = Reference(pin.buildModelFromXML(text), chain, "base", "flange")
+    reference.T_base_flange(np.zeros(chain.n_joints))
+    standing = np.array(reference.data.oMf[reference.base].rotation)
+    return chain, kr270_cell(nominal=Nominal(base_rotation=standing)), reference
 
 
 def gravity_torques(chain: Chain, gravity: np.ndarray):

@@ -14,7 +14,7 @@ from scipy import linalg
 from scipy.special import expit, softmax
 
 from elastocal.diagnosis.component_search import Rivals
-from elastocal.diagnosis.components import Component, FittedSum, presence_cost
+from elastocal.diagnosis.components import Component, FittedSum, presence_cost, side_by_side
 from elastocal.diagnosis.diagnosis import (
     ComponentShare,
     Curve,
@@ -68,8 +68,7 @@ class SumAnswer:
     def _wide(self) -> NoisyData:
         """The data of the sum with the columns of what is hidden last."""
         data = self.found.data
-        columns = [np.zeros((*data.r.shape, 0)), *(data.masked(c.columns) for c in self.hidden)]
-        extra = np.concatenate(columns, axis=2)
+        extra = side_by_side(data, [data.masked(c.columns) for c in self.hidden])
         return data.with_columns(extra, np.ones(extra.shape[2]))
 
     @cached_property

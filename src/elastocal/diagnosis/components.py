@@ -333,7 +333,7 @@ class SumOfComponents:
         return out
 
 
-def _joined(data: NoisyData, columns: Sequence[Array]) -> Array:
+def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
     """Columns (C, m, Σ k) side by side; none where there are none."""
     return np.concatenate([np.zeros((*data.r.shape, 0)), *columns], axis=2)
 
@@ -408,7 +408,7 @@ class FittedSum:
     @cached_property
     def data(self) -> NoisyData:
         """The data with the components' columns and their prior precisions."""
-        columns = _joined(self.plain, [self.plain.masked(c.columns) for c in self.components])
+        columns = side_by_side(self.plain, [self.plain.masked(c.columns) for c in self.components])
         return self.plain.with_columns(columns, 1 / self.variances)
 
     @cached_property
@@ -439,7 +439,7 @@ class FittedSum:
             shown for c, shown in zip(self.components, self._shown, strict=True)
             if not any(c is other for other in some)
         ]  # fmt: skip
-        joined = _joined(self.plain, columns)
+        joined = side_by_side(self.plain, columns)
         return self.plain.with_columns(joined, np.ones(joined.shape[2]))
 
 
@@ -523,7 +523,7 @@ def _noise_beside(
         _compressed(some.masked(c.columns[::step]), np.exp(2 * s) * c.shares(length)[0], root)
         for c, s, length in zip(components, at.size, at.length, strict=True)
     ]
-    joined = _joined(some, columns)
+    joined = side_by_side(some, columns)
     wide = some.with_columns(joined, np.ones(joined.shape[2]))
     # From next to nothing the likelihood is flat in a joint's logarithm, and no climb leaves.
     usual = NoiseValues.usual(len(noise.joint)).joint

@@ -80,9 +80,7 @@ def _settled(
     for _ in range(ROUNDS):
         before = now
         if good is None:
-            # So many faulty readings look like anything that scatters or drifts.
-            plain = replace(readings, visits=None) if asked == "auto" else readings
-            noise = estimate_noise(plain, asked)
+            noise = estimate_noise(readings, asked)
         else:
             noise, now = settle(readings, asked, now)
         progress(f"fitting with the noise found ({noise.kind})")
@@ -258,7 +256,9 @@ def _reml(
     def found(kind: str) -> Adapted:
         solution, noise, good = _adapted(every, sound, faulty, refit, kind, progress)
         if not good.all() and not _set_aside(~good, options):
-            solution, noise, _ = _settled(every, every, None, kind, progress)
+            # So many faulty readings look like anything that scatters or drifts.
+            plainly = OF_READINGS if kind == "auto" else kind
+            solution, noise, _ = _settled(every, every, None, plainly, progress)
         return solution, noise, good
 
     solution, noise, good = found(options.noise)

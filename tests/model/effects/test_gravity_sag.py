@@ -6,17 +6,15 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 import pytest
 from model.effects.stick import model, positions, rows, stick
-from model.test_agreement_with_pinocchio import Reference, random_configurations
+from model.test_agreement_with_pinocchio import random_configurations, standing_arm
 from scipy.spatial.transform import Rotation
 from support.cells import kr270_cell, kr270_chain, random_table
-from support.robots import random_chain_urdf
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
-from elastocal.model import Arm, Chain, Model, read_urdf
+from elastocal.model import Arm, Chain, Model
 from elastocal.model.effects.gravity_sag import GravitySag
 from elastocal.units import Array
 
@@ -35,14 +33,7 @@ def functions(chain: Chain, cell: Cell, place: str, q: Array) -> Array:
 @pytest.mark.parametrize("seed", range(8))
 def test_the_torques_of_any_weights_are_sums_of_them(tmp_path: Path, seed: int) -> None:
     """Masses, branches, prismatic joints and tilted bases, weighed by pinocchio."""
-    text = random_chain_urdf(seed)
-    path = tmp_path / "chain.urdf"
-    path.write_text(text)
-    chain = read_urdf(path, base="base", flange="flange")
-    reference = Reference(pin.buildModelFromXML(text), chain, "base", "flange")
-    reference.T_base_flange(np.zeros(chain.n_joints))
-    standing = np.array(reference.data.oMf[reference.base].rotation)
-    cell = kr270_cell(nominal=Nominal(base_rotation=standing))
+    chain, cell, reference = standing_arm(tmp_path, seed)
     q = random_configurations(chain, 160, seed)
     torques = np.array([reference.gravity_torques(each) for each in q])
     for place in SAG.places(chain, cell):

@@ -6,16 +6,14 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 import pytest
 from model.effects.stick import model, positions, rows, stick
-from model.test_agreement_with_pinocchio import Reference, random_configurations
+from model.test_agreement_with_pinocchio import random_configurations, standing_arm
 from support.cells import kr270_cell, kr270_chain, random_table
-from support.robots import random_chain_urdf
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
-from elastocal.model import Arm, Chain, Model, read_urdf
+from elastocal.model import Arm, Chain, Model
 from elastocal.model.effects.gravity_sag import LinkWeights
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.units import Array
@@ -39,14 +37,7 @@ def test_one_set_of_moments_makes_the_torques_of_any_weights_about_all_joints(
     tmp_path: Path, seed: int
 ) -> None:
     """Masses, branches, prismatic joints and tilted bases, weighed by pinocchio."""
-    text = random_chain_urdf(seed)
-    path = tmp_path / "chain.urdf"
-    path.write_text(text)
-    chain = read_urdf(path, base="base", flange="flange")
-    reference = Reference(pin.buildModelFromXML(text), chain, "base", "flange")
-    reference.T_base_flange(np.zeros(chain.n_joints))
-    standing = np.array(reference.data.oMf[reference.base].rotation)
-    cell = kr270_cell(nominal=Nominal(base_rotation=standing))
+    chain, cell, reference = standing_arm(tmp_path, seed)
     q = random_configurations(chain, 80, seed)
     weighed = -np.array([reference.gravity_torques(each) for each in q])
     D = torques(chain, cell, q)
