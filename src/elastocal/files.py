@@ -18,8 +18,9 @@ from typing import Any, BinaryIO, TextIO
 
 from elastocal.errors import InputError
 
-# What is being written ends so; a process that was killed leaves it.
+# What is being written ends so.  A process that was killed leaves it, no longer locked.
 UNFINISHED = ".tmp"
+_TAKEN_AT_RANDOM = r"\.[0-9a-f]{8}"
 # Lists and tables within each other, and parts of a dotted key: a file that people write has six.
 # tomllib takes time and memory that grow with the square of them.
 DEEPEST = 32
@@ -32,6 +33,8 @@ _TOKEN = re.compile(
     re.DOTALL,
 )
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
+# No link is followed, no pipe waited for; on Windows bytes are taken as they are.
+HOW_TO_OPEN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
 
 
 def check_regular(path: str | Path, what: str) -> int:
@@ -221,9 +224,10 @@ def atomic_binary_writer(path: str | Path) -> Iterator[BinaryIO]:
         yield handle
 
 
-# While `together` runs: the files that it holds back, and what is written of them so far.
+# While `together` runs: the files that it holds back, and what is written of them so far, with the
+# descriptor that locks it.
 _held: set[Path] = set()
-_written: list[tuple[Path, Path]] = []
+_written: list[tuple[Path, Path, int | None]] = []
 
 
 @contextmanager
@@ -235,20 +239,72 @@ def together(paths: Iterable[str | Path]) -> Iterator[None]:
     _held.update(_final(path) for path in paths)
     try:
         yield
-        for temporary, target in _written:
+        for temporary, target, _ in _written:
             with _write_errors(target):
                 os.replace(temporary, target)
     finally:
-        for temporary, _ in _written:
+        for temporary, _, lock in _written:
             with suppress(OSError):
                 temporary.unlink()
+            _unlock(lock)
         _held.clear()
         _written.clear()
 
 
-def temporary_beside(path: Path) -> Path:
-    """A hidden name of its own in the folder of `path`, for what is not finished."""
-    return path.with_name(f".{path.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}")
+def _begun(target: Path) -> tuple[Path, int | None]:
+    """A hidden empty file of its own beside `target`, and the descriptor that locks it.
+
+    When the process ends, however it does, the system unlocks it.  None where there are no locks.
+    """
+    while True:
+        name = f".{target.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}"
+        temporary = target.with_name(name)
+        lock = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        locked = _locked(lock, wait=True)
+        # Somebody who sweeps may have had it before it was locked.
+        if locked and os.fstat(lock).st_nlink:
+            return temporary, lock
+        os.close(lock)
+        if not locked:
+            return temporary, None
+
+
+def _locked(descriptor: int, wait: bool = False) -> bool | None:
+    """Lock the file; False where another process has it, None where the system has no locks."""
+    try:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        return None
+    return True
+
+
+def _unlock(descriptor: int | None) -> None:
+    if descriptor is not None:
+        os.close(descriptor)
+
+
+def remove_abandoned(folder: Path, name: str) -> None:
+    """Remove what killed processes left in `folder` of files whose names match the pattern `name`.
+
+    That is a regular file of the user's own, named as unfinished ones are, that no process locks.
+    """
+    known = re.compile(rf"\.{name}{_TAKEN_AT_RANDOM}{re.escape(UNFINISHED)}", re.DOTALL)
+    for path in folder.iterdir():
+        if not known.fullmatch(path.name):
+            continue
+        with suppress(OSError):
+            descriptor = os.open(path, os.O_RDWR | HOW_TO_OPEN)
+            try:
+                found = os.fstat(descriptor)
+                own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+                if own and stat.S_ISREG(found.st_mode) and _locked(descriptor):
+                    path.unlink()
+            finally:
+                os.close(descriptor)
 
 
 def _final(path: str | Path) -> Path:
@@ -268,22 +324,29 @@ def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
                 yield device
             return
         target = _final(target)
-        temporary = temporary_beside(target)
+        with suppress(OSError):
+            remove_abandoned(target.parent, re.escape(target.name[:40]))
+        temporary, lock = _begun(target)
+        kept = False
         try:
-            with open(temporary, f"x{binary}", **options) as handle:
+            with open(temporary, f"w{binary}", **options) as handle:
                 if target.exists():  # what others may not read they may not read afterwards
                     os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
                 yield handle
                 handle.flush()
                 os.fsync(handle.fileno())
             if target in _held:
-                _written.append((temporary, target))
+                _written.append((temporary, target, lock))
+                kept = True
             else:
                 os.replace(temporary, target)
         except BaseException:
             with suppress(OSError):
                 temporary.unlink()
             raise
+        finally:
+            if not kept:
+                _unlock(lock)
 
 
 @contextmanager

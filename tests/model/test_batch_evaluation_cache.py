@@ -127,12 +127,12 @@ def test_pruning_leaves_files_of_others_alone(
 
 def test_abandoned_parts_are_removed(folder: Path) -> None:
     folder.mkdir(mode=0o700)
-    old, new = folder / f".{KEY}.old.tmp", folder / f".{KEY}.new.tmp"
-    for path in (old, new):
+    others = [folder / ".thesis.0123abcd.tmp", folder / f".{KEY}.old.tmp"]
+    left = folder / f".{KEY}.0123456.0123abcd.tmp"
+    for path in (*others, left):
         path.write_bytes(b"half")
-    os.utime(old, (0, 0))
-    store(KEY, ".bin", b"content")
-    assert not old.exists() and new.exists()
+    store(content_key("another"), ".bin", b"content")
+    assert not left.exists() and all(path.exists() for path in others)
 
 
 # --- where it is ---------------------------------------------------------------------------

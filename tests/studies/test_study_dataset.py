@@ -62,7 +62,7 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
 
 
 def test_what_a_killed_run_left_half_written_is_removed(folder, results):
-    left = results / ".part-000002.parquet.tmp"
+    left = results / ".part-000002.parquet.0123abcd.tmp"
     left.write_bytes(b"PAR1")
     assert run_study(folder, results).complete
     assert not left.exists()

@@ -45,7 +45,7 @@ from elastocal.diagnosis.verdict import (
     warnings,
 )
 from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.files import atomic_write_text, temporary_beside
+from elastocal.files import atomic_writer
 from elastocal.identification.findings import BudgetStep
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.start import check_table
@@ -92,16 +92,11 @@ def write_extended_cell(
     if found:
         _switch_on(data.setdefault("model", {}), found)
         data["model"] |= dict(model_keys or {})
-    text = tomli_w.dumps(data)
-    # Read before it appears: a cell that cannot be read is not left behind.
-    trial = temporary_beside(target)
-    try:
-        atomic_write_text(trial, text)
-        cell = replace(read_cell(trial), path=target)
-    finally:
-        trial.unlink(missing_ok=True)
-    atomic_write_text(target, text)
-    return cell
+    with atomic_writer(target) as handle:
+        handle.write(tomli_w.dumps(data))
+        handle.flush()
+        # Read before it appears: a cell that cannot be read is not left behind.
+        return replace(read_cell(handle.name), path=target)
 
 
 def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:

@@ -7,7 +7,6 @@ import os
 import re
 import stat
 import sys
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -16,7 +15,7 @@ from pathlib import Path
 import casadi as ca
 
 from elastocal.errors import InputError
-from elastocal.files import UNFINISHED, atomic_write_bytes
+from elastocal.files import HOW_TO_OPEN, atomic_write_bytes, remove_abandoned
 
 # A function of a table's rows: as given, by content, and without repeated subexpressions.
 
@@ -89,9 +88,6 @@ def row_by_row(sparsity: ca.Sparsity) -> list[int]:
 # Part of every key: raise it when the meaning of an entry changes.
 FORMAT = "1"
 LARGEST_TOTAL = 200_000_000  # bytes
-# No link is followed, no pipe waited for; on Windows bytes are taken as they are.
-HOW_TO_OPEN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
-ABANDONED = 3600.0  # s; a temporary file this old belongs to a process that died
 
 
 def content_key(*parts: str | bytes) -> str:
@@ -202,13 +198,11 @@ def prune(folder: Path, keep: Path, largest: int | None = None) -> None:
     """Remove the least recently used entries beyond `largest` bytes, and abandoned parts."""
     largest = LARGEST_TOTAL if largest is None else largest
     entries = []
+    remove_abandoned(folder, r"[0-9a-f]{32}\..{,7}")  # the first 40 letters of an entry's name
     for path in folder.iterdir():
         with suppress(OSError):
             facts = path.stat()
-            if path.suffix == UNFINISHED and _is_key(path.name[1:33]):
-                if time.time() - facts.st_mtime > ABANDONED:
-                    path.unlink()
-            elif _is_entry(path) and path != keep:
+            if _is_entry(path) and path != keep:
                 entries.append((facts.st_mtime, facts.st_size, path))
             elif path == keep:
                 largest -= facts.st_size

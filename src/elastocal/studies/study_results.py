@@ -16,7 +16,12 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 from elastocal.errors import InputError, option, require
-from elastocal.files import UNFINISHED, atomic_binary_writer, atomic_write_text, read_json
+from elastocal.files import (
+    atomic_binary_writer,
+    atomic_write_text,
+    read_json,
+    remove_abandoned,
+)
 from elastocal.screen import shown
 from elastocal.studies.study_folder import Outcome, Study
 
@@ -286,8 +291,7 @@ def opened(folder: Path) -> Iterator[StudyResults]:
                 f"{folder}: another run of the study is writing there; wait for it, or name "
                 f"another folder with {option('output', 'NEW')}"
             ) from None
-        for left in folder.glob(f".part-*{UNFINISHED}"):
-            left.unlink(missing_ok=True)
+        remove_abandoned(folder, r"part-.*")
         yield StudyResults(folder)
 
 
