@@ -98,9 +98,14 @@ def shown(text: str) -> str:
 def say(text: str, error: bool = False, end: str = "\n") -> None:
     """Show `text` on stdout, or on stderr where it tells of an `error`."""
     stream = sys.stderr if error else sys.stdout
-    if stream is not None:
+    if stream is None:
+        return
+    try:
         stream.write(shown(text) + end)
         stream.flush()
+    except OSError:
+        if not error:  # where stderr is full there is nobody to tell
+            raise
 
 
 def complain(message: str) -> None:

@@ -96,7 +96,23 @@ def test_streams_that_are_closed_or_full(campaign, tmp_path, shell, code):
     assert b"Traceback" not in done.stderr and b"Exception" not in done.stderr
     assert result.stat().st_size > 1000  # written before anything is told
     if code:
-        assert b"No space left on device" in done.stderr
+        assert done.stderr == b"elastocal: standard output: No space left on device\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "shell", "code"),
+    [
+        (("identify", "--help"), '"$@" > /dev/full', 2),
+        (("--version",), '"$@" > /dev/full', 2),
+        (("nosuch",), '"$@" 2> /dev/full', 2),
+        (("identify", "absent.toml", "absent.csv"), '"$@" 2> /dev/full', 2),
+    ],
+)
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_help_and_messages_where_a_stream_is_full(campaign, words, shell, code):
+    done = elastocal(campaign, *words, shell=shell)
+    full = b"elastocal: standard output: No space left on device\n"
+    assert (done.returncode, done.stderr) == (code, b"" if "2>" in shell else full)
 
 
 def test_a_wheel_runs_outside_the_checkout(tmp_path):

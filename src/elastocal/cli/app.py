@@ -60,6 +60,8 @@ class InOrder(TyperGroup):
             code = super().main(*args, **extra)
         except (typer.Abort, KeyboardInterrupt, EOFError):
             code = INTERRUPTED
+        except OSError as error:  # of --help and --version
+            code = _unwritten(error)
         except Exception as error:
             if not hasattr(error, "show"):
                 raise
@@ -113,12 +115,8 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
         except ElastocalError as error:
             complain(str(error))
             raise typer.Exit(error.exit_code) from None
-        except BrokenPipeError:
-            # The reader of stdout went away (… | head): nothing is wrong with the input.
-            raise typer.Exit(0) from None
         except OSError as error:
-            complain(f"{error.filename or 'file'}: {error.strerror or error}")
-            raise typer.Exit(2) from None
+            raise typer.Exit(_unwritten(error)) from None
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort):
@@ -135,6 +133,16 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(code) from None
 
     return run
+
+
+def _unwritten(error: OSError) -> int:
+    """Say what the system refuses; the exit code."""
+    if isinstance(error, BrokenPipeError):
+        # The reader of stdout went away (… | head): nothing is wrong with the input.
+        return 0
+    # What reads and writes files names them; streams have no name.
+    complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+    return 2
 
 
 def console(stderr: bool = False) -> Console:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import ElastocalError, require
+from elastocal.errors import InputError, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain
@@ -408,13 +408,7 @@ class Model:
         chosen = tuple(range(len(x))) if columns is None else tuple(int(c) for c in columns)
         observed = observations or observe(table, self.observe)
         h, B = self._rows(table, x, chosen)
-        bad = np.flatnonzero(~np.isfinite(h).all(axis=1))
-        if len(bad):
-            raise ElastocalError(
-                f"{table.source}, line {table.row[bad[0]]}: no static equilibrium under this load "
-                f"({len(bad)} rows); the compliances are too large for the force: check force_*_N "
-                "and [model.nominal] joint_compliance, which is in rad/(N m)"
-            )
+        check_equilibrium(table, h)
         prediction = observed.apply(h).ravel()
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
 
@@ -432,6 +426,17 @@ class Model:
         x = self.nominal if x is None else np.asarray(x)
         inputs = row_inputs(self._symbolic.arm, table)
         return self._symbolic.function("frames")(*inputs, x, self._settle(inputs, x))
+
+
+def check_equilibrium(table: Measurements, predicted: Array) -> None:
+    """Raise InputError for the first row whose prediction (n_rows, k) is not finite."""
+    bad = np.flatnonzero(~np.isfinite(predicted).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{table.source}, line {table.row[bad[0]]}: no static equilibrium under this load "
+            f"({len(bad)} rows); the compliances are too large for the force: check force_*_N "
+            "and [model.nominal] joint_compliance, which is in rad/(N m)"
+        )
 
 
 def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from elastocal.errors import InputError, option
 from elastocal.measurements import Measurements, with_moves
 from elastocal.model.effects.compliances import JointCompliance
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
@@ -100,12 +100,12 @@ def simulate(
     n = len(rows)
     if model.observe == "distance":
         length = model.predict(replace(rows, distance=np.ones(n)), x)
-        _check_found(rows, length[:, None])
+        check_equilibrium(rows, length[:, None])
         sigma = (model.cell.tracker.distance_sigma or 0.0) if noise else 0.0
         return replace(rows, distance=length + sigma * rng.normal(size=n))
     # A pose model asks each row for the measured rotation it is compared with; any will do here.
     rotation, position = model.target_poses(replace(rows, rotation=np.zeros((n, 3))), x)
-    _check_found(rows, position)
+    check_equilibrium(rows, position)
     exact = replace(rows, position=position)
     if model.observe == "pose":
         turn = rotation
@@ -119,13 +119,3 @@ def simulate(
     covariance, _ = position_covariance(exact, model.cell.tracker, kind)
     shake = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(n, 3)))
     return replace(exact, position=position + shake)
-
-
-def _check_found(rows: Measurements, readings: Array) -> None:
-    """Raise InputError for the first row whose reading (n, k) is not finite."""
-    lost = np.flatnonzero(~np.isfinite(readings).all(axis=1))
-    if len(lost):
-        raise InputError(
-            f"{rows.source}, line {rows.row[lost[0]]}: no static equilibrium under this load; the "
-            "compliances are too large for the force"
-        )
