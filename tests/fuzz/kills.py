@@ -118,6 +118,8 @@ class Victim:
             if again.code:
                 found.append(f"the next run ends with {again.code}: {again.stderr[-300:]}")
             found += [f"after the next run: {what}" for what in self.wrong()]
+            left = [name for name in seen(self.folder) if name.endswith(".tmp")]
+            found += [f"the next run leaves {left}"] * bool(left)
         self.restore()
         return where, found
 
@@ -157,16 +159,18 @@ def _broken(name: str, content: bytes, size: int) -> str | None:
     return None
 
 
-def run_kills(base: Path, folder: Path, seed: int, kills: int, full: int) -> tuple[int, Counter]:
+def run_kills(
+    base: Path, folder: Path, seed: int, kills: int, full: int, part: slice = slice(None)
+) -> tuple[int, Counter]:
     """Kill each verb `kills` times and fill its disk `full` times; findings are printed.
 
-    A few times are of the verb's first command alone, many are of all.
+    A few times are of the verb's first command alone, many are of all.  `part` of them is run.
     """
     broken, tried = 0, Counter[tuple[str, str]]()
     for verb in KILLED:
         commands = [c for c in COMMANDS if c.verb == verb][: 1 + (kills + full) // 20]
         victims = [Victim(c, base, folder / f"kill-{verb}{i}") for i, c in enumerate(commands)]
-        for k in range(kills + full):
+        for k in range(kills + full)[part]:
             rng, victim = Random(f"{seed} {verb} {k}"), victims[k % len(victims)]
             where, found = victim.killed(rng) if k < kills else victim.refused(rng)
             tried[verb, "killed" if k < kills else "disk full"] += 1

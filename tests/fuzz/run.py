@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import pickle
+import platform
 import shutil
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from pathlib import Path
 
@@ -32,6 +35,7 @@ def main() -> int:
     parser.add_argument("--verb", action="append", default=[], help="only this verb; repeatable")
     parser.add_argument("--kills", type=int, default=0, help="kill each command so many times")
     parser.add_argument("--full", type=int, default=0, help="fill its disk so many times")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that share the work")
     parser.add_argument("--write", type=Path, help="page whose table this run replaces")
     parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
     asked = parser.parse_args()
@@ -45,16 +49,16 @@ def main() -> int:
         case = harness.run(harness.make(asked.case, base, folder / "case", tuple(asked.verb)))
         print(f"cd {case.folder}\n{case.told()}\nstdout:\n{case.stdout[-3000:]}")
         return int(bool(case.complaints))
-    tally, begun = Tally(), time.monotonic()
-    for seed in range(asked.seed, asked.seed + asked.cases):
-        if time.monotonic() - begun > asked.seconds:
-            break
-        tally.take(harness.run(harness.make(seed, base, folder / str(seed), tuple(asked.verb))))
-        shutil.rmtree(folder / str(seed), ignore_errors=True)
-    if asked.kills or asked.full:
-        found, tried = kills.run_kills(base, folder, asked.seed, asked.kills, asked.full)
-        tally.count.update(tried)
-        tally.broken += found
+    begun = time.monotonic()
+    parts = {fork(asked, base, folder, k): k for k in range(asked.jobs)}
+    tally = Tally()
+    while parts:
+        child, status = os.wait()
+        part = parts.pop(child, None)
+        if part is not None and status:
+            raise RuntimeError(f"part {part} of {asked.jobs} ended with {status}")
+        if part is not None:
+            tally.add(pickle.loads((folder / f"part{part}").read_bytes()))
     shutil.rmtree(folder, ignore_errors=True)
     print(tally.table())
     print(tally.sentence(asked.seed, time.monotonic() - begun))
@@ -65,6 +69,33 @@ def main() -> int:
         _, after = rest.split(END)
         asked.write.write_text(f"{before}{BEGIN}\n\n{told}\n{END}{after}", encoding="utf-8")
     return int(bool(tally.broken))
+
+
+def fork(asked: argparse.Namespace, base: Path, folder: Path, part: int) -> int:
+    """A process that runs every `jobs`-th case and kill, and leaves its tally in `folder`."""
+    sys.stdout.flush()
+    if child := os.fork():
+        return child
+    status = 1
+    try:
+        tally, until = Tally(), time.monotonic() + asked.seconds
+        for seed in range(asked.seed, asked.seed + asked.cases)[part :: asked.jobs]:
+            if time.monotonic() > until:
+                break
+            tally.take(harness.run(harness.make(seed, base, folder / str(seed), tuple(asked.verb))))
+            shutil.rmtree(folder / str(seed), ignore_errors=True)
+        if asked.kills or asked.full:
+            own, share = folder / f"kills{part}", slice(part, None, asked.jobs)
+            found, tried = kills.run_kills(base, own, asked.seed, asked.kills, asked.full, share)
+            tally.count.update(tried)
+            tally.broken += found
+        (folder / f"part{part}").write_bytes(pickle.dumps(tally))
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        os._exit(status)
 
 
 class Tally:
@@ -82,6 +113,13 @@ class Tally:
             self.broken += 1
             print(case.told(), flush=True)
 
+    def add(self, other: Tally) -> None:
+        """What another process has tried."""
+        self.count += other.count
+        self.broken += other.broken
+        self.slowest = max(self.slowest, other.slowest)
+        self.largest = max(self.largest, other.largest)
+
     def table(self) -> str:
         """One row per verb (Markdown)."""
         columns = ("exit 0", "exit 1", "exit 2", "killed", "disk full")
@@ -95,9 +133,10 @@ class Tally:
         cases = sum(n for (_, how), n in self.count.items() if how.startswith("exit"))
         others = self.count.total() - cases
         return (
-            f"{cases} cases from {seed} on, {others} kills and full disks: {self.broken} with a "
-            f"finding. Slowest case {self.slowest:.1f} s of processor time, largest "
-            f"{self.largest / 1e6:.0f} MB; {seconds:.0f} s in all."
+            f"{cases} cases from {seed} on, {others} kills and full disks, with Python "
+            f"{platform.python_version()}: {self.broken} with a finding. Slowest case "
+            f"{self.slowest:.1f} s of processor time, largest {self.largest / 1e6:.0f} MB; "
+            f"{seconds:.0f} s in all."
         )
 
 
