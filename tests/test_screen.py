@@ -140,6 +140,66 @@ with noting_interrupts():
     assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "elastocal: interrupted\n")
 
 
+# What stands here is run as a command; it is interrupted in a place that cannot raise.
+SWALLOWED = {
+    "by a finaliser": """
+class Late:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+def run():
+    Late()
+    time.sleep(60)
+""",
+    "by CasADi": """
+import casadi as ca
+from elastocal.cli.app import Interrupts
+from elastocal.planning.polish import IPOPT_OPTIONS
+class Goal(ca.Callback):
+    def __init__(self):
+        super().__init__()
+        self.construct("goal", {"enable_fd": True})
+    def eval(self, given):
+        signal.raise_signal(signal.SIGINT)
+        return [given[0]]
+def run():
+    x, goal = ca.MX.sym("x"), Goal()
+    with Interrupts() as stop:
+        try:
+            ca.nlpsol("s", "ipopt", {"x": x, "f": goal(x) ** 2}, IPOPT_OPTIONS)(x0=1.0)
+        except RuntimeError:
+            pass
+        stop.check()
+""",
+    "by nobody, when Python is half taken down": """
+class Late:
+    def __del__(self, kill=os.kill, number=os.getpid(), interrupt=signal.SIGINT):
+        kill(number, interrupt)
+late = Late()
+def run():
+    pass
+""",
+}
+
+
+@pytest.mark.parametrize("how", SWALLOWED)
+def test_an_interrupt_is_told_in_one_line_wherever_it_falls(how):
+    program = f"""
+import os, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+{SWALLOWED[how]}
+from elastocal.__main__ import main
+from elastocal.cli.app import command
+command("attacked")(run)
+sys.argv = ["elastocal", "attacked"]
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=50
+    )
+    told = (130, "elastocal: interrupted\n") if "by nobody" not in how else (0, "")
+    assert (done.returncode, done.stderr) == told
+
+
 def test_a_closed_pipe_is_no_error(tmp_path):
     command = f"{sys.executable} -m elastocal --help | head -1; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)

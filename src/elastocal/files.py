@@ -10,7 +10,9 @@ import json
 import os
 import re
 import secrets
+import signal
 import stat
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -239,9 +241,10 @@ def together(paths: Iterable[str | Path]) -> Iterator[None]:
     _held.update(_final(path) for path in paths)
     try:
         yield
-        for temporary, target, _ in _written:
-            with _write_errors(target):
-                os.replace(temporary, target)
+        with _undisturbed():
+            for temporary, target, _ in _written:
+                with _write_errors(target):
+                    os.replace(temporary, target)
     finally:
         for temporary, _, lock in _written:
             with suppress(OSError):
@@ -249,6 +252,22 @@ def together(paths: Iterable[str | Path]) -> Iterator[None]:
             _unlock(lock)
         _held.clear()
         _written.clear()
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """In a `with` block Ctrl-C is noted, and takes effect at its end."""
+    before, noted = signal.getsignal(signal.SIGINT), list[int]()
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda number, frame: noted.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if noted:
+        before(signal.SIGINT, None)
 
 
 def _begun(target: Path) -> tuple[Path, int | None]:

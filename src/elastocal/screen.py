@@ -7,14 +7,16 @@ here is shown as it can be read (`elastocal.text.printable`), in letters that th
 
 from __future__ import annotations
 
+import atexit
 import codecs
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from elastocal.text import printable
 
@@ -42,10 +44,32 @@ codecs.register_error("elastocal", _spelt)
 
 
 def prepare_streams() -> None:
-    """Have stdout and stderr spell out what their encoding lacks, instead of failing."""
+    """Have stdout and stderr spell out what their encoding lacks, instead of failing.
+
+    What CasADi writes to stderr is dropped: what comes of it is judged where it is used.
+    """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="elastocal")
+    if sys.stderr is not None:
+        sys.stderr = cast(TextIO, _WithoutCasadi(sys.stderr))
+
+
+class _WithoutCasadi:
+    """A stream without the lines of CasADi, which come in pieces, the first one "CasADi - "."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._dropping = stream, False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        self._dropping |= text.startswith("CasADi - ")
+        if not self._dropping:
+            return self._stream.write(text)
+        self._dropping = not text.endswith("\n")
+        return len(text)
 
 
 def close_streams() -> None:
@@ -63,15 +87,39 @@ def close_streams() -> None:
 # Ctrl-C: noted besides being raised, since libraries swallow it or make another error of it.
 
 interrupts: list[int] = []
+_ended: list[bool] = []  # not empty when all is written
 
 
 @contextmanager
 def noting_interrupts() -> Iterator[list[int]]:
-    """In a `with` block a SIGINT that would raise KeyboardInterrupt is noted too."""
+    """In a `with` block a SIGINT that would raise KeyboardInterrupt is noted too.
+
+    Where code that cannot raise (Cython's, a finaliser's) swallows one, it comes again.
+    """
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:  # not ignored, as under nohup
         signal.signal(signal.SIGINT, _note)
-    yield interrupts
+        # Python takes its handlers down when it ends, but what is ignored stays so.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    hooks = sys.excepthook, sys.unraisablehook
+    sys.excepthook = lambda kind, *what: kind is KeyboardInterrupt or hooks[0](kind, *what)
+
+    def swallowed(what: Any) -> None:
+        if what.exc_type is not KeyboardInterrupt:
+            hooks[1](what)
+        elif interrupts:
+            threading.Timer(0.05, _press_again).start()
+
+    sys.unraisablehook = swallowed
+    try:
+        yield interrupts
+    finally:
+        sys.excepthook, sys.unraisablehook = hooks
+
+
+def _press_again() -> None:
+    if not _ended:
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def _note(number: int, frame: FrameType | None) -> None:
@@ -86,6 +134,7 @@ def end_at_once() -> None:
         os.write(2, b"elastocal: interrupted\n")
         os._exit(128 + number)
 
+    _ended.append(True)
     if signal.getsignal(signal.SIGINT) is _note:
         signal.signal(signal.SIGINT, end)
 

@@ -120,16 +120,25 @@ def run(case: Case) -> Case:
 
 
 def execute(
-    case: Case, prepare: Callable[[], object] = lambda: None, longest: float = WALL
+    case: Case,
+    prepare: Callable[[], object] = lambda: None,
+    longest: float = WALL,
+    interrupt: float | None = None,
 ) -> Case:
-    """Run the case in a child, which calls `prepare` first and is killed after `longest` s."""
+    """Run the case in a child, which calls `prepare` first and is killed after `longest` s.
+
+    After `interrupt` s somebody presses Ctrl-C.
+    """
     out, err = case.folder.parent / "stdout", case.folder.parent / "stderr"
     begun = time.monotonic()
     sys.stdout.flush(), sys.stderr.flush()
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # until the command begins
     child = os.fork()
     if child == 0:
         _child(case, out, err, prepare)
-    status, usage = _waited(child, begun + longest)
+    signal.signal(signal.SIGINT, before)
+    pressed = None if interrupt is None else begun + interrupt
+    status, usage = _waited(child, begun + longest, pressed)
     case.took = time.monotonic() - begun
     case.seconds = usage.ru_utime + usage.ru_stime
     case.resident = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
@@ -159,6 +168,7 @@ def _child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) -> N
         sys.argv = ["elastocal", case.command.verb, *case.words]
         from elastocal.__main__ import main
 
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             main()
             code = 0
@@ -175,12 +185,17 @@ def _child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) -> N
             os._exit(code)
 
 
-def _waited(child: int, deadline: float) -> tuple[int, resource.struct_rusage]:
+def _waited(
+    child: int, deadline: float, interrupt: float | None
+) -> tuple[int, resource.struct_rusage]:
     pause = 0.002
     while True:
         done, status, usage = os.wait4(child, os.WNOHANG)
         if done:
             break
+        if interrupt is not None and time.monotonic() > interrupt:
+            os.kill(child, signal.SIGINT)
+            interrupt = None
         if time.monotonic() > deadline:
             os.kill(child, signal.SIGKILL)
             _, status, usage = os.wait4(child, 0)

@@ -1,4 +1,4 @@
-"""Commands that are killed, or whose disk is full: an output is the old file or the new one, whole.
+"""Commands killed, interrupted, or on a full disk: an output is the old file or the new one, whole.
 
 A moment is drawn in one of three ways: by the clock, at an operation on files (so that what stands
 between two of them is met, which takes microseconds), or at a byte that is written.
@@ -24,11 +24,14 @@ from fuzz.harness import OLD, Case, execute, malformed, seen
 OPERATIONS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "shutil.rmtree")
 # What a killed run may leave for the next one to go on from, or to sweep up.
 BEGUN = re.compile(r"\.resume/|^results(/|\.md$)|(^|/)\.[^/]+\.tmp$")
+INTERRUPTED = 128 + signal.SIGINT
 KILLED = ("identify", "design", "diagnose", "simulate", "export", "study")
 
 
-def kill_at_operation(number: int, counted: Path | None = None) -> None:
-    """SIGKILL before the `number`-th operation on files of this process that writes or moves."""
+def kill_at_operation(
+    number: int, counted: Path | None = None, by: signal.Signals = signal.SIGKILL
+) -> None:
+    """A signal before the `number`-th operation on files of this process that writes or moves."""
     left = [number]
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:
@@ -38,7 +41,7 @@ def kill_at_operation(number: int, counted: Path | None = None) -> None:
             return
         left[0] -= 1
         if left[0] == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), by)
         if counted is not None:
             counted.write_text(str(number - left[0])) if event != "open" else None
 
@@ -69,9 +72,9 @@ class Victim:
         self.operations = int(counter.read_text())
         self.restore()
 
-    def run(self, prepare: Callable[[], object] = lambda: None, longest: float = 120.0) -> Case:
+    def run(self, prepare: Callable[[], object] = lambda: None, **when: float) -> Case:
         case = Case(0, self.command, shlex.split(self.command.line), "", self.folder)
-        return execute(case, prepare, longest)
+        return execute(case, prepare, **when)
 
     def restore(self) -> None:
         """The inputs as they were, and an old file under every output's name."""
@@ -123,6 +126,35 @@ class Victim:
         self.restore()
         return where, found
 
+    def interrupted(self, rng: Random) -> tuple[str, list[str]]:
+        """One Ctrl-C at a moment of `rng`: all outputs, or one line and no new output."""
+        if rng.random() < 0.5:
+            where = f"Ctrl-C after {(moment := rng.uniform(0, self.took)):.3f} s"
+            case = self.run(interrupt=moment)
+        else:
+            number = rng.randint(1, self.operations)
+            where = f"Ctrl-C at operation {number} of {self.operations} on files"
+            case = self.run(lambda: kill_at_operation(number, by=signal.SIGINT))
+        found, there = list(self.wrong()), seen(self.folder)
+        new = [n for n in self.command.outputs if there.get(n) != OLD]
+        messages = [line for line in case.stderr.splitlines() if line.startswith("elastocal: ")]
+        study = self.command.verb == "study"
+        if case.code not in (0, INTERRUPTED):
+            found.append(f"exit code {case.code}")
+        if case.code == 0 and len(new) < len(self.command.outputs):
+            found.append("exit code 0 without all outputs")
+        # Where they appeared just before it, what follows is not told any more.
+        if case.code == INTERRUPTED and new and len(new) < len(self.command.outputs):
+            found.append(f"of its outputs {new} alone")
+        if case.code == INTERRUPTED and ((len(messages) != 1 and not study) or not messages):
+            found.append(f"says {case.stderr[-300:]!r}")
+        if "Traceback" in case.stderr or "Abort" in case.stderr or "Exception" in case.stderr:
+            found.append(f"says {case.stderr[-500:]!r}")
+        if [name for name in there if name.endswith(".tmp")]:
+            found.append("a temporary file is left")
+        self.restore()
+        return where, found
+
     def refused(self, rng: Random) -> tuple[str, list[str]]:
         """One run on a disk that is full at a byte of `rng`: a message, and nothing has changed."""
         # Room for the message at least, which goes to a file here.
@@ -160,21 +192,25 @@ def _broken(name: str, content: bytes, size: int) -> str | None:
 
 
 def run_kills(
-    base: Path, folder: Path, seed: int, kills: int, full: int, part: slice = slice(None)
+    base: Path, folder: Path, seed: int, times: dict[str, int], part: slice = slice(None)
 ) -> tuple[int, Counter]:
-    """Kill each verb `kills` times and fill its disk `full` times; findings are printed.
+    """Do to each verb what `times` says so many times, as HARMS has it; findings are printed.
 
     A few times are of the verb's first command alone, many are of all.  `part` of them is run.
     """
     broken, tried = 0, Counter[tuple[str, str]]()
+    harms = [(harm, k) for harm, number in times.items() for k in range(number)]
     for verb in KILLED:
-        commands = [c for c in COMMANDS if c.verb == verb][: 1 + (kills + full) // 20]
+        commands = [c for c in COMMANDS if c.verb == verb][: 1 + len(harms) // 20]
         victims = [Victim(c, base, folder / f"kill-{verb}{i}") for i, c in enumerate(commands)]
-        for k in range(kills + full)[part]:
-            rng, victim = Random(f"{seed} {verb} {k}"), victims[k % len(victims)]
-            where, found = victim.killed(rng) if k < kills else victim.refused(rng)
-            tried[verb, "killed" if k < kills else "disk full"] += 1
+        for i, (harm, k) in list(enumerate(harms))[part]:
+            rng, victim = Random(f"{seed} {verb} {harm} {k}"), victims[i % len(victims)]
+            where, found = HARMS[harm](victim, rng)
+            tried[verb, harm] += 1
             if found:
                 broken += 1
                 print(f"--- {victim.command.line}\n    {where}: {'; '.join(found)}\n", flush=True)
     return broken, tried
+
+
+HARMS = {"killed": Victim.killed, "disk full": Victim.refused, "interrupted": Victim.interrupted}

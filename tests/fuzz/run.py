@@ -35,6 +35,7 @@ def main() -> int:
     parser.add_argument("--verb", action="append", default=[], help="only this verb; repeatable")
     parser.add_argument("--kills", type=int, default=0, help="kill each command so many times")
     parser.add_argument("--full", type=int, default=0, help="fill its disk so many times")
+    parser.add_argument("--interrupts", type=int, default=0, help="Ctrl-C in each so many times")
     parser.add_argument("--jobs", type=int, default=1, help="processes that share the work")
     parser.add_argument("--write", type=Path, help="page whose table this run replaces")
     parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
@@ -84,9 +85,12 @@ def fork(asked: argparse.Namespace, base: Path, folder: Path, part: int) -> int:
                 break
             tally.take(harness.run(harness.make(seed, base, folder / str(seed), tuple(asked.verb))))
             shutil.rmtree(folder / str(seed), ignore_errors=True)
-        if asked.kills or asked.full:
+        times = {
+            "killed": asked.kills, "disk full": asked.full, "interrupted": asked.interrupts,
+        }  # fmt: skip
+        if any(times.values()):
             own, share = folder / f"kills{part}", slice(part, None, asked.jobs)
-            found, tried = kills.run_kills(base, own, asked.seed, asked.kills, asked.full, share)
+            found, tried = kills.run_kills(base, own, asked.seed, times, share)
             tally.count.update(tried)
             tally.broken += found
         (folder / f"part{part}").write_bytes(pickle.dumps(tally))
@@ -122,7 +126,7 @@ class Tally:
 
     def table(self) -> str:
         """One row per verb (Markdown)."""
-        columns = ("exit 0", "exit 1", "exit 2", "killed", "disk full")
+        columns = ("exit 0", "exit 1", "exit 2", *kills.HARMS)
         rows = ["| verb | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
         for verb in sorted({verb for verb, _ in self.count}):
             numbers = (self.count[verb, column] for column in columns)
@@ -133,7 +137,7 @@ class Tally:
         cases = sum(n for (_, how), n in self.count.items() if how.startswith("exit"))
         others = self.count.total() - cases
         return (
-            f"{cases} cases from {seed} on, {others} kills and full disks, with Python "
+            f"{cases} cases from {seed} on, {others} kills, interrupts and full disks, with Python "
             f"{platform.python_version()}: {self.broken} with a finding. Slowest case "
             f"{self.slowest:.1f} s of processor time, largest {self.largest / 1e6:.0f} MB; "
             f"{seconds:.0f} s in all."

@@ -581,3 +581,7 @@ def test_any_content_is_read_or_refused(tmp_path_factory, content):
         assert isinstance(read_knowledge(path), Knowledge)
     except ElastocalError as error:
         assert str(path) in str(error)
+
+
+def test_constraints_on_a_model_without_parameters_hold_nothing():
+    assert Constraints().resolve(()).A.shape == (0, 0)

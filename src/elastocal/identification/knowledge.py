@@ -287,7 +287,7 @@ class Constraints:
             tuple(names),
             lower,
             upper,
-            np.array(rows).reshape(-1, p),
+            np.array(rows).reshape(len(rows), p),
             np.array(values, dtype=float),
             tuple(labels),
             tuple(_matrix(m, position) for m in self.matrices),
