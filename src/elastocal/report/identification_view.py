@@ -186,7 +186,7 @@ def how_well_it_predicts(result: Calibration) -> str:
     )
     nominal, held = result.nominal_rms, result.heldout_rms
     if math.isfinite(held):
-        left_out = "" if result.noise.drift is None else " (whole blocks in time left out)"
+        left_out = "" if result.noise.drift is None else " (whole blocks in time left out, on another day)"
         text = (
             f"In poses that were not fitted{left_out} the {what} is predicted to {length(held)} rms"
         )
