@@ -264,9 +264,7 @@ def prefer_wider(
     observed = problem.observations
 
     def needed(narrow: Array, wide: Array) -> bool:
-        return predicts_better(
-            narrow, wide, problem.weights, observed.configuration, observed.size
-        )
+        return predicts_better(narrow, wide, problem.weights, observed.configuration, observed.size)
 
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
