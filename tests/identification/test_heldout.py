@@ -28,6 +28,7 @@ from elastocal.identification import (
     weights_for,
 )
 from elastocal.identification.identify import identify
+from elastocal.identification.residuals import predicts_better
 from elastocal.model import Model, subset
 
 UNIT = Weights("none", None, False, "")
@@ -94,6 +95,26 @@ def test_rms_is_of_three_dimensional_lengths():
     pose = np.array([3.0, 4.0, 0.0, 99.0, 99.0, 99.0])
     assert rms_3d(pose, 6) == pytest.approx(5.0)  # rotations do not count
     assert rms_3d(np.array([3.0, -3.0]), 1) == pytest.approx(3.0)
+
+
+def test_a_wider_set_is_needed_where_the_parameters_it_adds_are_something():
+    """None is found in at most 1 % of tables, one of six standard deviations in most."""
+    rng = np.random.default_rng(5)
+    configuration = np.repeat(np.arange(20), 2)
+    B = rng.normal(size=(120, 8))
+    B[:, 7] -= B[:, :6] @ np.linalg.lstsq(B[:, :6], B[:, 7], rcond=None)[0]
+    unit = B[:, 7] / np.linalg.norm(B[:, 7])
+
+    def held(y, p):
+        x = np.linalg.lstsq(B[:, :p], y, rcond=None)[0]
+        return held_out_residual(B[:, :p], y - B[:, :p] @ x, UNIT, configuration, 3)
+
+    def needed(size):
+        y = rng.normal(size=120) + size * unit
+        return predicts_better(held(y, 6), held(y, 8), UNIT, configuration, 3)
+
+    assert sum(needed(0.0) for _ in range(500)) <= 11  # 5 expected at most; p < 0.01 of more
+    assert sum(needed(6.0) for _ in range(50)) > 35
 
 
 def test_infinite_where_one_configuration_alone_determines_a_parameter():

@@ -354,7 +354,8 @@ def _visits(result: Calibration) -> Iterator[Finding]:
 
 def _prediction(result: Calibration) -> Iterator[Finding]:
     held, fitted, nominal = result.heldout_rms, result.residual_rms, result.nominal_rms
-    if math.isfinite(held) and held > FLATTERS * fitted:
+    # Under a drift the held-out error is that of another day, which more poses make no better.
+    if math.isfinite(held) and held > FLATTERS * fitted and result.noise.drift is None:
         numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "residual_rms_um": _um(fitted)}
         yield Finding("fit_flatters", "care", numbers, _more_poses())
     if held < nominal < LITTLE * held < math.inf:

@@ -268,7 +268,7 @@ def _reml(
         # which make light of it let the fit go where poses left out are predicted worse.
         progress("comparing with noise of the readings alone")
         plain = found(OF_READINGS)
-        if _held_out_rms(solution) > WORSE * _held_out_rms(plain[0]):
+        if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
             solution, noise, good = plain
             warnings = (LACKING,)
     intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
@@ -282,9 +282,20 @@ LACKING = (
 )
 
 
-def _held_out_rms(solution: Solution) -> float:
-    """Root mean square length in m of what poses left out are off by."""
-    known = solution.heldout[np.isfinite(solution.heldout)]
+def _held_out_rms(solution: Solution, judge: Solution) -> float:
+    """Root mean square length in m of what poses left out are off by: those which the noise of
+    `judge` takes for one, configurations or blocks in time."""
+    judged, together = judge.problem.observations, judge.problem.weights.together
+    held = solution.heldout
+    if together is not None:
+        block = dict(zip(judged.configuration.tolist(), together.tolist(), strict=True))
+        observed, weights = solution.problem.observations, solution.problem.weights
+        left_out = np.array([block.get(c, -1) for c in observed.configuration.tolist()])
+        if weights.together is not None:
+            weights = replace(weights, together=left_out)
+        fit = solution.fit
+        held = held_out_residual(fit.B, fit.residual, weights, left_out, observed.size)
+    known = held[np.isfinite(held)]
     return float(np.sqrt(np.mean(known**2)))
 
 

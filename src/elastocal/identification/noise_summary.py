@@ -151,7 +151,7 @@ class Noise:
     @property
     def held_out_by(self) -> str:
         """What is left out at a time to judge predictions: whole blocks in time where something
-        drifts, since neighbours in time err alike."""
+        drifts, since neighbours in time err alike; the error is then that of another day."""
         return "configurations" if self.drift is None else "blocks in time"
 
     @property

@@ -137,6 +137,39 @@ def _growth_of_blocks(B: Array, residual: Array, weights: Weights, block: IntArr
     return _growth(seen, Q, R, e, labels)[:n]
 
 
+def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
+    """Factors (rows,) that make what blocks in time are off by what a campaign of another day is.
+
+    Blocks of one campaign share part of the drift FFᵀ, and the fit follows it.  With x̂ and û the
+    estimates of parameters and drift from the other blocks, C = cov(x̂ − x, û − u) and Σ₀ the other
+    noise, a reading of the block that was left out and one with a drift of its own vary by
+
+        Σ₀ + FFᵀ + B C_xx Bᵀ + F C_ux Bᵀ + (F C_ux Bᵀ)ᵀ     and     Σ₀ + FFᵀ + B C_xx Bᵀ
+
+    (cov(x̂, û) = 0: Henderson 1975, Biometrics 31, 423).
+    """
+    F, together = weights.common, weights.together
+    assert F is not None and together is not None and weights.whiten is not None
+    p, k = B.shape[1], F.shape[1]
+    held = np.hstack([np.zeros((k, p)), np.eye(k)])
+    Q, R = linalg.qr(np.vstack([weights.alone(np.hstack([B, F])), held]), mode="economic")
+    T = linalg.solve_triangular(R, np.eye(p + k))
+    factor = np.ones(len(B))
+    block, whiten = np.repeat(together, size), weights.whiten.tocsr()
+    for b in np.unique(block):
+        rows = np.flatnonzero(block == b)
+        gap = np.eye(p + k) - Q[rows].T @ Q[rows]
+        if np.linalg.eigvalsh(gap)[0] < ALONE:
+            continue
+        C = T @ np.linalg.solve(gap, T.T)
+        own = np.linalg.inv(whiten[rows][:, rows].toarray())
+        new = (own**2).sum(axis=1) + (F[rows] ** 2).sum(axis=1)
+        new += ((B[rows] @ C[:p, :p]) * B[rows]).sum(axis=1)
+        shared = ((F[rows] @ C[p:, :p]) * B[rows]).sum(axis=1)
+        factor[rows] = np.sqrt(new / (new + 2 * shared))
+    return factor
+
+
 def _moved(share: Array, right: Array) -> tuple[Array, NDArray[np.bool_]]:
     """(I − share)⁻¹ right per configuration, and where it is alone in some direction.
 
@@ -160,6 +193,35 @@ def rms_3d(residual: Array, size: int) -> float:
     """Root mean square length in m of the position part of the residual (rows,)."""
     parts = residual.reshape(-1, size)[:, :3]
     return float(np.sqrt((parts**2).sum(axis=1).mean()))
+
+
+# Does a wider set of parameters predict better?  A test, since any gain is taken too often.
+
+CHANCE = 0.01  # of the wider set being taken though the parameters it adds are none
+
+
+def predicts_better(
+    narrow: Array, wide: Array, weights: Weights, configuration: NDArray, size: int
+) -> bool:
+    """Do the held-out residuals `wide` (rows,) of more parameters show that `narrow` (rows,) lacks
+    some?
+
+    Both models see the same noise, and the wider one errs more from estimating more: under the
+    narrow one's truth f_c = |n_c|² − (|w_c|² − |n_c − w_c|²) = 2 n_cᵀ(n_c − w_c), whitened, has
+    the mean zero over configurations c, since n_c − w_c comes from the others (Clark and West
+    2007, J. Econometrics 138, 291).  True where its t exceeds the quantile of a one-sided test and
+    the squares themselves became smaller.
+    """
+    before, after = rms_3d(narrow, size), rms_3d(wide, size)
+    if not after < before < np.inf:
+        return bool(after < before)
+    n, w = weights.apply(narrow), weights.apply(wide)
+    own = np.repeat(np.unique(configuration, return_inverse=True)[1], size)
+    f = np.bincount(own, 2 * n * (n - w))
+    if len(f) < 2:
+        return False
+    deviation = float(f.std(ddof=1)) / np.sqrt(len(f))
+    return bool(f.mean() > deviation * stats.t.isf(CHANCE, len(f) - 1))
 
 
 # Ordered residuals against normal order statistics, with a band that holds for all of them.

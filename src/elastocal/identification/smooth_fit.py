@@ -38,7 +38,7 @@ from elastocal.identification.noise_choice import (
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.outliers import FALSE_ALARM
-from elastocal.identification.residuals import rms_3d
+from elastocal.identification.residuals import predicts_better, rms_3d
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.smooth_prior import (
     LinearRows,
@@ -308,6 +308,13 @@ class Crossed(NamedTuple):
     held_out: Array
     leverage: Array
     standard: Array
+
+
+def _needed(problem: Problem, narrow: Crossed, wide: Crossed) -> bool:
+    observed = problem.observations
+    return predicts_better(
+        narrow.held_out, wide.held_out, problem.weights, observed.configuration, observed.size
+    )
 
 
 def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
@@ -608,12 +615,11 @@ class _Course:
         return fit
 
     def wider(self, fit: JointFit) -> tuple[JointFit, Crossed]:
-        """A wider set of ordinary parameters where it predicts held-out configurations better."""
+        """A wider set of ordinary parameters where held-out configurations show it is needed."""
         cross = crossed(fit)
         if fit.reduction.at_bound.size:
             return fit, cross
         self.progress("comparing with wider sets")
-        size = self.observed.size
         tried = len(fit.reduction.kept)
         for threshold in WIDER:
             wide = fit.chosen(self.every.sizes, threshold)
@@ -621,7 +627,7 @@ class _Course:
                 continue
             tried = len(wide.kept)
             there = crossed(*fit.linear(fit.scales, wide))
-            if rms_3d(there.held_out, size) >= rms_3d(cross.held_out, size):
+            if not _needed(fit.problem, cross, there):
                 continue
             try:
                 other = joint_fit(
@@ -631,7 +637,7 @@ class _Course:
                 there = crossed(other)
             except (ElastocalError, np.linalg.LinAlgError, ValueError):
                 continue  # along an undetermined direction it may leave every valid arm
-            if other.converged and rms_3d(there.held_out, size) < rms_3d(cross.held_out, size):
+            if other.converged and _needed(fit.problem, cross, there):
                 fit, cross = other, there
         return fit, cross
 

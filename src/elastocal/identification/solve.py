@@ -12,7 +12,13 @@ from scipy import linalg
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import Fit, FitProblem, fit
 from elastocal.identification.linear_solver import solve_weighted
-from elastocal.identification.residuals import held_out_by_parts, held_out_residual, rms_3d
+from elastocal.identification.residuals import (
+    as_of_another_campaign,
+    held_out_by_parts,
+    held_out_residual,
+    predicts_better,
+    rms_3d,
+)
 from elastocal.identification.start import check_enough
 from elastocal.identification.weighted_problem import (
     Part,
@@ -229,12 +235,16 @@ def fit_kept(
 
 
 def heldout_of(problem: Problem, found: Fit) -> Array:
-    """Residual (rows,) of each configuration under a fit to the others."""
+    """Residual (rows,) of each configuration under a fit to the others; under a drift, of each
+    block in time, as far off as readings of another day are."""
     if not problem.large:
-        observed = problem.observations
-        return held_out_residual(
-            found.B, found.residual, problem.weights, observed.configuration, observed.size
+        observed, weights = problem.observations, problem.weights
+        held = held_out_residual(
+            found.B, found.residual, weights, observed.configuration, observed.size
         )
+        if weights.together is None:
+            return held
+        return held * as_of_another_campaign(found.B, weights, observed.size)
     return held_out_by_parts(
         problem.model, problem.parts, found.x, found.columns, found.r_factor,
         np.zeros(len(found.columns)),
@@ -245,19 +255,24 @@ def prefer_wider(
     problem: Problem, sizes: Array, found: Fit, reduction: Reduction, heldout: Array,
     r_factor: RFactor,
 ) -> tuple[Fit, Reduction, Array]:  # fmt: skip
-    """A wider set, up to full rank, where it predicts held-out configurations better.
+    """A wider set, up to full rank, where held-out configurations show that it is needed.
 
-    Typical sizes are prior knowledge and may be wrong for this arm; held-out data decide, first
-    on the linearised model, then on the refitted one.  `r_factor` is that of the free columns.
+    Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
+    decides, first on the linearised model, then on the refitted one.  `r_factor` is that of the
+    free columns.
     """
-    size = problem.observations.size
+    observed = problem.observations
+
+    def needed(narrow: Array, wide: Array) -> bool:
+        return predicts_better(narrow, wide, problem.weights, observed.configuration, observed.size)
+
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
         wider = choose(problem, sizes, r_factor, sigma, threshold)
         if len(wider.kept) <= len(reduction.kept):
             continue
         x, linear_heldout = _linear_step(problem, sizes, found.x, wider, r_factor)
-        if rms_3d(linear_heldout, size) >= rms_3d(heldout, size):
+        if not needed(heldout, linear_heldout):
             continue
         try:
             wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
@@ -266,7 +281,7 @@ def prefer_wider(
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
-        if wide.converged and rms_3d(wide_heldout, size) < rms_3d(heldout, size):
+        if wide.converged and needed(heldout, wide_heldout):
             found, reduction, heldout = wide, wider, wide_heldout
             r_factor = free_r_factor(problem, found)
     return found, reduction, heldout

@@ -186,7 +186,8 @@ def how_well_it_predicts(result: Calibration) -> str:
     )
     nominal, held = result.nominal_rms, result.heldout_rms
     if math.isfinite(held):
-        left_out = "" if result.noise.drift is None else " (whole blocks in time left out)"
+        drifts = result.noise.drift is not None
+        left_out = " (whole blocks in time left out, another day's drift)" if drifts else ""
         text = (
             f"In poses that were not fitted{left_out} the {what} is predicted to {length(held)} rms"
         )

@@ -9,7 +9,7 @@ from scipy import linalg, stats
 from elastocal.errors import InputError
 from elastocal.identification import Readings, estimate_noise, kenward_roger
 from elastocal.identification.noise_choice import NoiseFit, time_blocks, weights_of
-from elastocal.identification.residuals import held_out_residual
+from elastocal.identification.residuals import as_of_another_campaign, held_out_residual
 from elastocal.identification.visit_record import VisitRecord, course_waves
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 2e-5, 4e-5, 0.2
@@ -115,6 +115,20 @@ def test_weights_whiten_what_drifts_and_blocks_are_left_out_as_by_fits_to_the_ot
         others = block != b
         x = restricted(V[np.ix_(others, others)], B[others], e[others])[1]
         assert np.allclose(held[~others], e[~others] - B[~others] @ x, atol=1e-9)
+    # What the blocks are off by, made as large as with a drift of another day: a base that is
+    # fitted follows that of the campaign.
+    B = np.hstack([np.tile(np.eye(3), (len(r), 1)), B])
+    factor = as_of_another_campaign(B, weights, 3)
+    assert factor.mean() > 1.05
+    for b in range(5):
+        own, others = block == b, block != b
+        inverse = np.linalg.inv(V[np.ix_(others, others)])
+        G = np.linalg.solve(B[others].T @ inverse @ B[others], B[others].T @ inverse)
+        M = B[own] @ G
+        new = V[np.ix_(own, own)] + M @ V[np.ix_(others, others)] @ M.T
+        shared = M @ V[np.ix_(others, own)]
+        ratio = np.diag(new) / np.diag(new - shared - shared.T)
+        assert np.allclose(factor[own] ** 2, ratio, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
