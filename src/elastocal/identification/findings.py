@@ -215,6 +215,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         *_repeats(result),
         *_visits(result),
         *_prediction(result),
+        *_new_poses(result),
         *(f for f in of_solution if f.kind != "ill_conditioned"),
         *_faulty(result),
         *_undetermined(result),
@@ -360,6 +361,67 @@ def _prediction(result: Calibration) -> Iterator[Finding]:
     if held < nominal < LITTLE * held < math.inf:
         numbers = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
         yield Finding("little_gain", "care", numbers)
+
+
+def _new_poses(result: Calibration) -> Iterator[Finding]:
+    """Is what is said of poses that nobody measured founded: on enough configurations, on a noise
+    that is known, on parameters that the readings show?"""
+    left, wanted = spare_equations(result), ENOUGH
+    if left < wanted:
+        numbers: dict[str, Number] = {
+            "configurations": len(np.unique(result.observations.configuration)),
+            "parameters": len(result.observations.value) - result.dof,
+            "equations_left": left, "needed": wanted,
+        }  # fmt: skip
+        yield Finding("few_configurations", "care", numbers, _more_poses())
+    if result.excess is None:
+        yield Finding("noise_unknown", "care", {}, STATE_NOISE)
+    found = result.predicted
+    if found is None:
+        return
+    numbers = {
+        "rms_um": _um(found.rms), "from_um": _um(found.ci95[0]), "to_um": _um(found.ci95[1]),
+        "poses": found.poses, "source": found.source,
+    }  # fmt: skip
+    yield Finding("new_poses", "note", numbers)
+    if found.open**2 > MOSTLY * found.rms**2:
+        yield Finding(
+            "new_poses_not_shown", "care",
+            {
+                "open_um": _um(found.open), "heldout_rms_um": _um(result.heldout_rms),
+                "parameters": found.blamed,
+            },
+            f"{_more_poses()} For a part of the joint ranges alone, state test poses in the cell.",
+        )  # fmt: skip
+    if found.rms > result.nominal_rms / LITTLE:
+        numbers = {"rms_um": _um(found.rms), "nominal_rms_um": _um(result.nominal_rms)}
+        yield Finding("new_poses_no_gain", "care", numbers, _more_poses())
+
+
+# Equations left between configurations from which their scatter says to a factor of 1.25, with
+# 95 % probability, what errors there are beyond the parameters: √(ν/χ²_ν(5 %)) ≤ 1.25.
+FACTOR = 1.25
+ENOUGH = next(n for n in range(1, 1000) if n <= FACTOR**2 * stats.chi2.ppf(0.05, n))
+
+
+def spare_equations(result: Calibration) -> int:
+    """Equations that configurations give beyond the parameters fitted.
+
+    A rigid body's place is six numbers in each load state, however many markers it has and however
+    often they are read.
+    """
+    observed = result.observations
+    table, lead = observed.table, observed.lead
+    state = np.column_stack([table.configuration, np.round(table.force, 3)])[lead]
+    _, code = np.unique(state, axis=0, return_inverse=True)
+    seen = np.unique(np.column_stack([code.ravel(), table.marker[lead]]), axis=0)[:, 0]
+    size = 1 if observed.kind == "distance" else observed.size
+    told = np.minimum(size * np.bincount(seen), 6)
+    return int(told.sum()) - int(np.sum(~result.model.shrunk[_columns(result)]))
+
+
+def _columns(result: Calibration) -> NDArray[np.bool_]:
+    return np.isin(result.model.names, result.determined)
 
 
 def _faulty(result: Calibration) -> Iterator[Finding]:

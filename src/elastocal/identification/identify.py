@@ -13,6 +13,7 @@ from elastocal.identification.methods import is_exact, run_method, with_smooth
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
+from elastocal.identification.prediction import NewPoses
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.result import Calibration, TestErrors
 from elastocal.identification.solve import Problem, Solution, solve
@@ -44,12 +45,14 @@ def identify(
     options: Options | None = None,
     test: Measurements | None = None,
     progress: Progress = lambda message: None,
+    new_poses: NewPoses | None = None,
 ) -> Calibration:
     """Parameters with intervals from nothing but the nominal arm and a table.
 
     Start by registration, a first fit weakly tied to it, choice of a minimal complete set of
     parameters, search for faulty readings; then the method: by default weights from a noise model
     whose variances restricted likelihood estimates, and intervals that know they are estimated.
+    `new_poses` are where the arm will be used; by default the workspace that its limits span.
 
     Raises InputError for data that contradict robot or cell, InsufficientDataError where the
     data cannot determine the model.
@@ -88,7 +91,7 @@ def identify(
         found = run_method(every, sound, faulty, refit, options, progress)
     progress("intervals and held-out residuals")
     outliers = describe(every, found.solution, ~found.good)
-    result = summarise(model, every, sound, found, outliers)
+    result = summarise(model, every, sound, found, outliers, new_poses)
     if test is None:
         return result
     return judged(replace(result, test=_test_errors(model, result.x, test)))

@@ -21,6 +21,7 @@ from elastocal.identification.findings import (
     stage_of,
     standings,
 )
+from elastocal.identification.prediction import PredictedError
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import (
     LOPSIDED,
@@ -64,7 +65,7 @@ from elastocal.report.method_and_noise import (
     size_rows,
 )
 from elastocal.report.smooth_view import counted_functions, smooth_lines, smooth_table
-from elastocal.text import printable
+from elastocal.text import listed, printable
 
 LARGEST_TERMS = 4
 Truth = dict[str, float]
@@ -208,6 +209,8 @@ def how_well_it_predicts(result: Calibration) -> str:
             "How well unseen poses are predicted is not known: some configuration alone "
             "determines a parameter, so none can be held out."
         )
+    if result.predicted is not None:
+        text += f" {at_new_poses(result.predicted)}"
     if result.test is not None:
         t = result.test
         text += (
@@ -215,6 +218,20 @@ def how_well_it_predicts(result: Calibration) -> str:
             f"{length(t.mean)} mean, {length(t.maximum)} at most."
         )
     return text
+
+
+def at_new_poses(found: PredictedError) -> str:
+    """What is to be expected where nobody measured, and of what it consists."""
+    low, high = found.ci95
+    parts = [f"{length(found.parameters)} of the estimates"]
+    if found.open > 0:
+        parts.append(f"{length(found.open)} of parameters that these poses do not show")
+    if found.lacking:
+        parts.append(f"{length(found.lacking)} that the model may lack")
+    return (
+        f"At new poses ({found.source}) the arm itself, without the noise of a reading, is off by "
+        f"{length(found.rms)} rms, 95 %: {length(low)} to {length(high)} ({', '.join(parts)})."
+    )
 
 
 def nominal_arm(result: Calibration) -> str:
@@ -539,14 +556,15 @@ def judgement(result: Calibration, sections: bool = False) -> Judgement:
         why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
         return Judgement("poor", f"Do not use this calibration: {DOUBTS[why.kind](why)}.", steps)
     told = _accuracy(result)
+    verdict = result.verdict
     if trust.severity == "care":
-        doubts = [f for f in result.findings if f.severity == "care" and f is not trust]
-        named = "; and ".join(DOUBTS[f.kind](f) for f in doubts)
+        named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
         text = f"Use this calibration with care: {told}, but {named}."
         return Judgement("care", text, steps)
     compared = result.finding("residual_agrees_with_stated_noise", "residual_below_stated_noise")
     noise = "" if compared is None else ", and the residual is noise"
-    return Judgement("good", f"This calibration can be trusted: {told}{noise}.", steps)
+    at = "" if verdict.at is None else f" at {length(verdict.at)}"
+    return Judgement("good", f"This calibration can be trusted{at}: {told}{noise}.", steps)
 
 
 def _step(f: Finding, sections: bool) -> str:
@@ -578,6 +596,23 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"unseen poses are worse than fitted ones ({_length(f, 'residual_rms_um')})"
     ),
     "little_gain": lambda f: "that is hardly better than the nominal arm",
+    "few_configurations": lambda f: (
+        f"{f.numbers['configurations']} configurations leave {f.numbers['equations_left']} equations "
+        f"beyond {f.numbers['parameters']} parameters, too few to judge by (needed: "
+        f"{f.numbers['needed']})"
+    ),
+    "noise_unknown": lambda f: (
+        "nothing says how large the noise is (no stated noise, no repeats), so the residual may "
+        "hide what the model lacks"
+    ),
+    "new_poses_not_shown": lambda f: (
+        f"at new poses {_length(f, 'open_um')} are to be expected of what the measured poses do "
+        f"not show ({listed([printable(str(n)) for n in f.listed('parameters')], 3)})"
+    ),
+    "new_poses_no_gain": lambda f: (
+        f"at new poses {_length(f, 'rms_um')} are to be expected, hardly better than the nominal "
+        "arm"
+    ),
     "many_faulty_readings": lambda f: (
         f"{f.numbers['faulty']} of the {f.numbers['fitted']} readings fitted lie beyond what the "
         "noise explains"
