@@ -19,6 +19,7 @@ from elastocal.identification.result import Calibration, Estimate, Finding, Numb
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.effects import CATALOGUE
+from elastocal.text import listed
 from elastocal.units import Array
 
 # Where the error of the nominal arm goes, step by step, as an identification can tell it.
@@ -441,13 +442,19 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
 
 
 def _undetermined(result: Calibration) -> Iterator[Finding]:
+    """What these poses do not show, and what no pose shows: only the first is to be measured."""
     all_of_them = standings(result)
-    found = [all_of_them[e.name] for e in result.ordinary]
-    if n := found.count(INVISIBLE) + found.count(ABSORBED):
+    lacking = [e.name for e in result.ordinary if all_of_them[e.name] in (INVISIBLE, ABSORBED)]
+    redundant = () if result.left is None else result.left.redundant
+    shown = [name for name in lacking if name not in redundant]
+    if n := len(lacking) - len(shown):
+        yield Finding("redundant", "good", {"parameters": n})
+    if n := len(shown):
         yield Finding(
-            "undetermined", "note", {"parameters": n},
-            f"{n} parameter{'' if n == 1 else 's'} cannot be had from these data. Poses and loads "
-            "like those measured are predicted all the same; for others, measure what shows them.",
+            "undetermined", "note", {"parameters": n, "names": tuple(shown)},
+            f"{n} parameter{'' if n == 1 else 's'} cannot be had from these data "
+            f"({listed(shown, 4)}). Poses and loads like those measured are predicted all the "
+            "same; for others, measure what shows them.",
         )  # fmt: skip
 
 

@@ -27,7 +27,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
-from elastocal.identification.solve import Solution, free_r_factor
+from elastocal.identification.solve import STRUCTURAL, Solution, free_r_factor
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import CalibratedArm, OpenParameters
@@ -122,7 +122,34 @@ def left_open(solution: Solution) -> OpenParameters:
         R = R * typical[free]
         columns, rest = np.searchsorted(free, kept[own]), np.searchsorted(free, open_)
         mixing[own] = _shares(R[:, columns], R[:, rest], typical[kept[own]], typical[open_])
-    return OpenParameters(tuple(model.names[d] for d in open_), mixing, typical[open_])
+    names = tuple(model.names[d] for d in open_)
+    return OpenParameters(names, mixing, typical[open_], _redundant(solution, open_, typical))
+
+
+def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str, ...]:
+    """Which of the parameters left open no pose tells from the rest: at poses over the whole joint
+    range, their columns of B lie in the span of those determined and of the others left open."""
+    problem, kept = solution.problem, solution.reduction.kept
+    model, observed = problem.model, problem.observations
+    if not len(open_):
+        return ()
+    anywhere = over_the_workspace(model.cell, model, observed.table)
+    try:
+        B = readings_at(model, solution.fit.x, observed, anywhere)[0]
+    except ElastocalError:
+        return ()
+    B = B.reshape(-1, B.shape[2]) * np.where(typical > 0, typical, 1.0)
+    known = B[:, kept[~model.shrunk[kept]]]
+    basis = linalg.qr(known, mode="economic")[0]
+    off = B[:, open_] - basis @ (basis.T @ B[:, open_])
+    off -= basis @ (basis.T @ off)
+    _, R, order = linalg.qr(off, mode="economic", pivoting=True)
+    length = np.linalg.norm(B[:, open_], axis=0)
+    least = STRUCTURAL * max(length.max(initial=0.0), np.linalg.norm(known, axis=0).max(initial=0))
+    pivot = np.zeros(len(open_))
+    pivot[: min(R.shape)] = np.abs(np.diag(R))
+    none = pivot <= np.maximum(least, OUTSIDE * length[order])
+    return tuple(model.names[d] for d in open_[order[none]])
 
 
 def _shares(B_K: Array, B_D: Array, kept: Array, left: Array) -> Array:
@@ -369,11 +396,12 @@ def predicted_error(
     if left is None or not arm.determined or observed.kind == "distance":
         return None
     try:
-        known, off, weight = _sensitivities(arm, left, observed, poses)
+        B, weight = readings_at(arm.model, arm.x, observed, poses)
     except ElastocalError:
         return None
     if not len(weight):
         return None
+    known, off = _moves(arm, left, B[:, :3])
     size, axes = np.linalg.eigh((arm.covariance + arm.covariance.T) / 2)
     root = axes * np.sqrt(np.maximum(size, 0.0))
     each = np.sqrt(weight)[:, None, None]
@@ -405,33 +433,33 @@ def predicted_error(
     )
 
 
-def _sensitivities(
-    arm: CalibratedArm, left: OpenParameters, observed: Observations, poses: NewPoses
-) -> tuple[Array, Array, Array]:
-    """A_K (R, 3, K), O S (R, 3, D) and weight (R,) of sum 1 of each pose and marker."""
-    model, table = arm.model, observed.table
+def readings_at(
+    model: Model, x: Array, observed: Observations, poses: NewPoses
+) -> tuple[Array, Array]:
+    """B (R, size, parameters) of readings at new poses, one for each pose and marker, and their
+    weight (R,) of sum 1; without those that have no static equilibrium.
+
+    Whatever else the model asks for, as times and temperatures, is that of the readings in turn.
+    """
+    table = observed.table
     markers = np.unique(table.marker[observed.lead])
-    loaded = model.observe == "deflection"
-    states = 2 if loaded else 1
+    states = 2 if model.observe == "deflection" else 1
     T, M = len(poses.q), len(markers)
     pose = np.repeat(np.arange(T), M * states)
-    state = np.tile(np.arange(states), T * M)
-    rows = table.take(observed.lead[np.arange(len(pose)) // (M * states) % len(observed.lead)])
-    force = poses.force[pose] * (state == states - 1)[:, None]
+    loaded = np.tile(np.arange(states), T * M) == states - 1
+    like = observed.lead[pose % len(observed.lead)]
     new = replace(
-        rows, source="new poses", row=np.arange(len(pose)) + 1, q=poses.q[pose],
+        table.take(like), source="new poses", row=np.arange(len(pose)) + 1, q=poses.q[pose],
         configuration=pose, configuration_labels=tuple(map(str, range(1, T + 1))),
         repeat=np.zeros(len(pose), dtype=np.int64), marker=np.tile(np.repeat(markers, states), T),
-        force=force,
+        force=poses.force[pose] * loaded[:, None],
     )  # fmt: skip
-    settled = np.isfinite(model.deflection(new, arm.x)).all(axis=1)
-    good = np.bincount(pose, ~settled, minlength=T) == 0
-    new = new.take(np.flatnonzero(good[pose]))
+    still = np.isfinite(model.deflection(new, x)).all(axis=1)
+    good = np.bincount(pose, ~still, minlength=T) == 0
+    new = new.take(good[pose])
     if not len(new):
-        return np.zeros((0, 3, 0)), np.zeros((0, 3, 0)), np.zeros(0)
+        return np.zeros((0, 1, len(x))), np.zeros(0)
     again = observe(new, observed.kind)
-    B = model.regressor(new, arm.x, observations=again).B
-    A = B.reshape(len(again.lead), again.size, -1)[:, :3]
-    known, off = _moves(arm, left, A)
+    B = model.regressor(new, x, observations=again).B
     weight = poses.weight[new.configuration[again.lead]]
-    return known, off, weight / weight.sum()
+    return B.reshape(len(again.lead), again.size, -1), weight / weight.sum()

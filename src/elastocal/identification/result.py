@@ -285,6 +285,37 @@ class Calibration(Result):
             tuple(doubts),
         )
 
+    def unmet(self, **limits: float | None) -> tuple[str, ...]:
+        """What of the required accuracy is not kept, a sentence for each; empty where all is.
+
+        Args:
+            **limits: `heldout`, `new_poses` and `test` in m, 3-D rms (`new_poses`: the upper end
+                of the 95 % interval); by default those of the cell ([require]).
+
+        Raises:
+            UnknownNameError: A limit of another name.
+
+        Examples:
+            >>> fit = ec.identify("cell.toml", "data.csv")
+            >>> fit.unmet(heldout=1e-3)
+            ()
+            >>> fit.unmet(heldout=1e-6)
+            ('heldout: 124 µm where at most 1 µm is required',)
+        """
+        found = {
+            "heldout": self.heldout_rms,
+            "new_poses": math.inf if self.predicted is None else self.predicted.ci95[1],
+            "test": math.inf if self.test is None else self.test.rms,
+        }
+        told = []
+        for name, most in (vars(self.model.cell.require) | limits).items():
+            if name not in found:
+                raise UnknownNameError.of("limit", name, found)
+            if most is not None and not found[name] <= most:
+                value = f"{found[name] * 1e6:.3g} µm" if math.isfinite(found[name]) else "not known"
+                told.append(f"{name}: {value} where at most {most * 1e6:.3g} µm is required")
+        return tuple(told)
+
     @property
     def faulty(self) -> tuple[Outlier, ...]:
         """Readings beyond the noise, whether they had a part in the fit or were set apart."""

@@ -36,17 +36,20 @@ class OpenParameters:
     `mixing` (K, D): a deviation of X_D went into the estimates of the K determined parameters as
     mixing · X_D, the least-squares solution of ∂(readings)/∂X_D ≈ ∂(readings)/∂X_K · mixing at
     the poses measured.  `typical` (D,): typical deviations in SI units, 0 where none is known.
+    `redundant`: those that no pose under the loads measured tells from the rest: it is the model
+    that has one parameter too many, and nothing needs to be done.
     """
 
     names: tuple[str, ...]
     mixing: Array
     typical: Array
+    redundant: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready; numbers in SI units."""
         return {
             "names": list(self.names), "typical": self.typical.tolist(),
-            "mixing": self.mixing.tolist(),
+            "mixing": self.mixing.tolist(), "redundant": list(self.redundant),
         }  # fmt: skip
 
 
@@ -288,7 +291,7 @@ def _left_open(
             f"{path}: open does not say names, typical sizes and shares of the parameters left "
             "open; write the result anew with identify"
         )
-    return OpenParameters(names, mixing, typical)
+    return OpenParameters(names, mixing, typical, tuple(map(str, stated.get("redundant", []))))
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:

@@ -144,12 +144,22 @@ def nominal_known(result: Calibration, name: str) -> bool:
 def undetermined_lines(result: Calibration) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason."""
     lines = []
-    if names := names_of(result, INVISIBLE):
+    extra = {printable(name) for name in result.left.redundant} if result.left else set()
+    if names := [n for n in names_of(result, INVISIBLE) if n not in extra]:
         where = held_where(result, names)
         lines.append(f"{where} (not visible in these data): {', '.join(names)}")
-    if names := names_of(result, ABSORBED):
+    if names := [n for n in names_of(result, ABSORBED) if n not in extra]:
         where = held_where(result, names)
-        lines.append(f"{where}, absorbed in a combination: {', '.join(names)}")
+        lines.append(
+            f"{where}, absorbed in a combination that these poses do not take apart: "
+            f"{', '.join(names)}"
+        )
+    if names := [n for s in (INVISIBLE, ABSORBED) for n in names_of(result, s) if n in extra]:
+        where = held_where(result, names)
+        lines.append(
+            f"{where}, redundant by construction (no pose under such loads shows them; nothing to "
+            f"do): {', '.join(names)}"
+        )
     if names := names_of(result, FIXED):
         lines.append(f"fixed by the user: {', '.join(names)}")
     return lines
@@ -597,8 +607,8 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     ),
     "little_gain": lambda f: "that is hardly better than the nominal arm",
     "few_configurations": lambda f: (
-        f"{f.numbers['configurations']} configurations leave {f.numbers['equations_left']} equations "
-        f"beyond {f.numbers['parameters']} parameters, too few to judge by (needed: "
+        f"{f.numbers['configurations']} configurations leave {f.numbers['equations_left']} "
+        f"equations beyond {f.numbers['parameters']} parameters, too few to judge by (needed: "
         f"{f.numbers['needed']})"
     ),
     "noise_unknown": lambda f: (
