@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, option
+from elastocal.identification.mistakes import unheard_of
 from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary, held_out_residual
@@ -210,6 +211,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         of_solution = tuple(f for f in result.findings if f.kind in OF_SOLUTION)
     found = [
         *_spoilt(result),
+        *_unheard_of(result),
         *_few_poses(result),
         *(f for f in of_solution if f.kind == "ill_conditioned"),
         *_against_stated_noise(result),
@@ -252,6 +254,22 @@ def _spoilt(result: Calibration) -> Iterator[Finding]:
     if math.isfinite(held) and math.isfinite(nominal) and held >= nominal:
         numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
         yield Finding("no_better_than_nominal", "poor", numbers)
+
+
+def _unheard_of(result: Calibration) -> Iterator[Finding]:
+    """Values that no arm has: an effect is missing, or hardly anything holds them."""
+    far = unheard_of(result.model, result.x)
+    if far:
+        values = [result[name] for name in far]
+        yield Finding(
+            "unheard_of", "care",
+            {
+                "parameters": tuple(far), "typical_sizes": tuple(far.values()),
+                "values": tuple(e.held for e in values),
+                "units": tuple(e.unit for e in values), "readings_set_apart": len(result.excluded),
+            },
+            LACKING,
+        )  # fmt: skip
 
 
 def _few_poses(result: Calibration) -> Iterator[Finding]:

@@ -187,6 +187,8 @@ def what_was_identified(result: Calibration) -> str:
         text += f"; {unseen} not visible in these data"
     if fixed := len(names_of(result, FIXED)):
         text += f"; {fixed} fixed by the user"
+    if (far := result.finding("unheard_of")) is not None:
+        text += f"; {len(far.listed('parameters'))} at values that no arm has"
     return text + counted_functions(result) + "."
 
 
@@ -605,6 +607,7 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "fit_flatters": lambda f: (
         f"unseen poses are worse than fitted ones ({_length(f, 'residual_rms_um')})"
     ),
+    "unheard_of": lambda f: _unheard_of(f),
     "little_gain": lambda f: "that is hardly better than the nominal arm",
     "few_configurations": lambda f: (
         f"{f.numbers['configurations']} configurations leave {f.numbers['equations_left']} "
@@ -634,6 +637,25 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"test data are off by {_length(f, 'test_rms_um')} rms, more than chance explains"
     ),
 }
+
+
+def _unheard_of(f: Finding) -> str:
+    """ "no arm has such values (link6.dx 32.1 mm, 32 typical sizes): …" """
+    each = zip(
+        f.listed("parameters"), f.listed("values"), f.listed("units"), f.listed("typical_sizes"),
+        strict=True,
+    )  # fmt: skip
+    shown = []
+    for name, value, unit, sizes in each:
+        number, shown_unit = display(float(value), str(unit))
+        shown.append(
+            f"{printable(str(name))} at {significant(number)} {shown_unit}, "
+            f"{significant(float(sizes), 2)} typical deviations from nominal"
+        )
+    return (
+        f"no arm has such values ({listed(shown, 3)}): most likely an effect is missing that they "
+        "stand in for, or these poses hardly tell them from others"
+    )
 
 
 def _accuracy(result: Calibration) -> str:
