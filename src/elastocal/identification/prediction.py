@@ -25,6 +25,7 @@ from scipy import linalg, stats
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
+from elastocal.identification.methods import EXACT
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.solve import STRUCTURAL, Solution, free_r_factor
@@ -41,6 +42,7 @@ from elastocal.units import Array, IntArray
 
 OUTSIDE = 1e-6  # share of the tool's motion that may lie outside what is known: rounding
 SPARE = 4  # readings for every parameter, at random poses
+NEVER_SHOWN = 0.1  # standard deviations; a hundred times as many readings would show one
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
 
 
@@ -127,8 +129,12 @@ def left_open(solution: Solution) -> OpenParameters:
 
 
 def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str, ...]:
-    """Which of the parameters left open no pose tells from the rest: at poses over the whole joint
-    range, their columns of B lie in the span of those determined and of the others left open."""
+    """Which of the parameters left open no pose tells from the rest.
+
+    At poses over the whole joint range, their columns of B lie in the span of those determined and
+    of the others left open, but for so little that as many readings as these would show a typical
+    deviation by less than NEVER_SHOWN standard deviations.
+    """
     problem, kept = solution.problem, solution.reduction.kept
     model, observed = problem.model, problem.observations
     if not len(open_):
@@ -138,17 +144,19 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
         B = readings_at(model, solution.fit.x, observed, anywhere)[0]
     except ElastocalError:
         return ()
-    B = B.reshape(-1, B.shape[2]) * np.where(typical > 0, typical, 1.0)
+    parts = solution.fit.residual.reshape(-1, observed.size)
+    noise = np.sqrt((parts**2).mean(axis=0))[:, None]
+    B = (B / np.maximum(noise, EXACT)).reshape(-1, B.shape[2])
+    B *= np.where(typical > 0, typical, 1.0) * np.sqrt(len(parts) * observed.size / len(B))
     known = B[:, kept[~model.shrunk[kept]]]
     basis = linalg.qr(known, mode="economic")[0]
     off = B[:, open_] - basis @ (basis.T @ B[:, open_])
     off -= basis @ (basis.T @ off)
     _, R, order = linalg.qr(off, mode="economic", pivoting=True)
-    length = np.linalg.norm(B[:, open_], axis=0)
-    least = STRUCTURAL * max(length.max(initial=0.0), np.linalg.norm(known, axis=0).max(initial=0))
+    least = STRUCTURAL * max(np.linalg.norm(B, axis=0))
     pivot = np.zeros(len(open_))
     pivot[: min(R.shape)] = np.abs(np.diag(R))
-    none = pivot <= np.maximum(least, OUTSIDE * length[order])
+    none = pivot <= np.where(typical[open_[order]] > 0, max(least, NEVER_SHOWN), least)
     return tuple(model.names[d] for d in open_[order[none]])
 
 

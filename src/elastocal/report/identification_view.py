@@ -150,10 +150,7 @@ def undetermined_lines(result: Calibration) -> list[str]:
         lines.append(f"{where} (not visible in these data): {', '.join(names)}")
     if names := [n for n in names_of(result, ABSORBED) if n not in extra]:
         where = held_where(result, names)
-        lines.append(
-            f"{where}, absorbed in a combination that these poses do not take apart: "
-            f"{', '.join(names)}"
-        )
+        lines.append(f"{where}, absorbed in a combination: {', '.join(names)}")
     if names := [n for s in (INVISIBLE, ABSORBED) for n in names_of(result, s) if n in extra]:
         where = held_where(result, names)
         lines.append(
@@ -598,7 +595,8 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"does as well ({_length(f, 'nominal_rms_um')})"
     ),
     "not_held_out": lambda f: (
-        "how well it predicts other poses is not known: some pose alone determines a parameter"
+        "how well it predicts poses left out is not known: some pose alone determines a parameter, "
+        "and nothing checks it"
     ),
     "residual_above_stated_noise": lambda f: (
         f"the residual is {significant(f.number('ratio'))} times the stated noise"
