@@ -152,7 +152,8 @@ def _limits(stated: list[str]) -> dict[str, float | None]:
     from elastocal.errors import InputError, option
     from elastocal.text import listed
 
-    names, limits = tuple(vars(Acceptance())), {}
+    names = tuple(vars(Acceptance()))
+    limits: dict[str, float | None] = {}
     for text in stated:
         name, _, number = text.partition("=")
         try:

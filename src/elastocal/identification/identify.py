@@ -97,9 +97,7 @@ def identify(
     else:
         found = run_method(every, sound, faulty, refit, options, progress)
         if not found.good.all() and options.faulty == "auto":
-            found = _kept_where_sensible(
-                model, found, every, sound, faulty, refit, options, progress
-            )
+            found = _kept_where_sensible(found, every, sound, faulty, refit, options, progress)
     progress("intervals and held-out residuals")
     outliers = describe(every, found.solution, ~found.good)
     result = summarise(model, every, sound, found, outliers, new_poses)
