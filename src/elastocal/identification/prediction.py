@@ -312,7 +312,7 @@ def over_the_workspace(cell: Cell, model: Model, table: Measurements) -> NewPose
         forces = forces[(forces != 0).any(axis=1)]
     if not len(forces):
         forces = np.zeros((1, 3))
-    source = f"{POSES} poses drawn over the joint limits (the cell states no test poses)"
+    source = f"{POSES} poses drawn over the joint limits, as the cell states no test poses"
     return NewPoses(q, np.resize(forces, (POSES, 3)), np.full(POSES, 1 / POSES), source)
 
 

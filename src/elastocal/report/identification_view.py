@@ -568,7 +568,8 @@ def judgement(result: Calibration, sections: bool = False) -> Judgement:
     verdict = result.verdict
     if trust.severity == "care":
         named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
-        text = f"Use this calibration with care: {told}, but {named}."
+        at = "" if verdict.at is None else f", at new poses to {length(verdict.at)} at 95 %"
+        text = f"Use this calibration with care: {told}{at}, but {named}."
         return Judgement("care", text, steps)
     compared = result.finding("residual_agrees_with_stated_noise", "residual_below_stated_noise")
     noise = "" if compared is None else ", and the residual is noise"
