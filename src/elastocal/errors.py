@@ -42,6 +42,12 @@ class InsufficientDataError(ElastocalError):
     exit_code = 1
 
 
+class NotAcceptedError(ElastocalError):
+    """The calibration is done and written, but does not keep what was required of it."""
+
+    exit_code = 3
+
+
 class UnknownNameError(InputError, KeyError):
     """A name that is not there, looked up in a result or a model.  It is a KeyError too."""
 

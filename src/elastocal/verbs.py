@@ -27,13 +27,15 @@ from elastocal.text import did_you_mean, listed, quoted
 
 if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
-    from elastocal.compensation.tool import Targets, ToolPoint
+    from elastocal.compensation.targets import Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.intervals import IntervalKind
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, Method
+    from elastocal.identification.prediction import NewPoses
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
+    from elastocal.model.calibrated_tool import ToolPoint
     from elastocal.planning.design import DesignOptions, Effort
     from elastocal.planning.plan import Plan
 
@@ -465,7 +467,19 @@ def identify(
         prior = prior or known_prior
     if prior is not None or constraints is not None:
         options = replace(options, constraints=constraints, prior=prior)
-    return run(made, table, options, kept_back, tell)
+    return run(made, table, options, kept_back, tell, _new_poses(made))
+
+
+def _new_poses(model: Model) -> NewPoses | None:
+    """Where the cell says that position must be right; None where it says nothing."""
+    from elastocal.identification.prediction import NewPoses
+    from elastocal.planning.test_poses import test_poses
+
+    spec = model.cell.design
+    if not spec.test_poses and spec.test_path is None and spec.test_box is None:
+        return None
+    found = test_poses(model.cell, model.chain)
+    return NewPoses(found.q, found.force, found.weight, found.source.removeprefix("test poses: "))
 
 
 def diagnose(
@@ -599,14 +613,14 @@ def compensate(
 
 def check_frame(frame: str) -> None:
     """Raise InputError for a frame that targets cannot stand in."""
-    from elastocal.compensation.tool import FRAMES
+    from elastocal.compensation.targets import FRAMES
 
     told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
     require(frame in FRAMES, told)
 
 
 def _tool_point(cell: Cell, point: str | ArrayLike | None) -> ToolPoint:
-    from elastocal.compensation.tool import tool_point
+    from elastocal.model.calibrated_tool import tool_point
 
     if point is None or isinstance(point, str):
         return tool_point(cell, point)
@@ -621,7 +635,7 @@ def _targets(
     frame: Literal["base", "tracker"],
     force: NDArray[np.float64] | None,
 ) -> Targets:
-    from elastocal.compensation.tool import Targets, read_targets, targets_at
+    from elastocal.compensation.targets import Targets, read_targets, targets_at
 
     if isinstance(targets, Targets):
         return targets

@@ -22,10 +22,10 @@ from support.cells import (
 from support.commands import calibrated, circumstances, erring, tool_errors
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.compensation import nominal_flanges, targets_at, tool_point
+from elastocal.compensation import nominal_flanges, targets_at
 from elastocal.compensation.compensate import compensate
 from elastocal.errors import InputError
-from elastocal.model import Model
+from elastocal.model import Model, tool_point
 
 EVERYWHERE = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 SOME = ("joint_offset", "link_geometry:link3", "joint_compliance")

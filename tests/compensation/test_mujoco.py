@@ -9,8 +9,9 @@ import pytest
 from support.cells import COMPLIANCE, DOWN, LOAD_POINT, kr270_cell, kr270_chain
 from support.commands import calibrated
 
-from elastocal.compensation import nominal_flanges, targets_at, tool_point
+from elastocal.compensation import nominal_flanges, targets_at
 from elastocal.compensation.compensate import compensate
+from elastocal.model import tool_point
 from elastocal.simulation import MujocoArm
 
 POSTURES = np.radians(

@@ -13,18 +13,11 @@ from hypothesis import strategies as st
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated
 
-from elastocal.compensation import (
-    commands_csv,
-    one_target,
-    read_targets,
-    share_of_levels,
-    summary,
-    targets_at,
-    tool_point,
-)
+from elastocal.compensation import commands_csv, one_target, read_targets, summary, targets_at
 from elastocal.compensation.compensate import compensate
 from elastocal.errors import ElastocalError, InputError
 from elastocal.measurements import read_plan
+from elastocal.model import share_of_levels, tool_point
 
 KINDS = ("revolute",) * 6
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"

@@ -192,9 +192,9 @@ def commands():
     from support.cells import kr270_cell
     from support.commands import calibrated, erring
 
-    from elastocal.compensation import targets_at, tool_point
+    from elastocal.compensation import targets_at
     from elastocal.compensation.compensate import compensate
-    from elastocal.model import Model
+    from elastocal.model import Model, tool_point
 
     cell = kr270_cell(("joint_offset", "joint_compliance"))
     x = erring(Model.assembled(kr270_chain(), cell), np.random.default_rng(1), 0.5)

@@ -34,7 +34,9 @@ def fine(case: Any) -> Any:
 def test_what_nothing_speaks_against_can_be_trusted(fine: Any) -> None:
     found = judgement(fine)
     assert found.tone == "good"
-    assert found.headline.startswith("This calibration can be trusted: positions in poses that")
+    at = f"{1e6 * fine.predicted.ci95[1]:.3g}"
+    assert found.headline.startswith("This calibration can be trusted at ")
+    assert at[:2] in found.headline.partition(": positions in poses that")[0]
     assert any("give them with `test`" in step for step in found.steps)
     assert not any("diagnose" in step for step in found.steps)
     tested = replace(fine, test=TestErrors(fine.heldout_rms, 0.0, 0.0, 9))

@@ -20,7 +20,7 @@ from elastocal.cell.file_keys import (
 )
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.config import Table, Text, Vector2, checked, header, key, read_toml
+from elastocal.config import Positive, Table, Text, Vector2, checked, header, key, read_toml
 from elastocal.errors import require
 from elastocal.files import check_exists
 from elastocal.plugin_loader import is_plugin_file, load_plugins
@@ -44,6 +44,20 @@ def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
         if is_plugin_file(module):
             check_exists(spot.path.parent / module, f"plugins.modules[{i}]", spot.path)
     return tuple(str(spot.path.parent / m) if is_plugin_file(m) else m for m in modules)
+
+
+@record
+class Acceptance:
+    """What a calibration must keep to be accepted: 3-D rms errors in m, None for any.
+
+    `heldout`: in poses left out of the fit, the noise of a reading included; `new_poses`: the
+    upper end of the 95 % interval of the arm's own error where it will be used; `test`: on
+    readings that took no part in the fit.
+    """
+
+    heldout: Positive | None = keyed("a positive number in µm", "heldout_um", default=None)
+    new_poses: Positive | None = keyed("a positive number in µm", "new_poses_um", default=None)
+    test: Positive | None = keyed("a positive number in µm", "test_um", default=None)
 
 
 @record
@@ -82,6 +96,7 @@ class Cell:
     )
     workspace: Workspace = keyed("a table", default_factory=Workspace)
     design: DesignSpec = keyed("a table", default_factory=DesignSpec)
+    require: Acceptance = keyed("a table", default_factory=Acceptance)
     plugins: Many[Text] = keyed("a table", form=PluginsTable, into=_modules, default=())
 
     def __post_init__(self) -> None:

@@ -99,10 +99,11 @@ def compensate(
     Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
     """
     from elastocal import verbs
-    from elastocal.compensation.tool import one_target, tool_point
+    from elastocal.compensation.targets import one_target
     from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
+    from elastocal.model.calibrated_tool import tool_point
 
     # What can be wrong with the options is told before any file is read.
     verbs.check_frame(frame)
@@ -180,7 +181,7 @@ def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
     import numpy as np
 
     from elastocal.compensation.compensate import in_file_units
-    from elastocal.compensation.tool import numbers
+    from elastocal.model.calibrated_tool import numbers
     from elastocal.model.chain import joint_limits
 
     if text is None:
@@ -202,7 +203,7 @@ def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) 
     from scipy.spatial.transform import Rotation
 
     from elastocal.compensation.correction_table import box_grid, joint_grid
-    from elastocal.compensation.tool import numbers
+    from elastocal.model.calibrated_tool import numbers
 
     try:
         counts = tuple(int(part) for part in grid.split(","))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -97,6 +98,14 @@ def identify(
             "drop, keep. They are listed in any case."
         ),
     ] = "auto",
+    require: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=UM",
+            help="Largest error in µm that is accepted: heldout=, new_poses=, test=; repeatable, "
+            "else as [require] of the cell says. Exit code 3 where one is exceeded.",
+        ),
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Processes of a bootstrap; -1 for all cores.")] = 1,
     seed: Seed = 0,
     as_json: Json = False,
@@ -107,10 +116,12 @@ def identify(
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
     """
     from elastocal import verbs
+    from elastocal.errors import NotAcceptedError
     from elastocal.measurements import read_matrix
     from elastocal.model.choice import cell_of
 
     written = check_outputs(output, report, residuals)
+    limits = _limits(require or [])
     inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
     known = cell_of(cell)  # its plug-ins may have the noise model
     check_apart(written, inputs, known)
@@ -125,12 +136,37 @@ def identify(
         write_results(result, output, report, residuals, inputs, seed=seed)
     if as_json:
         say(json_text(result.to_json()))
-        return
-    from elastocal.report.terminal import print_result
+    else:
+        from elastocal.report.terminal import print_result
 
-    print_result(console(), result)
-    for path in written:
-        say(f"wrote {path}")
+        print_result(console(), result)
+        for path in written:
+            say(f"wrote {path}")
+    if unmet := result.unmet(**limits):
+        raise NotAcceptedError(f"not accepted: {'; '.join(unmet)}")
+
+
+def _limits(stated: list[str]) -> dict[str, float | None]:
+    """NAME=UM as limits in m."""
+    from elastocal.cell.work_cell import Acceptance
+    from elastocal.errors import InputError, option
+    from elastocal.text import listed
+
+    names = tuple(vars(Acceptance()))
+    limits: dict[str, float | None] = {}
+    for text in stated:
+        name, _, number = text.partition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if name not in names or not 0 < value < math.inf:
+            raise InputError(
+                f"{option('require')} takes NAME=UM, NAME one of {listed(names)} and UM a positive "
+                f"number in µm; found '{text}'"
+            )
+        limits[name] = value * 1e-6
+    return limits
 
 
 def write_results(

@@ -6,7 +6,7 @@ ROOMS = {
     "commands": "nominal_path",
     "compensate": "Compensation commands_csv nominal_flanges summary",
     "correction_table": "CorrectionGrid box_grid joint_grid",
-    "tool": "one_target read_targets share_of_levels targets_at tool_point",
+    "targets": "one_target read_targets targets_at",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]
 __getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

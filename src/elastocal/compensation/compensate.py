@@ -16,18 +16,17 @@ from elastocal.compensation.commands import (
     Commanding,
     Goals,
     Solved,
-    Uncertainty,
     jumps,
     nominal_path,
-    position_uncertainty,
-    undetermined,
 )
-from elastocal.compensation.tool import CalibratedTool, Targets, ToolPoint
+from elastocal.compensation.targets import Targets
 from elastocal.errors import InsufficientDataError, option
+from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.identification.start import check_limits
 from elastocal.measurements import families
 from elastocal.model import rigid
 from elastocal.model.calibrated import CalibratedArm, lasting
+from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.effects import effect_of
 from elastocal.model.evaluate import BatchFunction
@@ -38,7 +37,6 @@ from elastocal.text import listed, plain
 from elastocal.units import Array, IntArray
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
-SENSITIVITIES = 5000  # rows at a time, which bounds the memory
 
 
 @dataclass(frozen=True, repr=False)
@@ -236,16 +234,10 @@ def _uncertainty(
 ) -> Uncertainty:
     n = len(q)
     covariance, unknown = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
-    blamed: dict[str, None] = {}
-    left = undetermined(tool, rows, seed)
     good = np.flatnonzero(reached)
-    for first in range(0, len(good), SENSITIVITIES):
-        some = good[first : first + SENSITIVITIES]
-        A = tool.sensitivity([values[some] for values in rows], q[some])
-        part = position_uncertainty(tool.calibrated, A, left)
-        covariance[some], unknown[some] = part.covariance, part.unknown
-        blamed |= dict.fromkeys(part.blamed)
-    return Uncertainty(covariance, unknown, tuple(blamed))
+    found = uncertainty_at(tool, [values[good] for values in rows], q[good], rows, seed)
+    covariance[good], unknown[good] = found.covariance, found.unknown
+    return Uncertainty(covariance, unknown, found.blamed)
 
 
 # Sentences about commands that are right but that somebody should look at.

@@ -12,9 +12,10 @@ from scipy.stats import qmc
 
 from elastocal.compensation.commands import Goals
 from elastocal.compensation.compensate import Compensation, compensate, nominal_flanges
-from elastocal.compensation.tool import CalibratedTool, Targets, ToolPoint, targets_at
+from elastocal.compensation.targets import Targets, targets_at
 from elastocal.errors import InputError, option
 from elastocal.model.calibrated import CalibratedArm, lasting
+from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.inverse_kinematics import Reaching
 from elastocal.units import Array

@@ -14,6 +14,12 @@ from elastocal.identification.intervals import Intervals
 from elastocal.identification.methods import MethodResult, is_exact
 from elastocal.identification.noise_summary import noise_of
 from elastocal.identification.outliers import Outlier
+from elastocal.identification.prediction import (
+    NewPoses,
+    left_open,
+    over_the_workspace,
+    predicted_error,
+)
 from elastocal.identification.residuals import ResidualSummary, rms_3d, summarise_residuals
 from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.identification.solve import Solution, residual_sigma
@@ -25,12 +31,14 @@ NOT_SHOWN = "held: the readings do not show the smooth function that it is part 
 
 
 def summarise(
-    model: Model, every: Solution, sound: Solution, found: MethodResult, faulty: tuple[Outlier, ...]
-) -> Calibration:
+    model: Model, every: Solution, sound: Solution, found: MethodResult,
+    faulty: tuple[Outlier, ...], new_poses: NewPoses | None = None,
+) -> Calibration:  # fmt: skip
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
     `every` holds all readings, `sound` the fit to those that agree.  `faulty` are the readings
-    beyond the noise: set apart where the method did so, else only listed.
+    beyond the noise: set apart where the method did so, else only listed.  `new_poses` are where
+    the arm will be used; without them it is the workspace that the joint limits span.
     """
     solution, final = found.solution, found.solution.fit
     kept = solution.reduction.kept
@@ -78,7 +86,15 @@ def summarise(
         active=found.active,
         prior_share=found.prior_share,
         smooth=found.smooth,
+        left=left_open(solution),
     )
+    dofs = found.intervals.covariance.dof
+    predicted = predicted_error(
+        result.arm, observed, result.excess, float(np.median(dofs)) if len(dofs) else np.inf,
+        new_poses or over_the_workspace(model.cell, model, observed.table),
+        np.random.default_rng(0),
+    )  # fmt: skip
+    result = replace(result, predicted=predicted)
     result = judged(result, of_solution(result, solution))
     return replace(result, warnings=found.warnings + warning_sentences(result))
 

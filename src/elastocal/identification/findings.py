@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, option
+from elastocal.identification.mistakes import unheard_of
 from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary, held_out_residual
@@ -19,6 +20,7 @@ from elastocal.identification.result import Calibration, Estimate, Finding, Numb
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.effects import CATALOGUE
+from elastocal.text import listed
 from elastocal.units import Array
 
 # Where the error of the nominal arm goes, step by step, as an identification can tell it.
@@ -209,12 +211,14 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         of_solution = tuple(f for f in result.findings if f.kind in OF_SOLUTION)
     found = [
         *_spoilt(result),
+        *_unheard_of(result),
         *_few_poses(result),
         *(f for f in of_solution if f.kind == "ill_conditioned"),
         *_against_stated_noise(result),
         *_repeats(result),
         *_visits(result),
         *_prediction(result),
+        *_new_poses(result),
         *(f for f in of_solution if f.kind != "ill_conditioned"),
         *_faulty(result),
         *_undetermined(result),
@@ -250,6 +254,22 @@ def _spoilt(result: Calibration) -> Iterator[Finding]:
     if math.isfinite(held) and math.isfinite(nominal) and held >= nominal:
         numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
         yield Finding("no_better_than_nominal", "poor", numbers)
+
+
+def _unheard_of(result: Calibration) -> Iterator[Finding]:
+    """Values that no arm has: an effect is missing, or hardly anything holds them."""
+    far = unheard_of(result.model, result.x)
+    if far:
+        values = [result[name] for name in far]
+        yield Finding(
+            "unheard_of", "care",
+            {
+                "parameters": tuple(far), "typical_sizes": tuple(far.values()),
+                "values": tuple(e.held for e in values),
+                "units": tuple(e.unit for e in values), "readings_set_apart": len(result.excluded),
+            },
+            LACKING,
+        )  # fmt: skip
 
 
 def _few_poses(result: Calibration) -> Iterator[Finding]:
@@ -363,6 +383,67 @@ def _prediction(result: Calibration) -> Iterator[Finding]:
         yield Finding("little_gain", "care", numbers)
 
 
+def _new_poses(result: Calibration) -> Iterator[Finding]:
+    """Is what is said of poses that nobody measured founded: on enough configurations, on a noise
+    that is known, on parameters that the readings show?"""
+    left, wanted = spare_equations(result), ENOUGH
+    if left < wanted:
+        numbers: dict[str, Number] = {
+            "configurations": len(np.unique(result.observations.configuration)),
+            "parameters": len(result.observations.value) - result.dof,
+            "equations_left": left, "needed": wanted,
+        }  # fmt: skip
+        yield Finding("few_configurations", "care", numbers, _more_poses())
+    if result.excess is None:
+        yield Finding("noise_unknown", "care", {}, STATE_NOISE)
+    found = result.predicted
+    if found is None:
+        return
+    numbers = {
+        "rms_um": _um(found.rms), "from_um": _um(found.ci95[0]), "to_um": _um(found.ci95[1]),
+        "poses": found.poses, "source": found.source,
+    }  # fmt: skip
+    yield Finding("new_poses", "note", numbers)
+    if found.open**2 > MOSTLY * found.rms**2:
+        yield Finding(
+            "new_poses_not_shown", "care",
+            {
+                "open_um": _um(found.open), "heldout_rms_um": _um(result.heldout_rms),
+                "parameters": found.blamed,
+            },
+            f"{_more_poses()} For a part of the joint ranges alone, state test poses in the cell.",
+        )  # fmt: skip
+    if found.rms > result.nominal_rms / LITTLE:
+        numbers = {"rms_um": _um(found.rms), "nominal_rms_um": _um(result.nominal_rms)}
+        yield Finding("new_poses_no_gain", "care", numbers, _more_poses())
+
+
+# Equations left between configurations from which their scatter says to a factor of 1.25, with
+# 95 % probability, what errors there are beyond the parameters: √(ν/χ²_ν(5 %)) ≤ 1.25.
+FACTOR = 1.25
+ENOUGH = next(n for n in range(1, 1000) if n <= FACTOR**2 * stats.chi2.ppf(0.05, n))
+
+
+def spare_equations(result: Calibration) -> int:
+    """Equations that configurations give beyond the parameters fitted.
+
+    A rigid body's place is six numbers in each load state, however many markers it has and however
+    often they are read.
+    """
+    observed = result.observations
+    table, lead = observed.table, observed.lead
+    state = np.column_stack([table.configuration, np.round(table.force, 3)])[lead]
+    _, code = np.unique(state, axis=0, return_inverse=True)
+    seen = np.unique(np.column_stack([code.ravel(), table.marker[lead]]), axis=0)[:, 0]
+    size = 1 if observed.kind == "distance" else observed.size
+    told = np.minimum(size * np.bincount(seen), 6)
+    return int(told.sum()) - int(np.sum(~result.model.shrunk[_columns(result)]))
+
+
+def _columns(result: Calibration) -> NDArray[np.bool_]:
+    return np.isin(result.model.names, result.determined)
+
+
 def _faulty(result: Calibration) -> Iterator[Finding]:
     n, fitted = len(result.faulty), len(result.observations.lead)
     if n:
@@ -380,13 +461,19 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
 
 
 def _undetermined(result: Calibration) -> Iterator[Finding]:
+    """What these poses do not show, and what no pose shows: only the first is to be measured."""
     all_of_them = standings(result)
-    found = [all_of_them[e.name] for e in result.ordinary]
-    if n := found.count(INVISIBLE) + found.count(ABSORBED):
+    lacking = [e.name for e in result.ordinary if all_of_them[e.name] in (INVISIBLE, ABSORBED)]
+    redundant = () if result.left is None else result.left.redundant
+    shown = [name for name in lacking if name not in redundant]
+    if n := len(lacking) - len(shown):
+        yield Finding("redundant", "good", {"parameters": n})
+    if n := len(shown):
         yield Finding(
-            "undetermined", "note", {"parameters": n},
-            f"{n} parameter{'' if n == 1 else 's'} cannot be had from these data. Poses and loads "
-            "like those measured are predicted all the same; for others, measure what shows them.",
+            "undetermined", "note", {"parameters": n, "names": tuple(shown)},
+            f"{n} parameter{'' if n == 1 else 's'} cannot be had from these data "
+            f"({listed(shown, 4)}). Poses and loads like those measured are predicted all the "
+            "same; for others, measure what shows them.",
         )  # fmt: skip
 
 

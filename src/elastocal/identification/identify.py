@@ -7,12 +7,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.errors import ElastocalError
 from elastocal.identification.estimates import summarise
 from elastocal.identification.findings import judged
-from elastocal.identification.methods import is_exact, run_method, with_smooth
-from elastocal.identification.mistakes import refuse_nonsense
+from elastocal.identification.methods import (
+    MethodResult,
+    Refit,
+    is_exact,
+    run_method,
+    with_smooth,
+)
+from elastocal.identification.mistakes import refuse_nonsense, unheard_of
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
+from elastocal.identification.prediction import NewPoses
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.result import Calibration, TestErrors
 from elastocal.identification.solve import Problem, Solution, solve
@@ -44,12 +52,14 @@ def identify(
     options: Options | None = None,
     test: Measurements | None = None,
     progress: Progress = lambda message: None,
+    new_poses: NewPoses | None = None,
 ) -> Calibration:
     """Parameters with intervals from nothing but the nominal arm and a table.
 
     Start by registration, a first fit weakly tied to it, choice of a minimal complete set of
     parameters, search for faulty readings; then the method: by default weights from a noise model
     whose variances restricted likelihood estimates, and intervals that know they are estimated.
+    `new_poses` are where the arm will be used; by default the workspace that its limits span.
 
     Raises InputError for data that contradict robot or cell, InsufficientDataError where the
     data cannot determine the model.
@@ -86,12 +96,31 @@ def identify(
         found = with_smooth(every, sound, faulty, free, options, progress)
     else:
         found = run_method(every, sound, faulty, refit, options, progress)
+        if not found.good.all() and options.faulty == "auto":
+            found = _kept_where_sensible(found, every, sound, faulty, refit, options, progress)
     progress("intervals and held-out residuals")
     outliers = describe(every, found.solution, ~found.good)
-    result = summarise(model, every, sound, found, outliers)
+    result = summarise(model, every, sound, found, outliers, new_poses)
     if test is None:
         return result
     return judged(replace(result, test=_test_errors(model, result.x, test)))
+
+
+def _kept_where_sensible(
+    found: MethodResult, every: Solution, sound: Solution,
+    faulty: NDArray[np.bool_], refit: Refit, options: Options, progress: Progress,
+) -> MethodResult:  # fmt: skip
+    """The result with all readings, where setting some apart leaves values that no arm has and
+    keeping them does not: then an effect is missing, and those readings show it."""
+    model = every.problem.model
+    if not unheard_of(model, found.solution.fit.x):
+        return found
+    progress("fitting all readings: without some, the values are none of an arm")
+    try:
+        kept = run_method(every, sound, faulty, refit, replace(options, faulty="keep"), progress)
+    except (ElastocalError, np.linalg.LinAlgError):
+        return found
+    return found if unheard_of(model, kept.solution.fit.x) else kept
 
 
 def _silent(message: str) -> None:

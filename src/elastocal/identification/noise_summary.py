@@ -81,12 +81,14 @@ TOO_LARGE = (
 
 @dataclass(frozen=True)
 class NoiseSize:
-    """An estimated standard deviation `sigma` in m (rad), or the `factor` on the stated noise."""
+    """An estimated standard deviation `sigma` in m (rad), or the `factor` on the stated noise;
+    `joints` are those whose scatter it is."""
 
     name: str
     sigma: float | None
     factor: float | None = None
     of_joints: bool = False
+    joints: tuple[int, ...] = ()
 
     @property
     def shared(self) -> bool:
@@ -224,7 +226,7 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
         for name, v in zip(names, fit.own, strict=True)
     ]
     shared = [
-        NoiseSize(SCATTER.format(e.name), float(np.sqrt(v)), None, True)
+        NoiseSize(SCATTER.format(e.name), float(np.sqrt(v)), None, True, e.joints)
         if e.joints
         else NoiseSize(f"{COMMON} {e.name}", float(np.sqrt(v)))
         for e, v in zip(fit.shared, fit.common, strict=True)

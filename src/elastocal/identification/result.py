@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from elastocal.above import Result
 from elastocal.errors import UnknownNameError
@@ -16,9 +17,18 @@ from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outliers import Outlier
+from elastocal.identification.prediction import (
+    Excess,
+    Position,
+    PredictedError,
+    excess_of,
+    position_at,
+    scatter_of,
+)
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.smooth_part import SmoothPart
-from elastocal.model.calibrated import CalibratedArm, nominal_flange_rows
+from elastocal.model.calibrated import CalibratedArm, OpenParameters, nominal_flange_rows
+from elastocal.model.calibrated_tool import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.units import Array
@@ -148,6 +158,33 @@ class Finding:
         }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """Can the calibration be used, and how far is it to be trusted?
+
+    Trusted at `at` (m) means: where the arm will be used its noise-free position error is at most
+    that (3-D rms over the poses), with 97.5 % probability, and nothing is `missing` that this
+    rests on: configurations beyond the parameters, a residual that the noise explains, a predicted
+    error.  `tone` is good (trusted), care (what is missing is named), poor (do not use it).
+    """
+
+    tone: Severity
+    at: float | None
+    missing: tuple[Finding, ...]
+
+    @property
+    def trusted(self) -> bool:
+        return self.tone == "good"
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-ready; None where no error at new poses can be told."""
+        return {
+            "tone": self.tone, "trusted": self.trusted,
+            "at_um": None if self.at is None else self.at * 1e6,
+            "missing": [f.kind for f in self.missing],
+        }  # fmt: skip
+
+
 @dataclass(frozen=True, repr=False)
 class Calibration(Result):
     """What `identify` found: a mapping from parameter names to `Estimate`s, and all around it.
@@ -182,6 +219,9 @@ class Calibration(Result):
         active: Constraints that hold with equality.
         prior_share: By parameter the share of its information that the prior gave, 0 to 1; empty
             without a prior.
+        left: The parameters that the data left open, and what they stand for.
+        predicted: The error to be expected at poses that nobody measured, without the noise of
+            a reading; None where it cannot be told.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -225,12 +265,56 @@ class Calibration(Result):
     prior_share: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     smooth: tuple[SmoothPart, ...] = ()
+    left: OpenParameters | None = None
+    predicted: PredictedError | None = None
 
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
         """The estimates of all parameters but those of smooth functions."""
         shrunk = {p.name for p in self.model.parameters if p.shrunk}
         return tuple(e for e in self.estimates if e.name not in shrunk)
+
+    @property
+    def verdict(self) -> Verdict:
+        """The judgement that terminal, page, notebook and JSON give."""
+        doubts = (f for f in self.findings if f.kind != "trust" and f.severity in ("care", "poor"))
+        trust = self.finding("trust")
+        return Verdict(
+            "care" if trust is None else trust.severity,
+            None if self.predicted is None else self.predicted.ci95[1],
+            tuple(doubts),
+        )
+
+    def unmet(self, **limits: float | None) -> tuple[str, ...]:
+        """What of the required accuracy is not kept, a sentence for each; empty where all is.
+
+        Args:
+            **limits: `heldout`, `new_poses` and `test` in m, 3-D rms (`new_poses`: the upper end
+                of the 95 % interval); by default those of the cell ([require]).
+
+        Raises:
+            UnknownNameError: A limit of another name.
+
+        Examples:
+            >>> fit = ec.identify("cell.toml", "data.csv")
+            >>> fit.unmet(heldout=1e-3)
+            ()
+            >>> fit.unmet(heldout=1e-6)
+            ('heldout: 124 µm where at most 1 µm is required',)
+        """
+        found = {
+            "heldout": self.heldout_rms,
+            "new_poses": math.inf if self.predicted is None else self.predicted.ci95[1],
+            "test": math.inf if self.test is None else self.test.rms,
+        }
+        told = []
+        for name, most in (vars(self.model.cell.require) | limits).items():
+            if name not in found:
+                raise UnknownNameError.of("limit", name, found)
+            if most is not None and not found[name] <= most:
+                value = f"{found[name] * 1e6:.3g} µm" if math.isfinite(found[name]) else "not known"
+                told.append(f"{name}: {value} where at most {most * 1e6:.3g} µm is required")
+        return tuple(told)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
@@ -290,7 +374,46 @@ class Calibration(Result):
             self.covariance,
             self.observations.table.source,
             tuple(_estimate_json(e) for e in self.estimates),
+            self.left,
         )
+
+    @cached_property
+    def excess(self) -> Excess | None:
+        """By how much configurations scatter beyond their noise; None where nothing tells it."""
+        rng = np.random.default_rng(0)
+        return excess_of(self.observations, self.residual, self.dof, self.noise, rng)
+
+    def position(
+        self, q: ArrayLike, load: ArrayLike | None = None, point: str | None = None
+    ) -> Position:
+        """Where the tool is at any pose, with covariance and region.
+
+        Args:
+            q: Commanded joints (joints,) or (n, joints), in rad or m.
+            load: Force (3,) or (n, 3) in N at the load point, in the data's frame; default none.
+            point: A marker, or "x,y,z" in m in the flange frame; default the cell's load point,
+                else its only marker.
+
+        Returns:
+            The `Position` of n poses: place, its covariance, the scatter of a single visit, and
+            the half axes of its region.
+
+        Raises:
+            InputError: A shape does not fit, the point is unknown, or the model needs more than
+                joints and load.
+
+        Examples:
+            >>> fit = ec.identify("cell.toml", "data.csv")
+            >>> at = fit.position([0.0, -1.0, 1.0, 0.0, 0.5, 0.0], load=[0, 0, -2600])
+            >>> at.position.shape, at.covariance.shape, bool((at.half_axes() < 1e-3).all())
+            ((1, 3), (1, 3, 3), True)
+        """
+        model = self.model
+        tool = CalibratedTool(self.arm, tool_point(model.cell, point))
+        table = model.table(q, load)
+        lacking = 0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean()))
+        scatter = scatter_of(self.noise, model.chain.n_joints)
+        return position_at(tool, table, table.q, lacking, scatter)
 
     def combination(self, first: str) -> Combination:
         """The combination whose first member is `first`; UnknownNameError where there is none."""
@@ -358,6 +481,9 @@ class Calibration(Result):
             "test_rms_um": None if self.test is None else _um(self.test.rms),
             "test_mean_um": None if self.test is None else _um(self.test.mean),
             "test_max_um": None if self.test is None else _um(self.test.maximum),
+            "verdict": self.verdict.to_json(),
+            "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
+            "open": None if self.left is None else self.left.to_json(),
             "noise": self.noise.to_json(),
             "residual_summary": (
                 None if self.residual_summary is None else self.residual_summary.to_json()

@@ -6,6 +6,7 @@ ROOMS = {
     "arm": "Arm Parameter ParameterSpec Setting row_inputs",
     "c_engine": "find_compiler",
     "calibrated": "CalibratedArm nominal_flange_rows read_calibrated",
+    "calibrated_tool": "CalibratedTool ToolPoint share_of_levels tool_point",
     "chain": "Chain Joint LinkMass finite_ranges joint_index joint_limits",
     "choice": "choose_effects load_chain",
     "dh": "read_dh",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,30 @@ SAME = 1e-6  # m, and of directions: two arms of one design differ by nothing
 MOST_BYTES = 200_000_000  # a covariance of 3000 parameters
 
 
+@dataclass(frozen=True)
+class OpenParameters:
+    """The parameters D that the data left open, by `names` (D,), and what they stand for.
+
+    `mixing` (K, D): a deviation of X_D went into the estimates of the K determined parameters as
+    mixing · X_D, the least-squares solution of ∂(readings)/∂X_D ≈ ∂(readings)/∂X_K · mixing at
+    the poses measured.  `typical` (D,): typical deviations in SI units, 0 where none is known.
+    `redundant`: those that no pose under the loads measured tells from the rest: it is the model
+    that has one parameter too many, and nothing needs to be done.
+    """
+
+    names: tuple[str, ...]
+    mixing: Array
+    typical: Array
+    redundant: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-ready; numbers in SI units."""
+        return {
+            "names": list(self.names), "typical": self.typical.tolist(),
+            "mixing": self.mixing.tolist(), "redundant": list(self.redundant),
+        }  # fmt: skip
+
+
 @dataclass(frozen=True, repr=False)
 class CalibratedArm(Saved):
     """A calibrated arm: a model and the parameter values that it predicts with.
@@ -44,6 +68,7 @@ class CalibratedArm(Saved):
         covariance: (determined, determined), theirs.
         source: What it came from: the result file, or the table it was identified with.
         entries: What identify says of each parameter, as in its JSON, in the model's order.
+        left: The parameters that the data left open; None in results that do not say.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -59,6 +84,7 @@ class CalibratedArm(Saved):
     covariance: Array
     source: str
     entries: tuple[Mapping[str, Any], ...] = ()
+    left: OpenParameters | None = None
 
     def __repr__(self) -> str:
         return (
@@ -114,6 +140,7 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
         arm.covariance[np.ix_(kept, kept)],
         arm.source,
         tuple(entries[name] for name in rest.names if name in entries),
+        None if arm.left is None else replace(arm.left, mixing=arm.left.mixing[kept]),
     ), tuple(gone)  # fmt: skip
 
 
@@ -156,6 +183,7 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
         covariance,
         str(result_path),
         tuple(entries[name] for name in model.names),
+        _left_open(result.get("open"), held, determined, result_path),
     )
 
 
@@ -244,6 +272,26 @@ def _covariance(
     if np.isinf(covariance).any():
         raise InputError(f"{path}: covariance holds numbers beyond all measure; write it anew")
     return determined, covariance.reshape(len(determined), len(determined))
+
+
+def _left_open(
+    stated: Any, held: dict[str, float], determined: tuple[str, ...], path: str | Path
+) -> OpenParameters | None:
+    """What the result says of the parameters that the data left open; older ones say nothing."""
+    if stated is None:
+        return None
+    try:
+        names = tuple(map(str, stated["names"]))
+        mixing = np.array(stated["mixing"], dtype=float).reshape(len(determined), len(names))
+        typical = np.array(stated["typical"], dtype=float).reshape(len(names))
+    except (TypeError, KeyError, ValueError, OverflowError):
+        names, mixing, typical = ("",), np.zeros((0, 0)), np.zeros(0)
+    if not (set(names) <= set(held) and np.isfinite(mixing).all() and np.isfinite(typical).all()):
+        raise InputError(
+            f"{path}: open does not say names, typical sizes and shares of the parameters left "
+            "open; write the result anew with identify"
+        )
+    return OpenParameters(names, mixing, typical, tuple(map(str, stated.get("redundant", []))))
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:

@@ -21,6 +21,7 @@ from elastocal.identification.findings import (
     stage_of,
     standings,
 )
+from elastocal.identification.prediction import PredictedError
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import (
     LOPSIDED,
@@ -64,7 +65,7 @@ from elastocal.report.method_and_noise import (
     size_rows,
 )
 from elastocal.report.smooth_view import counted_functions, smooth_lines, smooth_table
-from elastocal.text import printable
+from elastocal.text import listed, printable
 
 LARGEST_TERMS = 4
 Truth = dict[str, float]
@@ -143,12 +144,19 @@ def nominal_known(result: Calibration, name: str) -> bool:
 def undetermined_lines(result: Calibration) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason."""
     lines = []
-    if names := names_of(result, INVISIBLE):
+    extra = {printable(name) for name in result.left.redundant} if result.left else set()
+    if names := [n for n in names_of(result, INVISIBLE) if n not in extra]:
         where = held_where(result, names)
         lines.append(f"{where} (not visible in these data): {', '.join(names)}")
-    if names := names_of(result, ABSORBED):
+    if names := [n for n in names_of(result, ABSORBED) if n not in extra]:
         where = held_where(result, names)
         lines.append(f"{where}, absorbed in a combination: {', '.join(names)}")
+    if names := [n for s in (INVISIBLE, ABSORBED) for n in names_of(result, s) if n in extra]:
+        where = held_where(result, names)
+        lines.append(
+            f"{where}, redundant by construction (no pose under such loads shows them; nothing to "
+            f"do): {', '.join(names)}"
+        )
     if names := names_of(result, FIXED):
         lines.append(f"fixed by the user: {', '.join(names)}")
     return lines
@@ -176,6 +184,8 @@ def what_was_identified(result: Calibration) -> str:
         text += f"; {unseen} not visible in these data"
     if fixed := len(names_of(result, FIXED)):
         text += f"; {fixed} fixed by the user"
+    if (far := result.finding("unheard_of")) is not None:
+        text += f"; {len(far.listed('parameters'))} at values that no arm has"
     return text + counted_functions(result) + "."
 
 
@@ -209,6 +219,8 @@ def how_well_it_predicts(result: Calibration) -> str:
             "How well unseen poses are predicted is not known: some configuration alone "
             "determines a parameter, so none can be held out."
         )
+    if result.predicted is not None:
+        text += f" {at_new_poses(result.predicted)}"
     if result.test is not None:
         t = result.test
         text += (
@@ -216,6 +228,20 @@ def how_well_it_predicts(result: Calibration) -> str:
             f"{length(t.mean)} mean, {length(t.maximum)} at most."
         )
     return text
+
+
+def at_new_poses(found: PredictedError) -> str:
+    """What is to be expected where nobody measured, and of what it consists."""
+    low, high = found.ci95
+    parts = [f"{length(found.parameters)} of the estimates"]
+    if found.open > 0:
+        parts.append(f"{length(found.open)} of parameters that these poses do not show")
+    if found.lacking:
+        parts.append(f"{length(found.lacking)} that the model may lack")
+    return (
+        f"At new poses ({found.source}) the arm itself, without the noise of a reading, is off by "
+        f"{length(found.rms)} rms, 95 %: {length(low)} to {length(high)} ({', '.join(parts)})."
+    )
 
 
 def nominal_arm(result: Calibration) -> str:
@@ -540,14 +566,16 @@ def judgement(result: Calibration, sections: bool = False) -> Judgement:
         why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
         return Judgement("poor", f"Do not use this calibration: {DOUBTS[why.kind](why)}.", steps)
     told = _accuracy(result)
+    verdict = result.verdict
     if trust.severity == "care":
-        doubts = [f for f in result.findings if f.severity == "care" and f is not trust]
-        named = "; and ".join(DOUBTS[f.kind](f) for f in doubts)
-        text = f"Use this calibration with care: {told}, but {named}."
+        named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
+        at = "" if verdict.at is None else f", at new poses to {length(verdict.at)} at 95 %"
+        text = f"Use this calibration with care: {told}{at}, but {named}."
         return Judgement("care", text, steps)
     compared = result.finding("residual_agrees_with_stated_noise", "residual_below_stated_noise")
     noise = "" if compared is None else ", and the residual is noise"
-    return Judgement("good", f"This calibration can be trusted: {told}{noise}.", steps)
+    at = "" if verdict.at is None else f" at {length(verdict.at)}"
+    return Judgement("good", f"This calibration can be trusted{at}: {told}{noise}.", steps)
 
 
 def _step(f: Finding, sections: bool) -> str:
@@ -569,7 +597,8 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"does as well ({_length(f, 'nominal_rms_um')})"
     ),
     "not_held_out": lambda f: (
-        "how well it predicts other poses is not known: some pose alone determines a parameter"
+        "how well it predicts poses left out is not known: some pose alone determines a parameter, "
+        "and nothing checks it"
     ),
     "residual_above_stated_noise": lambda f: (
         f"the residual is {significant(f.number('ratio'))} times the stated noise"
@@ -578,7 +607,25 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "fit_flatters": lambda f: (
         f"unseen poses are worse than fitted ones ({_length(f, 'residual_rms_um')})"
     ),
+    "unheard_of": lambda f: _unheard_of(f),
     "little_gain": lambda f: "that is hardly better than the nominal arm",
+    "few_configurations": lambda f: (
+        f"{f.numbers['configurations']} configurations leave {f.numbers['equations_left']} "
+        f"equations beyond {f.numbers['parameters']} parameters, too few to judge by (needed: "
+        f"{f.numbers['needed']})"
+    ),
+    "noise_unknown": lambda f: (
+        "nothing says how large the noise is (no stated noise, no repeats), so the residual may "
+        "hide what the model lacks"
+    ),
+    "new_poses_not_shown": lambda f: (
+        f"at new poses {_length(f, 'open_um')} are to be expected of what the measured poses do "
+        f"not show ({listed([printable(str(n)) for n in f.listed('parameters')], 3)})"
+    ),
+    "new_poses_no_gain": lambda f: (
+        f"at new poses {_length(f, 'rms_um')} are to be expected, hardly better than the nominal "
+        "arm"
+    ),
     "many_faulty_readings": lambda f: (
         f"{f.numbers['faulty']} of the {f.numbers['fitted']} readings fitted lie beyond what the "
         "noise explains"
@@ -590,6 +637,25 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"test data are off by {_length(f, 'test_rms_um')} rms, more than chance explains"
     ),
 }
+
+
+def _unheard_of(f: Finding) -> str:
+    """ "no arm has such values (link6.dx 32.1 mm, 32 typical sizes): …" """
+    each = zip(
+        f.listed("parameters"), f.listed("values"), f.listed("units"), f.listed("typical_sizes"),
+        strict=True,
+    )  # fmt: skip
+    shown = []
+    for name, value, unit, sizes in each:
+        number, shown_unit = display(float(value), str(unit))
+        shown.append(
+            f"{printable(str(name))} at {significant(number)} {shown_unit}, "
+            f"{significant(float(sizes), 2)} typical deviations from nominal"
+        )
+    return (
+        f"no arm has such values ({listed(shown, 3)}): most likely an effect is missing that they "
+        "stand in for, or these poses hardly tell them from others"
+    )
 
 
 def _accuracy(result: Calibration) -> str:

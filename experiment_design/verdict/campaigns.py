@@ -1,0 +1,162 @@
+"""Simulated campaigns over arms, sizes, plans and effects that the model does not have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from elastocal.cell.arm_description import (
+    CartesianNoise,
+    EffectChoice,
+    ModelSpec,
+    Nominal,
+    Robot,
+    Tool,
+    Tracker,
+)
+from elastocal.cell.work_cell import Cell
+from elastocal.measurements import Measurements
+from elastocal.model import Chain, Model, finite_ranges, read_urdf
+from elastocal.simulation.simulate import simulate
+
+HERE = Path(__file__).parent
+ARMS = {
+    "KR 270": (Path(str(files("elastocal.demo") / "kr270_2.urdf")), 2600.0),
+    "medium": (HERE.parent / "blind_diagnosis" / "arms" / "medium.urdf", 150.0),
+    "heavy": (HERE.parent / "blind_diagnosis" / "arms" / "heavy.urdf", 1500.0),
+    "seven axes": (HERE.parent / "blind_diagnosis" / "arms" / "seven_axis.urdf", 100.0),
+}  # with the load in N
+MODELS = {
+    "geometry": ("base_frame", "joint_offset", "link_geometry", "marker_position"),
+    "geometry and springs": (
+        "base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance",
+    ),
+    "springs": ("joint_compliance",),
+}  # fmt: skip
+HIDDEN = ("none", "none", "none", "backlash", "gear_eccentricity", "joint scatter")
+SAG = 1e-3  # m, what each joint of a typical arm yields under the load at full reach
+TEST_POSES = 200
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What is fitted (`model`, `table`), what is true at new poses (`exact`), and of what kind."""
+
+    model: Model
+    table: Measurements
+    exact: Measurements
+    kind: dict[str, str | float | int]
+
+
+def campaign(number: int) -> Campaign:
+    """The campaign of that number; everything about it follows from the number."""
+    rng = np.random.default_rng([21, number])
+    arm, what = rng.choice(list(ARMS)), rng.choice(list(MODELS))
+    path, weight = ARMS[arm]
+    chain = read_urdf(path)
+    hidden = str(rng.choice(HIDDEN))
+    scale, size = float(rng.choice([0.3, 1.0])), float(np.exp(rng.uniform(np.log(0.3), np.log(3))))
+    sigma, stated = float(rng.choice([10e-6, 30e-6])), bool(rng.random() < 0.8)
+    poses, markers = int(np.exp(rng.uniform(np.log(6), np.log(60)))), int(rng.choice([1, 3]))
+    share, repeats = float(rng.choice([0.25, 0.6, 1.0])), int(rng.choice([1, 3]))
+    joint = f"joint{rng.integers(1, chain.n_joints + 1)}"
+    fitted = _model(chain, MODELS[what], what, markers, sigma if stated else None)
+    added = (EffectChoice(hidden, joint),) if hidden in ("backlash", "gear_eccentricity") else ()
+    real = fitted.with_effects(fitted.cell.model.effects + added)
+    x = _true(real, rng, scale, size, weight)
+    low, high = finite_ranges(chain, *_limits(chain))
+    middle = low + rng.uniform(share / 2, 1 - share / 2, len(low)) * (high - low)
+    near = middle + share / 2 * (high - low) * rng.uniform(-1, 1, (poses, len(low)))
+    loads = [[0.0, 0.0, 0.0]] if what == "geometry" else [[0.0, 0.0, 0.0], [0.0, 0.0, -weight]]
+    table = _measured(real, near, loads, repeats, x, rng, sigma, hidden == "joint scatter", size)
+    far = rng.uniform(low, high, (TEST_POSES, len(low)))
+    exact = simulate(real, _rows(real, far, loads, 1), x, rng, False)
+    kind = {
+        "arm": str(arm), "model": str(what), "hidden": hidden, "size": size, "scale": scale,
+        "sigma_um": sigma * 1e6, "stated": stated, "poses": poses, "markers": markers,
+        "range": share, "repeats": repeats,
+    }  # fmt: skip
+    return Campaign(fitted, table, exact, kind)
+
+
+def _limits(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+    low = np.array([max(j.lower, -np.pi) for j in chain.joints])
+    return low, np.array([min(j.upper, np.pi) for j in chain.joints])
+
+
+def _model(
+    chain: Chain, effects: tuple[str, ...], what: str, markers: int, sigma: float | None
+) -> Model:
+    places = {"M1": [0.20, 0.0, 0.05], "M2": [-0.1, 0.2, 0.1], "M3": [0.0, -0.1, 0.2]}
+    chosen = {name: np.array(place) for name, place in list(places.items())[:markers]}
+    spec = ModelSpec(
+        observe="deflection" if what == "springs" else "position",
+        effects=tuple(EffectChoice(name, None) for name in effects),
+        nominal=Nominal(),
+    )
+    tracker = Tracker(noise=None if sigma is None else CartesianNoise(np.full(3, sigma)))
+    low, high = _limits(chain)
+    cell = Cell("campaign", None, Robot(), Tool(np.array([0.1, 0.0, 0.1]), chosen), tracker, spec)
+    limits = {f"joint{i + 1}": (low[i], high[i]) for i in range(len(low))}
+    return Model.assembled(chain, replace(cell, limits=limits))
+
+
+def _true(
+    model: Model, rng: np.random.Generator, scale: float, size: float, weight: float
+) -> np.ndarray:
+    """Values (parameters,) of a real arm: geometry by `scale` typical sizes, a hidden effect by
+    `size` of them."""
+    x = model.nominal.copy()
+    reach = sum(np.linalg.norm(j.placement[:3, 3]) for j in model.chain.joints)
+    for i, p in enumerate(model.parameters):
+        if p.effect == "joint_compliance":
+            wrist = 4.0 if p.where in ("joint4", "joint5", "joint6", "joint7") else 1.0
+            x[i] = wrist * SAG / (weight * reach**2) * rng.uniform(0.5, 2.0)
+        elif p.effect == "backlash":
+            x[i] = size * (p.typical or 0.0)
+        elif p.effect == "base_frame":
+            x[i] = 0.0
+        elif p.effect == "gear_eccentricity":
+            x[i] = size * (p.typical or 0.0) * rng.normal()
+        else:
+            x[i] += scale * (p.typical or 0.0) * rng.normal()
+    if "base.x" in model.names:
+        base = [model.names.index(f"base.{k}") for k in ("x", "y", "z", "rx", "ry", "rz")]
+        x[base] = [*rng.uniform(-2, 2, 3), *Rotation.random(random_state=rng).as_rotvec()]
+    return x
+
+
+def _rows(model: Model, q: np.ndarray, loads: list[list[float]], repeats: int) -> Measurements:
+    n, states, m = len(q), len(loads), len(model.cell.tool.markers)
+    pose = np.repeat(np.arange(n), repeats * states * m)
+    each = np.tile(np.repeat(np.arange(states), m), n * repeats)
+    return Measurements(
+        source="simulated", row=np.arange(len(pose)) + 2, q=q[pose], configuration=pose,
+        configuration_labels=tuple(str(i + 1) for i in range(n)),
+        repeat=np.tile(np.repeat(np.arange(repeats), states * m), n),
+        marker=np.tile(np.arange(m), n * repeats * states),
+        marker_names=tuple(model.cell.tool.markers), force=np.array(loads)[each],
+    )  # fmt: skip
+
+
+def _measured(
+    model: Model, q: np.ndarray, loads: list[list[float]], repeats: int, x: np.ndarray,
+    rng: np.random.Generator, sigma: float, scatter: bool, size: float,
+) -> Measurements:  # fmt: skip
+    rows = _rows(model, q, loads, repeats)
+    if scatter:  # the joints settle anew at each visit, by 20 µrad times the size
+        visit = np.unique(
+            np.column_stack([rows.configuration, rows.repeat, rows.force]), axis=0,
+            return_inverse=True,
+        )[1].ravel()  # fmt: skip
+        off = 20e-6 * size * rng.normal(size=(visit.max() + 1, q.shape[1]))
+        exact = simulate(model, replace(rows, q=rows.q + off[visit]), x, rng, False)
+        exact = replace(exact, q=rows.q)
+    else:
+        exact = simulate(model, rows, x, rng, False)
+    assert exact.position is not None
+    return replace(exact, position=exact.position + sigma * rng.normal(size=exact.position.shape))

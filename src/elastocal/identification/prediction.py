@@ -1,0 +1,473 @@
+"""Where the calibrated arm will be: covariance and region of the tool's position at any pose, the
+error to be expected at poses that nobody measured.
+
+At a pose the tool's position moves by A_K (K parameters that the data determined) and A_D (D left
+open) per unit of a parameter.  What is not known of it has three parts:
+
+    Σ_p = A_K Σ A_Kᵀ            the estimates' covariance
+        + O S² Oᵀ               O = A_D − A_K · mixing: what typical deviations S of the parameters
+                                left open move it by, beyond what the estimates took over for them
+        + τ² I/3                what the model lacks: what configurations scatter by beyond their
+                                noise (lack of fit)
+
+A single visit scatters about that place by the joints' repeatability, J diag(s²) Jᵀ, and by what
+the readings of a configuration have in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, stats
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import ElastocalError
+from elastocal.identification.methods import EXACT
+from elastocal.identification.noise_summary import Noise
+from elastocal.identification.residuals import rms_3d
+from elastocal.identification.solve import STRUCTURAL, Solution, free_r_factor
+from elastocal.measurements import Measurements
+from elastocal.model.arm import Parameter
+from elastocal.model.calibrated import CalibratedArm, OpenParameters
+from elastocal.model.calibrated_tool import CalibratedTool
+from elastocal.model.chain import finite_ranges, joint_index, joint_limits
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations, observe
+from elastocal.units import Array, IntArray
+
+# What the identification knows of where the tool will be, and what it does not.
+
+OUTSIDE = 1e-6  # share of the tool's motion that may lie outside what is known: rounding
+SPARE = 4  # readings for every parameter, at random poses
+NEVER_SHOWN = 0.1  # standard deviations; a hundred times as many readings would show one
+SENSITIVITIES = 5000  # rows at a time, which bounds the memory
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """`covariance` (n, 3, 3) m² of the position in the data's frame.
+
+    `unknown` (n,) m: what typical deviations of the parameters that the data do not determine
+    would move the tool by, which the covariance does not hold; `blamed` names those parameters,
+    the most harmful first.
+    """
+
+    covariance: Array
+    unknown: Array
+    blamed: tuple[str, ...]
+
+    @property
+    def std(self) -> Array:
+        """(n,) m: root of the sum of the variances along the three axes."""
+        return np.asarray(np.sqrt(np.trace(self.covariance, axis1=1, axis2=2)))
+
+
+def uncertainty_at(
+    tool: CalibratedTool, rows: list[NDArray], q: Array, circumstances: list[NDArray], seed: int = 0
+) -> Uncertainty:
+    """Σ_p = A_K Σ A_Kᵀ and O S at commanded joints q (n, joints) under the inputs `rows`.
+
+    `circumstances` are rows under which the random poses stand that a result asks for which does
+    not say what its open parameters went into.  NaN where the result determined nothing.
+    """
+    arm = tool.calibrated
+    left = arm.left or _by_random_poses(tool, circumstances, seed)
+    known, off = [], []
+    for first in range(0, len(q), SENSITIVITIES):
+        some = slice(first, first + SENSITIVITIES)
+        A = tool.sensitivity([values[some] for values in rows], q[some])
+        at = _moves(arm, left, A)
+        known.append(at[0] @ arm.covariance @ at[0].transpose(0, 2, 1))
+        off.append(at[1])
+    if not off:
+        return Uncertainty(np.zeros((0, 3, 3)), np.zeros(0), ())
+    covariance, move = np.concatenate(known), np.concatenate(off)
+    if not arm.determined:  # nothing known is no certainty
+        covariance = np.full((len(q), 3, 3), np.nan)
+    return Uncertainty(
+        (covariance + covariance.transpose(0, 2, 1)) / 2,
+        np.sqrt((move**2).sum(axis=(1, 2))),
+        _blamed(left, (move**2).sum(axis=1).mean(axis=0)),
+    )
+
+
+def _moves(arm: CalibratedArm, left: OpenParameters, A: Array) -> tuple[Array, Array]:
+    """A_K (n, r, K), and O S (n, r, D) of A (n, r, parameters) in m per unit; what vanishes but
+    for rounding, as the tool's point moves as the measured ones do, is zero."""
+    index = {name: i for i, name in enumerate(arm.model.names)}
+    known = A[..., [index[name] for name in arm.determined]]
+    move = A[..., [index[name] for name in left.names]] * left.typical
+    off = move - known @ (left.mixing * left.typical)
+    size = np.abs(move).max(axis=(0, 1), initial=0.0)
+    off[np.abs(off) <= OUTSIDE * np.maximum(size, np.abs(move).max(initial=0.0))] = 0.0
+    return known, off
+
+
+def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:
+    """Parameters that do harm (D,), the worst first."""
+    return tuple(left.names[int(i)] for i in np.argsort(-harm) if harm[i] > 0)
+
+
+def left_open(solution: Solution) -> OpenParameters:
+    """What a fit left open, from its weighted B_K and B_D at the values found."""
+    model, reduction = solution.problem.model, solution.reduction
+    free, x = solution.problem.free, solution.fit.x
+    kept, own = reduction.kept, ~model.shrunk[reduction.kept]
+    open_ = reduction.dropped[~model.shrunk[reduction.dropped]]
+    mixing = np.zeros((len(kept), len(open_)))
+    typical = typical_sizes(model.parameters, x, kept)
+    if len(open_) and own.any():
+        R = free_r_factor(solution.problem, solution.fit).R[:, : len(free)]
+        R = R * typical[free]
+        columns, rest = np.searchsorted(free, kept[own]), np.searchsorted(free, open_)
+        mixing[own] = _shares(R[:, columns], R[:, rest], typical[kept[own]], typical[open_])
+    names = tuple(model.names[d] for d in open_)
+    return OpenParameters(names, mixing, typical[open_], _redundant(solution, open_, typical))
+
+
+def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str, ...]:
+    """Which of the parameters left open no pose tells from the rest.
+
+    At poses over the whole joint range, their columns of B lie in the span of those determined and
+    of the others left open, but for so little that as many readings as these would show a typical
+    deviation by less than NEVER_SHOWN standard deviations.
+    """
+    problem, kept = solution.problem, solution.reduction.kept
+    model, observed = problem.model, problem.observations
+    if not len(open_):
+        return ()
+    anywhere = over_the_workspace(model.cell, model, observed.table)
+    try:
+        B = readings_at(model, solution.fit.x, observed, anywhere)[0]
+    except ElastocalError:
+        return ()
+    parts = solution.fit.residual.reshape(-1, observed.size)
+    noise = np.sqrt((parts**2).mean(axis=0))[:, None]
+    B = (B / np.maximum(noise, EXACT)).reshape(-1, B.shape[2])
+    B *= np.where(typical > 0, typical, 1.0) * np.sqrt(len(parts) * observed.size / len(B))
+    known = B[:, kept[~model.shrunk[kept]]]
+    basis = linalg.qr(known, mode="economic")[0]
+    off = B[:, open_] - basis @ (basis.T @ B[:, open_])
+    off -= basis @ (basis.T @ off)
+    _, R, order = linalg.qr(off, mode="economic", pivoting=True)
+    least = STRUCTURAL * max(np.linalg.norm(B, axis=0))
+    pivot = np.zeros(len(open_))
+    pivot[: min(R.shape)] = np.abs(np.diag(R))
+    none = pivot <= np.where(typical[open_[order]] > 0, max(least, NEVER_SHOWN), least)
+    return tuple(model.names[d] for d in open_[order[none]])
+
+
+def _shares(B_K: Array, B_D: Array, kept: Array, left: Array) -> Array:
+    """mixing (K, D) with B_D ≈ B_K · mixing, of columns scaled by the sizes `kept`, `left`."""
+    found = linalg.lstsq(B_K, B_D, cond=1e-10)[0]
+    known = left > 0
+    found[:, known] *= kept[:, None] / left[known]
+    return np.asarray(found)
+
+
+def _by_random_poses(tool: CalibratedTool, rows: list[NDArray], seed: int) -> OpenParameters:
+    """By least squares on the markers' places at random poses, in the targets' circumstances.
+
+    What the identification left out as indistinguishable leaves no residual there; what it left
+    out although it moves markers by itself does, and is then unknown at the targets as well.
+    """
+    arm = tool.calibrated
+    model = arm.model
+    names = {name: i for i, name in enumerate(model.names)}
+    kept = np.array([names[name] for name in arm.determined], dtype=np.int64)
+    # Smooth functions have their prior: where the readings do not show them they are zero.
+    left = np.setdiff1d(np.flatnonzero(~model.shrunk), kept)
+    sizes, own = typical_sizes(model.parameters, arm.x, kept), ~model.shrunk[kept]
+    mixing = np.zeros((len(kept), len(left)))
+    if len(left) and own.any():
+        low, high = finite_ranges(tool.chain, *joint_limits(tool.cell, tool.chain))
+        n = max(SPARE * int((~model.shrunk).sum()) // 3, 1)
+        q = np.random.default_rng(seed).uniform(low, high, (n, tool.chain.n_joints))
+        some = [values[np.arange(n) % len(values)] for values in rows]
+        B = tool.marker_sensitivity(some, q)
+        B = B[np.isfinite(B).all(axis=(1, 2))].reshape(-1, len(names)) * sizes
+        mixing[own] = _shares(B[:, kept[own]], B[:, left], sizes[kept[own]], sizes[left])
+    return OpenParameters(tuple(model.names[d] for d in left), mixing, sizes[left])
+
+
+def typical_sizes(parameters: tuple[Parameter, ...], x: Array, kept: IntArray) -> Array:
+    """Typical deviation (parameters,) of each parameter; where none is known beforehand, the root
+    mean square of what was determined of its kind (of all joints' compliances)."""
+    found: dict[tuple[str, str], list[float]] = {}
+    for k in kept:
+        p = parameters[k]
+        found.setdefault((p.effect, p.unit), []).append(float(x[k]))
+    rms = {kind: float(np.sqrt(np.mean(np.square(values)))) for kind, values in found.items()}
+    own = set(map(int, kept))
+    return np.array(
+        [
+            p.typical or abs(p.nominal) or rms.get((p.effect, p.unit), 1.0 if k in own else 0.0)
+            or (1.0 if k in own else 0.0)
+            for k, p in enumerate(parameters)
+        ]
+    )  # fmt: skip
+
+
+# The position of the tool at a pose, with its region.
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where the tool is at n poses, and how sure that is; lengths in m, in the data's frame.
+
+    `position` (n, 3).  `covariance` (n, 3, 3) of the place about which visits scatter: estimates,
+    parameters left open and lack of fit; `visit` (n, 3, 3): the scatter of a single visit besides,
+    as far as the noise model has it.
+    """
+
+    position: Array
+    covariance: Array
+    visit: Array
+
+    def half_axes(self, level: float = 0.95, visit: bool = False) -> Array:
+        """Half axes (n, 3), the longest first, of the ellipsoid that holds the tool with
+        probability `level`: √(χ²₃(level) λ) of the eigenvalues λ; with `visit` at one visit."""
+        total = self.covariance + (self.visit if visit else 0.0)
+        size = np.maximum(np.linalg.eigvalsh(total)[:, ::-1], 0.0)
+        return np.asarray(np.sqrt(stats.chi2.ppf(level, 3) * size))
+
+    def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
+        """Whether the regions of that `level` hold the places (n, 3)."""
+        total = self.covariance + (self.visit if visit else 0.0)
+        off = np.asarray(places) - self.position
+        distance = np.einsum("ni,nij,nj->n", off, np.linalg.pinv(total, hermitian=True), off)
+        return np.asarray(distance <= stats.chi2.ppf(level, 3))
+
+
+def position_at(
+    tool: CalibratedTool, table: Measurements, q: Array, lacking: float, scatter: Scatter
+) -> Position:
+    """The tool's position at joints q (n, joints) in the circumstances of the table (n,).
+
+    `lacking` (m): 3-D rms of what the model lacks.  NaN where there is no static equilibrium.
+    """
+    rows = tool.rows(table)
+    found = uncertainty_at(tool, rows, q, rows)
+    place = tool.poses(rows, q)[0]
+    left = tool.calibrated.left
+    covariance = found.covariance + lacking**2 / 3 * np.eye(3)
+    if left is not None:
+        off = _moves(tool.calibrated, left, tool.sensitivity(rows, q))[1]
+        covariance = covariance + off @ off.transpose(0, 2, 1)
+    J = tool.errors(rows, q, place, None)[1]
+    visit = (J * scatter.joints**2) @ J.transpose(0, 2, 1) + scatter.common**2 * np.eye(3)
+    return Position(place, covariance, visit)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What a visit scatters by: `joints` (joints,) in rad or m, `common` in m on each axis."""
+
+    joints: Array
+    common: float
+
+
+def scatter_of(noise: Noise, n_joints: int) -> Scatter:
+    """What the noise model says of a visit's scatter; zero where it has none."""
+    joints, common = np.zeros(n_joints), 0.0
+    for size in noise.sizes or ():
+        if size.of_joints:
+            joints[list(size.joints)] = size.sigma
+        elif size.shared and size.sigma is not None:
+            common = float(np.hypot(common, size.sigma))
+    return Scatter(joints, common)
+
+
+# The error to be expected at poses that nobody measured.
+
+POSES = 256  # drawn over the joint limits where nobody says where the arm will work
+DRAWS = 2000
+FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
+
+
+@dataclass(frozen=True)
+class NewPoses:
+    """Where the arm will be used: `q` (T, joints) rad or m, `force` (T, 3) N in the data's frame,
+    `weight` (T,) of sum 1; `source` says in words where they come from."""
+
+    q: Array
+    force: Array
+    weight: Array
+    source: str
+
+
+def over_the_workspace(cell: Cell, model: Model, table: Measurements) -> NewPoses:
+    """Poses drawn over the joint limits with a fixed seed, under the loads that were measured."""
+    chain = model.chain
+    low, high = finite_ranges(chain, *joint_limits(cell, chain))
+    q = np.random.default_rng(0).uniform(low, high, (POSES, chain.n_joints))
+    for name, levels in cell.model.compliance_levels.items():
+        # Elsewhere the model has no compliance for that joint.
+        q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, POSES)
+    forces = np.unique(np.round(table.force, 3), axis=0)
+    if model.observe == "deflection":
+        forces = forces[(forces != 0).any(axis=1)]
+    if not len(forces):
+        forces = np.zeros((1, 3))
+    source = f"{POSES} poses drawn over the joint limits, as the cell states no test poses"
+    return NewPoses(q, np.resize(forces, (POSES, 3)), np.full(POSES, 1 / POSES), source)
+
+
+@dataclass(frozen=True)
+class PredictedError:
+    """The noise-free position error to be expected at new poses: 3-D rms over poses, in m.
+
+    `rms` is its expectation, `ci95` its 95 % interval.  The parts of the expectation: of the
+    `parameters` determined, of those left `open`, of what the model lacks (`lacking`, None where
+    nothing tells the noise from it).  `blamed` names open parameters, the worst first.
+    """
+
+    rms: float
+    ci95: tuple[float, float]
+    parameters: float
+    open: float
+    lacking: float | None
+    blamed: tuple[str, ...]
+    poses: int
+    source: str
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-ready, in µm."""
+        low, high = self.ci95
+        return {
+            "rms": self.rms * 1e6, "ci95": [low * 1e6, high * 1e6],
+            "parameters": self.parameters * 1e6, "open_parameters": self.open * 1e6,
+            "lack_of_fit": None if self.lacking is None else self.lacking * 1e6,
+            "blamed": list(self.blamed), "poses": self.poses, "source": self.source,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Excess:
+    """By how much configurations scatter beyond their noise, as draws (DRAWS,) of what the data
+    leave possible: `squared` in m², 3-D, and the factor `inflated` on the covariance of the
+    estimates, which the missing part has moved as well."""
+
+    squared: Array
+    inflated: Array
+
+
+def excess_of(
+    observed: Observations, residual: Array, dof: int, noise: Noise, rng: np.random.Generator
+) -> Excess | None:
+    """From repeats where there are enough, else from the stated noise; None without either.
+
+    Mean squares are drawn as s² ν/χ²_ν.  Between configurations it is σ² + n τ² with n readings
+    in a cell of configuration, marker and load; within them σ².
+    """
+    rows, spent = len(residual), len(residual) / max(dof, 1)
+    scatter = rms_3d(residual, observed.size) ** 2 * spent
+    test = noise.lack_of_fit
+    one = np.ones(DRAWS)
+    if test is not None and test.dof_pure >= FEWEST_REPEATS:
+        n = rows / (rows - test.dof_pure)
+        pure = scatter * dof / (test.dof_between * test.F + test.dof_pure)
+        between = test.F * _chi2(test.dof_between, rng)
+        within = _chi2(test.dof_pure, rng)
+        beyond = np.maximum(between - within, 0.0)
+        visits = any(s.shared or s.of_joints or s.drift for s in noise.sizes or ())
+        return Excess(beyond / n * pure, one if visits else 1 + beyond / within)
+    if noise.ratio_to_stated:
+        floor = scatter / noise.ratio_to_stated**2
+        return Excess(floor * np.maximum(noise.ratio_to_stated**2 * _chi2(dof, rng) - 1, 0.0), one)
+    return None
+
+
+def _chi2(dof: int, rng: np.random.Generator) -> Array:
+    """Draws (DRAWS,) of ν/χ²_ν: by what factor a mean square may be off."""
+    return np.asarray(dof / rng.chisquare(dof, DRAWS))
+
+
+def predicted_error(
+    arm: CalibratedArm,
+    observed: Observations,
+    excess: Excess | None,
+    dof: float,
+    poses: NewPoses,
+    rng: np.random.Generator,
+) -> PredictedError | None:
+    """The error at new poses, at the markers, in the circumstances of the readings.
+
+    e² = zᵀ G z + τ² with G = Σ_t w_t [A_K L, O S]ᵀ [A_K L, O S] and Σ = L Lᵀ: its distribution
+    by draws of z, normal, and t with `dof` degrees of freedom for what the estimates' covariance
+    holds.  None where nothing was determined, or no position follows from what was read.
+    """
+    left = arm.left
+    if left is None or not arm.determined or observed.kind == "distance":
+        return None
+    try:
+        B, weight = readings_at(arm.model, arm.x, observed, poses)
+    except ElastocalError:
+        return None
+    if not len(weight):
+        return None
+    known, off = _moves(arm, left, B[:, :3])
+    size, axes = np.linalg.eigh((arm.covariance + arm.covariance.T) / 2)
+    root = axes * np.sqrt(np.maximum(size, 0.0))
+    each = np.sqrt(weight)[:, None, None]
+    F = np.concatenate([known @ root, off], axis=2) * each
+    F = F.reshape(-1, F.shape[2])
+    n = root.shape[1]
+    G = F.T @ F
+    value, vector = np.linalg.eigh(G)
+    half = vector * np.sqrt(np.maximum(value, 0.0))
+    z = rng.standard_normal((DRAWS, len(G)))
+    inflated = np.ones(DRAWS) if excess is None else excess.inflated
+    wide = _chi2(max(int(dof), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
+    z[:, :n] *= np.sqrt(wide * inflated)[:, None]
+    squares = ((z @ half) ** 2).sum(axis=1)
+    lacking = None if excess is None else float(excess.squared.mean())
+    squares = squares if excess is None else squares + excess.squared
+    own = float(np.trace(G[:n, :n]) * inflated.mean())
+    rest = float(np.trace(G[n:, n:]))
+    low, high = np.sqrt(np.quantile(squares, [0.025, 0.975]))
+    return PredictedError(
+        float(np.sqrt(own + rest + (lacking or 0.0))),
+        (float(low), float(high)),
+        float(np.sqrt(own)),
+        float(np.sqrt(rest)),
+        None if lacking is None else float(np.sqrt(lacking)),
+        _blamed(left, np.diag(G)[n:]),
+        len(poses.q),
+        poses.source,
+    )
+
+
+def readings_at(
+    model: Model, x: Array, observed: Observations, poses: NewPoses
+) -> tuple[Array, Array]:
+    """B (R, size, parameters) of readings at new poses, one for each pose and marker, and their
+    weight (R,) of sum 1; without those that have no static equilibrium.
+
+    Whatever else the model asks for, as times and temperatures, is that of the readings in turn.
+    """
+    table = observed.table
+    markers = np.unique(table.marker[observed.lead])
+    states = 2 if model.observe == "deflection" else 1
+    T, M = len(poses.q), len(markers)
+    pose = np.repeat(np.arange(T), M * states)
+    loaded = np.tile(np.arange(states), T * M) == states - 1
+    like = observed.lead[pose % len(observed.lead)]
+    new = replace(
+        table.take(like), source="new poses", row=np.arange(len(pose)) + 1, q=poses.q[pose],
+        configuration=pose, configuration_labels=tuple(map(str, range(1, T + 1))),
+        repeat=np.zeros(len(pose), dtype=np.int64), marker=np.tile(np.repeat(markers, states), T),
+        force=poses.force[pose] * loaded[:, None],
+    )  # fmt: skip
+    still = np.isfinite(model.deflection(new, x)).all(axis=1)
+    good = np.bincount(pose, ~still, minlength=T) == 0
+    new = new.take(good[pose])
+    if not len(new):
+        return np.zeros((0, 1, len(x))), np.zeros(0)
+    again = observe(new, observed.kind)
+    B = model.regressor(new, x, observations=again).B
+    weight = poses.weight[new.configuration[again.lead]]
+    return B.reshape(len(again.lead), again.size, -1), weight / weight.sum()

@@ -1,0 +1,119 @@
+"""Where the arm will be: covariance at any pose, error at new poses, what no pose shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table_at, true_values
+from support.cells import random_poses
+
+from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.errors import UnknownNameError
+from elastocal.identification import judged, rms_3d
+from elastocal.identification.findings import ENOUGH, spare_equations
+from elastocal.identification.identify import identify
+from elastocal.identification.mistakes import UNHEARD, unheard_of
+from elastocal.model import Model, observe
+from elastocal.model.calibrated_tool import CalibratedTool, tool_point
+
+SIGMA, POSES = 5e-5, 40
+
+
+def model_of() -> Model:
+    tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
+    return Model.assembled(planar_chain(), cell_of(GEOMETRY, tracker=tracker))
+
+
+def campaign(seed: int, poses: int = POSES):
+    """A fit, and the true values behind its readings."""
+    model, rng = model_of(), np.random.default_rng(seed)
+    x = true_values(model, rng)
+    plan = table_at(random_poses(model.chain, poses, seed), [[0, 0, 0]])
+    return identify(model, measured(model, plan, x, SIGMA, rng)), x
+
+
+@pytest.fixture(scope="module")
+def fits():
+    return [campaign(seed) for seed in range(12)]
+
+
+def test_regions_hold_the_tool_as_often_as_they_say(fits):
+    held = []
+    for fit, x in fits:
+        marker = next(iter(fit.model.cell.tool.markers))
+        q = random_poses(fit.model.chain, 30, 99)
+        at = fit.position(q, point=marker)
+        tool = CalibratedTool(replace(fit.arm, x=x), tool_point(fit.model.cell, marker))
+        true = tool.poses(tool.rows(fit.model.table(q)), q)[0]
+        held.append(at.holds(true).mean())
+        assert (at.half_axes() >= at.half_axes(0.5)).all()
+        assert at.holds(at.position).all()
+    assert 0.85 < np.mean(held) <= 1.0
+
+
+def test_predicted_error_is_that_at_new_poses(fits):
+    """In the mean over campaigns, and inside its interval nearly always."""
+    ratios, inside = [], []
+    for fit, x in fits:
+        new = table_at(random_poses(fit.model.chain, 300, 7), [[0, 0, 0]])
+        exact = measured(fit.model, new, x, 0.0, np.random.default_rng(0))
+        o = observe(exact, "position")
+        error = rms_3d(fit.model.predict(exact, fit.x, o) - o.value, 3)
+        low, high = fit.predicted.ci95
+        ratios.append((error / fit.predicted.rms) ** 2)
+        inside.append(error <= high)
+        assert low < fit.predicted.rms < high
+        assert fit.predicted.rms < fit.heldout_rms  # which includes the noise of a reading
+    assert 0.3 < np.mean(ratios) < 1.5
+    assert sum(inside) >= 11
+
+
+def test_trusted_at_is_the_upper_end_of_what_is_predicted(fits):
+    fit = fits[0][0]
+    assert fit.verdict.trusted and fit.verdict.at == fit.predicted.ci95[1]
+    assert fit.to_json()["verdict"]["at_um"] == pytest.approx(fit.verdict.at * 1e6)
+    assert fit.to_json()["predicted_new_poses_um"]["ci95"][1] == pytest.approx(fit.verdict.at * 1e6)
+
+
+def test_few_configurations_and_unknown_noise_are_no_ground_for_trust(fits):
+    few = campaign(0, 12)[0]
+    assert spare_equations(few) < ENOUGH
+    assert "few_configurations" in few.verdict.to_json()["missing"]
+    fit = fits[0][0]
+    unknown = replace(fit, noise=replace(fit.noise, ratio_to_stated=None, lack_of_fit=None))
+    assert not judged(unknown).verdict.trusted
+    assert judged(unknown).finding("noise_unknown") is not None
+
+
+def test_limits_that_are_not_kept_are_named(fits):
+    fit = fits[0][0]
+    assert fit.unmet(heldout=1.0, new_poses=1.0) == ()
+    (told,) = fit.unmet(heldout=1e-6)
+    assert told.startswith("heldout: ") and told.endswith("at most 1 µm is required")
+    assert fit.unmet(test=1.0) == ("test: not known where at most 1e+06 µm is required",)
+    with pytest.raises(UnknownNameError, match="held_out"):
+        fit.unmet(held_out=1.0)
+
+
+def test_values_that_no_arm_has_are_said_first(fits):
+    fit = fits[0][0]
+    name = next(p.name for p in fit.model.parameters if p.effect == "link_geometry")
+    k = fit.model.names.index(name)
+    x = fit.x.copy()
+    assert unheard_of(fit.model, x) == {}
+    x[k] = fit.model.nominal[k] + 1.5 * UNHEARD * fit.model.parameters[k].typical
+    far = judged(replace(fit, x=x, estimates=fit.estimates))
+    assert far.verdict.missing[0].kind == "unheard_of" and not far.verdict.trusted
+    assert far.finding("unheard_of").numbers["parameters"] == (name,)
+
+
+def test_what_no_pose_shows_is_not_asked_for(fits):
+    fit = fits[0][0]
+    left = fit.left
+    assert set(left.redundant) <= set(left.names)
+    undetermined = fit.finding("undetermined")
+    asked = () if undetermined is None else undetermined.numbers["names"]
+    assert not set(asked) & set(left.redundant)
+    assert len(asked) + len(left.redundant) == len(left.names)
