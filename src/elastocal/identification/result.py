@@ -44,6 +44,8 @@ class Estimate:
         dof: Degrees of freedom of the t distribution behind `ci95`, infinite for a normal one.
         combined_with: Names that the data know only together with it.
         note: Why there is no value, and what else there is to know.
+        limits: Where the readings hardly show it, so that it has no value: the 95 % interval that
+            they leave it, with ends beyond its physical bound.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Estimate:
     dof: float | None = None
     combined_with: tuple[str, ...] = ()
     note: str = ""
+    limits: tuple[float, float] | None = None
 
     @property
     def identifiable(self) -> bool:
@@ -182,6 +185,7 @@ class Calibration(Result):
         active: Constraints that hold with equality.
         prior_share: By parameter the share of its information that the prior gave, 0 to 1; empty
             without a prior.
+        copies: Lines of readings that were left out: they repeat others to the last digit.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -225,6 +229,7 @@ class Calibration(Result):
     prior_share: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     smooth: tuple[SmoothPart, ...] = ()
+    copies: tuple[int, ...] = ()
 
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
@@ -236,6 +241,14 @@ class Calibration(Result):
     def faulty(self) -> tuple[Outlier, ...]:
         """Readings beyond the noise, whether they had a part in the fit or were set apart."""
         return self.outliers + self.excluded
+
+    @property
+    def heldout_all_rms(self) -> float:
+        """The held-out 3-D rms in m with the readings that were set apart, by their errors under
+        the fit to the others; infinite where none could be held out."""
+        apart = sum(o.residual**2 for o in self.excluded)
+        n, k = len(self.observations.lead), len(self.excluded)
+        return math.sqrt((n * self.heldout_rms**2 + apart) / (n + k))
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of the parameter `name`; UnknownNameError with the nearest name."""
@@ -350,6 +363,7 @@ class Calibration(Result):
             "dof": self.dof,
             "residual_rms_um": _um(self.residual_rms),
             "heldout_rms_um": _um(self.heldout_rms),
+            "heldout_all_rms_um": _um(self.heldout_all_rms),
             "nominal_rms_um": _um(self.nominal_rms),
             "test": None if self.test is None else {
                 "rms_um": _um(self.test.rms), "mean_um": _um(self.test.mean),
@@ -376,6 +390,7 @@ class Calibration(Result):
             "backend": self.model.backend_report(),
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
+            "copies": list(self.copies),
             "warnings": list(self.warnings),
             "findings": [f.to_json() for f in self.findings],
         }  # fmt: skip
@@ -389,6 +404,7 @@ def _estimate_json(e: Estimate) -> dict[str, Any]:
         "dof": None if e.dof is None else _finite(e.dof), "identifiable": e.identifiable,
         "combined_with": list(e.combined_with), "nominal": e.nominal, "held": e.held,
         "note": e.note or _endless(e.ci95),
+        **({} if e.limits is None else {"limits95": [_finite(v) for v in e.limits]}),
     }  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from elastocal.identification.findings import (
     COMBINED,
     FIXED,
     INVISIBLE,
+    WEAK,
     ErrorBudget,
     next_steps,
     stage_of,
@@ -99,9 +100,26 @@ def short_note(result: Calibration, e: Estimate) -> str:
         several = len(e.combined_with) - 3
         names = ", ".join(printable(n) for n in e.combined_with[:3])
         return f"held: absorbed in {names}" + (f" + {several} more" if several > 0 else "")
+    if standing == WEAK:
+        return f"hardly shown: {limits(result, e)}"
     if standing == INVISIBLE:
         return "held: not visible in these data"
     return "fixed by the user" if standing == FIXED else printable(e.note)
+
+
+def limits(result: Calibration, e: Estimate) -> str:
+    """What the readings say of a parameter that they hardly show, and what the model uses."""
+    assert e.limits is not None
+    p = result.model.parameters[result.model.names.index(e.name)]
+    low, high = (significant(display(end, e.unit)[0], 2) for end in e.limits)
+    held, unit = display(e.held, e.unit)
+    text = f"{low} to {high} {unit}"
+    if e.limits[0] <= p.lower <= e.limits[1]:
+        text = f"at most {high} {unit}"
+    elif e.limits[0] <= p.upper <= e.limits[1]:
+        text = f"at least {low} {unit}"
+    used = "nominal" if e.held == e.nominal and e.held else significant(held, 2)
+    return f"{text}; {used} is used"
 
 
 def held_where(result: Calibration, names: list[str]) -> str:
@@ -143,6 +161,13 @@ def nominal_known(result: Calibration, name: str) -> bool:
 def undetermined_lines(result: Calibration) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason."""
     lines = []
+    weak = [
+        f"{printable(e.name)} ({limits(result, e)})"
+        for e in result.ordinary
+        if e.limits is not None
+    ]
+    if weak:
+        lines.append(f"hardly shown, so without a value (95 %): {', '.join(weak)}")
     if names := names_of(result, INVISIBLE):
         where = held_where(result, names)
         lines.append(f"{where} (not visible in these data): {', '.join(names)}")
@@ -172,6 +197,8 @@ def what_was_identified(result: Calibration) -> str:
             f", and {counted(n, 'combination')} of parameters that no reading tells apart "
             f"({absorbed} held in exchange)"
         )
+    if weak := len(names_of(result, WEAK)):
+        text += f"; {weak} hardly shown"
     if unseen := len(names_of(result, INVISIBLE)):
         text += f"; {unseen} not visible in these data"
     if fixed := len(names_of(result, FIXED)):
@@ -198,6 +225,9 @@ def how_well_it_predicts(result: Calibration) -> str:
         elif result.finding("no_better_than_nominal") is not None:
             text += f", no better than the nominal arm ({length(nominal)})"
         text += "."
+        if result.excluded:
+            apart = counted(len(result.excluded), "reading")
+            text += f" With the {apart} set apart as faulty: {length(result.heldout_all_rms)}."
         if result.finding("fit_flatters") is not None:
             text += (
                 f" The fitted poses look better ({length(result.residual_rms)}) than unseen ones: "
@@ -572,6 +602,21 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     ),
     "residual_above_stated_noise": lambda f: (
         f"the residual is {significant(f.number('ratio'))} times the stated noise"
+    ),
+    "residual_below_stated_noise": lambda f: (
+        f"the noise is stated too large (the residual is {significant(f.number('ratio'))} times "
+        "it), so nothing shows whether the model lacks something"
+    ),
+    "residuals_heavy_tailed": lambda f: (
+        "far errors are more frequent than normal noise makes them (excess kurtosis "
+        f"{f.number('excess_kurtosis'):+.2g})"
+    ),
+    "load_unit": lambda f: (
+        f"the compliances are {significant(f.number('ratio'), 2)} times what {f.numbers['by']} let "
+        "expect: the loads may be in another unit"
+    ),
+    "scatter_not_counted": lambda f: (
+        "residuals scatter from visit to visit, or drift, as the noise model does not have it"
     ),
     "lack_of_fit": lambda f: "configurations scatter more than repeats of one explain",
     "fit_flatters": lambda f: (
