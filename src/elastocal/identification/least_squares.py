@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -345,6 +345,8 @@ def _polished(problem: FitProblem, x: Array, at: Regression) -> tuple[Array, Reg
     bends within its residual takes more, until what is left after them is less than LAST.
     """
     weights, columns, last = problem.weights, problem.columns, 0.0
+    if weights.even:
+        weights = replace(weights, whiten=None)
     for _ in range(MOST_POLISHES):
         B, before = weights.apply(at.B), weights.apply(at.residual)
         step = solve_weighted(B, before, scale=problem.sizes[columns]).x
