@@ -97,5 +97,7 @@ def test_linear_sets_through_the_fit_under_noise_that_was_estimated(name):
     certified = np.array(given["x"])
     begin = np.zeros(len(certified))
     model = AnyModel(lambda b, _: ca.DM(B) @ b, len(begin), table[:, 1])
-    found, _ = fitted(model, table[:, 0], begin, np.abs(certified), 0.7 * given["residual_std"] or 1)
+    found, _ = fitted(
+        model, table[:, 0], begin, np.abs(certified), 0.7 * given["residual_std"] or 1
+    )
     assert digits(found.x, certified) > (7 if name == "Filip" else 9)

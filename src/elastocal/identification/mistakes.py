@@ -175,6 +175,7 @@ def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Me
 # that is rounded more coarsely than the noise, and then more often in one coordinate than in all.
 
 NO_FINER = 1e-7  # m; readings with more digits than this agree in all of them by no chance
+ROUNDS = 20  # of the equation for P
 COPIED = 0.01  # p-value below which equal readings are too many for rounding
 
 
@@ -183,8 +184,9 @@ def copied(observed: Observations) -> BoolArray:
     and reading, whatever they are called.
 
     Where readings are rounded, those of one pose, load and marker that differ tell how often a
-    coordinate agrees by rounding (with half a reading more of either kind); equal readings that
-    are no more frequent than the product of these shares explains are true repeats.
+    coordinate agrees by rounding (with half a reading more of either kind): of pairs that differ
+    somewhere, a share s_a = (p_a - P)/(1 - P) agrees in coordinate a, P the product of all p_a.
+    Equal readings that are no more frequent than P explains are true repeats.
     """
     table, n = observed.table, len(observed.lead)
     value, own = observed.value.reshape(n, observed.size), observed.lead
@@ -209,10 +211,14 @@ def copied(observed: Observations) -> BoolArray:
     others = np.flatnonzero(start[group] != np.arange(n))
     same = value[others] == value[start[group[others]]]
     differing = same[~same.all(axis=1)]
-    share = np.prod((differing.sum(axis=0) + 0.5) / (len(differing) + 1))
-    members = np.bincount(group)
-    pairs = float((members * (members - 1) / 2).sum())
-    chance = stats.poisson.sf(int(found.sum()) - 1, share * pairs)
+    partly = (differing.sum(axis=0) + 0.5) / (len(differing) + 1)
+    share = 0.0
+    for _ in range(ROUNDS):
+        share = float(np.prod(partly * (1 - share) + share))
+    # A reading with k others before it is like one of them with probability 1 - (1 - P)^k.
+    before = np.arange(int(np.bincount(group).max()))
+    alike_by_chance = np.cumsum(1 - (1 - share) ** before)[np.bincount(group) - 1]
+    chance = stats.poisson.sf(int(found.sum()) - 1, float(alike_by_chance.sum()))
     return found & bool(chance < COPIED)
 
 
