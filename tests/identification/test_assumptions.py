@@ -93,7 +93,7 @@ def test_one_repeated_reading_stops_nothing(clean, digits):
 
 
 def test_repeats_that_rounding_makes_equal_are_no_copies():
-    """Of clean tables, hardly any loses a reading; one in which a third is copied nearly always does."""
+    """Hardly any clean table loses a reading; nearly every one does of which a third is copied."""
     model, plan = arm(poses=8, nominal=None, effects=("base_frame",))
     found, caught = [], []
     for seed in range(60):

@@ -23,6 +23,7 @@ def assumption_findings(result: Calibration) -> Iterator[Finding]:
     yield from _load_unit(result)
     yield from _hardly_shown(result)
     yield from _left_out(result)
+    yield from _alike_in_time(result)
 
 
 def _copies(result: Calibration) -> Iterator[Finding]:
@@ -81,3 +82,23 @@ def _left_out(result: Calibration) -> Iterator[Finding]:
                 "Ask what the model lacks (elastocal diagnose): residuals change from visit to "
                 "visit or in time, and noise that does so does not predict poses better.",
             )  # fmt: skip
+
+
+def _alike_in_time(result: Calibration) -> Iterator[Finding]:
+    """Residuals of visits that follow each other, by a permutation test."""
+    found = result.autocorrelation
+    if found is None or found.p >= LEVEL:
+        return
+    counted = result.noise.drift is not None
+    yield Finding(
+        "autocorrelated", "note" if counted else "care",
+        {
+            "lag1": found.correlations[0], "p": found.p, "visits": found.visits, "by": found.by,
+            "counted": "yes" if counted else "no",
+        },
+        ""
+        if counted
+        else "Visit poses and loads in random order and return to a reference pose every ten "
+        "poses: residuals of visits that follow each other are alike, as where something drifts, "
+        "or where the model lacks what neighbouring poses have in common.",
+    )  # fmt: skip

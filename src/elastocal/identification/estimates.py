@@ -11,7 +11,7 @@ from scipy import linalg
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution, warning_sentences
 from elastocal.identification.methods import MethodResult, is_exact
-from elastocal.identification.noise_summary import noise_of
+from elastocal.identification.noise_summary import noise_of, noise_parts
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.residuals import ResidualSummary, rms_3d, summarise_residuals
 from elastocal.identification.result import Calibration, Combination, Estimate
@@ -81,6 +81,8 @@ def summarise(
         prior_share=found.prior_share,
         smooth=found.smooth,
         copies=copies,
+        weights=solution.problem.weights,
+        noise_parts=noise_parts(found),
     )
     result = judged(result, of_solution(result, solution))
     return replace(result, warnings=found.warnings + warning_sentences(result))

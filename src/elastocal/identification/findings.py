@@ -17,9 +17,9 @@ from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary, held_out_residual
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
+from elastocal.identification.scrutiny import stage_of
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import weights_for
-from elastocal.model.effects import CATALOGUE
 from elastocal.units import Array
 
 # Where the error of the nominal arm goes, step by step, as an identification can tell it.
@@ -149,14 +149,6 @@ def resampled_rms(
     drawn = np.sqrt((weight @ squares) / (weight @ count))
     low, high = np.quantile(drawn, [0.025, 0.975])
     return rms, (float(low), float(high))
-
-
-def stage_of(effect: str) -> int:
-    """0 for what places base and markers, 1 for geometry, 2 for what yields under load."""
-    known = CATALOGUE[effect]
-    if known.registered:
-        return 0
-    return 2 if known.stage in ("compliance", "load") else 1
 
 
 # What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.

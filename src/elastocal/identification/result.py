@@ -12,12 +12,16 @@ import numpy as np
 
 from elastocal.above import Result
 from elastocal.errors import UnknownNameError
+from elastocal.identification import scrutiny
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.residuals import ResidualSummary
+from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.smooth_part import SmoothPart
+from elastocal.identification.weighted_problem import Weights
+from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm, nominal_flange_rows
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
@@ -186,6 +190,9 @@ class Calibration(Result):
         prior_share: By parameter the share of its information that the prior gave, 0 to 1; empty
             without a prior.
         copies: Lines of readings that were left out: they repeat others to the last digit.
+        weights: Those of the fit.
+        noise_parts: Mean square 3-D noise (m²) of single "readings", and what readings of
+            "visits" have in common.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -230,6 +237,8 @@ class Calibration(Result):
     findings: tuple[Finding, ...] = ()
     smooth: tuple[SmoothPart, ...] = ()
     copies: tuple[int, ...] = ()
+    weights: Weights | None = field(default=None, compare=False)
+    noise_parts: dict[str, float] = field(default_factory=dict)
 
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
@@ -292,6 +301,44 @@ class Calibration(Result):
         """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
         observed = self.observations
         return self.model.regressor(observed.table, self.x, observations=observed).B
+
+    @cached_property
+    def _looked(self) -> scrutiny.Looked | None:
+        """The fit for a second look; None for a table too large to do it in passing."""
+        if self.weights is None or len(self.residual) * len(self.estimates) > MOST_NUMBERS:
+            return None
+        columns = np.array([self.model.names.index(name) for name in self.determined])
+        return scrutiny.Looked(
+            self.model, self.observations, self.weights, self.x, self.B, columns.astype(np.int64),
+            self.covariance, self.residual, self.held_out, self.dof,
+        )  # fmt: skip
+
+    def influence(self) -> tuple[scrutiny.Influence, ...]:
+        """Leverage and influence of every configuration, in the table's order; empty for tables
+        too large to look again.
+
+        Examples:
+            >>> strongest = max(ec.identify("cell.toml", "data.csv").influence(), key=lambda c: c.cook)
+            >>> strongest.configuration, strongest.leverage, strongest.moved
+            ('...', 1..., 'joint...')
+        """
+        return () if self._looked is None else scrutiny.influence(self._looked)
+
+    def parameter_sets(self) -> tuple[scrutiny.ParameterSet, ...]:
+        """Sets of parameters side by side: held-out errors and restricted likelihoods."""
+        return () if self._looked is None else scrutiny.parameter_sets(self._looked)
+
+    def uncertainty(self, table: Measurements | None = None) -> scrutiny.UncertaintyBudget | None:
+        """What a predicted reading's error is made of, at the poses and loads of a `table` or those
+        fitted; None for tables too large to look again."""
+        if self._looked is None:
+            return None
+        return scrutiny.uncertainty_budget(self._looked, self.noise_parts, table)
+
+    @cached_property
+    def autocorrelation(self) -> scrutiny.Autocorrelation | None:
+        """How alike the residuals of visits are that follow each other; None for few visits."""
+        return scrutiny.autocorrelation(self.residual, self.observations)
 
     @cached_property
     def arm(self) -> CalibratedArm:
@@ -391,9 +438,19 @@ class Calibration(Result):
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
             "copies": list(self.copies),
+            **self._second_look(),
             "warnings": list(self.warnings),
             "findings": [f.to_json() for f in self.findings],
         }  # fmt: skip
+
+    def _second_look(self) -> dict[str, Any]:
+        budget, course = self.uncertainty(), self.autocorrelation
+        return {
+            "influence": [c.to_json() for c in self.influence()],
+            "parameter_sets": [s.to_json() for s in self.parameter_sets()],
+            "autocorrelation": None if course is None else course.to_json(),
+            "uncertainty": None if budget is None else budget.to_json(),
+        }
 
 
 def _estimate_json(e: Estimate) -> dict[str, Any]:

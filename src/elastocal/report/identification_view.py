@@ -55,6 +55,7 @@ from elastocal.report.method_and_noise import (
     false_alarm_line,
     fault_lines,
     group_name,
+    in_time_line,
     intervals_line,
     method_and_weights,
     noise_model_line,
@@ -322,6 +323,7 @@ def noise_lines(result: Calibration) -> list[tuple[str, str]]:
         ("Noise model", noise_model_line(result)),
         ("Repeats", repeats_line(result)),
         ("Residuals", None if summary is None else shape_line(summary)),
+        ("In time", in_time_line(result)),
     ]
     return [(label, text) for label, text in found if text is not None]
 
@@ -611,6 +613,9 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         "far errors are more frequent than normal noise makes them (excess kurtosis "
         f"{f.number('excess_kurtosis'):+.2g})"
     ),
+    "autocorrelated": lambda f: (
+        "residuals of visits that follow each other are alike, as under a drift"
+    ),
     "load_unit": lambda f: (
         f"the compliances are {significant(f.number('ratio'), 2)} times what {f.numbers['by']} let "
         "expect: the loads may be in another unit"
@@ -647,6 +652,77 @@ def _accuracy(result: Calibration) -> str:
     if math.isfinite(gain):
         text += f", {significant(gain, 2)} times better than by the nominal arm"
     return text
+
+
+# A second look: who decides the fit, what else would do, what its errors are of.
+
+MOST_INFLUENTIAL = 12
+
+
+def influence_table(result: Calibration) -> ShownTable:
+    """The configurations that decide most, by Cook's distance; those without others to judge them
+    first."""
+    found = sorted(result.influence(), key=lambda c: (-c.cook, -c.leverage))[:MOST_INFLUENTIAL]
+    rows = [
+        (
+            printable(c.configuration), str(c.readings), significant(c.leverage, 2),
+            significant(c.cook, 2) if math.isfinite(c.cook) else "∞", printable(c.moved),
+            significant(c.by, 2) if math.isfinite(c.by) else "undetermined",
+        )
+        for c in found
+    ]  # fmt: skip
+    heads = (
+        "configuration", "readings", "parameters it pays for", "Cook's distance", "moves most",
+        "by (std)",
+    )  # fmt: skip
+    return ShownTable(heads, rows, (0, 4))
+
+
+def sets_table(result: Calibration) -> ShownTable:
+    """Sets of parameters side by side."""
+    rows = []
+    for s in result.parameter_sets():
+        over, ends = "", ""
+        if s.heldout_over_chosen and math.isfinite(s.heldout_over_chosen):
+            over = _signed(s.heldout_over_chosen)
+            ends = f"{_signed(s.ci95[0])} to {_signed(s.ci95[1])}"
+        rows.append((
+            s.name, str(s.parameters), length(s.residual_rms),
+            length(s.heldout_rms) if math.isfinite(s.heldout_rms) else "undetermined", over, ends,
+            f"{s.log_likelihood:+.1f}" if s.log_likelihood else "0",
+        ))  # fmt: skip
+    heads = (
+        "set", "parameters", "fitted rms", "held-out rms", "over the chosen", "95 %",
+        "log-likelihood over the chosen",
+    )  # fmt: skip
+    return ShownTable(heads, rows)
+
+
+def _signed(metres: float) -> str:
+    return f"{'-' if metres < 0 else '+'}{length(abs(metres))}"
+
+
+SOURCES = {
+    "parameters": "parameters: what the estimates leave uncertain",
+    "repeatability": "repeatability: what readings of a visit have in common",
+    "instrument": "instrument: single readings",
+    "lack_of_fit": "lack of fit: what the held-out error has beyond these",
+    "total": "together",
+}
+
+
+def uncertainty_table(result: Calibration) -> ShownTable:
+    """What the error of a predicted reading is made of."""
+    budget = result.uncertainty()
+    if budget is None:
+        return ShownTable((), [])
+    total = budget.total
+    rows = [
+        (words, length(part), f"{100 * (part / total) ** 2 if total else 0:.0f} %")
+        for name, words in SOURCES.items()
+        for part in (getattr(budget, name),)
+    ]
+    return ShownTable(("source", "3-D rms", "share of the square"), rows)
 
 
 # What the page shows, by the names that its template has for it.
@@ -688,6 +764,9 @@ def identification_contents(
         "shape": None if summary is None else shape_line(summary),
         "sizes": size_rows(result.noise),
         "candidates": candidate_rows(result.noise),
+        "influence": influence_table(result),
+        "sets": sets_table(result),
+        "uncertainty": uncertainty_table(result),
         "deviating": [(group_name(by, g), g.n, ratio(g), f"{g.p_holm:.1g}") for by, g in deviating],
         "held_out_scatter": "" if scatter is None else (
             f"In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
