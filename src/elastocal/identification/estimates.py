@@ -10,9 +10,8 @@ from scipy import linalg
 
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution, warning_sentences
-from elastocal.identification.intervals import Intervals
 from elastocal.identification.methods import MethodResult, is_exact
-from elastocal.identification.noise_summary import noise_of
+from elastocal.identification.noise_summary import noise_of, noise_parts
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.prediction import (
     NewPoses,
@@ -23,6 +22,7 @@ from elastocal.identification.prediction import (
 from elastocal.identification.residuals import ResidualSummary, rms_3d, summarise_residuals
 from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.identification.solve import Solution, residual_sigma
+from elastocal.model.arm import Parameter
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray
 
@@ -32,20 +32,21 @@ NOT_SHOWN = "held: the readings do not show the smooth function that it is part 
 
 def summarise(
     model: Model, every: Solution, sound: Solution, found: MethodResult,
-    faulty: tuple[Outlier, ...], new_poses: NewPoses | None = None,
+    faulty: tuple[Outlier, ...], new_poses: NewPoses | None = None, copies: tuple[int, ...] = (),
 ) -> Calibration:  # fmt: skip
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
     `every` holds all readings, `sound` the fit to those that agree.  `faulty` are the readings
     beyond the noise: set apart where the method did so, else only listed.  `new_poses` are where
-    the arm will be used; without them it is the workspace that the joint limits span.
+    the arm will be used; without them it is the workspace that the joint limits span.  `copies`
+    are the lines of readings that were left out since they repeat others to the last digit.
     """
     solution, final = found.solution, found.solution.fit
     kept = solution.reduction.kept
     spent = len(kept) if found.effective is None else found.effective
     sigma = residual_sigma(final, spent)
     left_out = {int(c) for s in found.smooth if not s.scale for c in s.group.columns.ravel()}
-    estimates, combinations = _estimates(model, solution, found.intervals, left_out)
+    estimates, combinations = _estimates(model, solution, found, left_out)
     determined = tuple(model.names[c] for c in kept)
     observed = solution.problem.observations
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
@@ -87,6 +88,9 @@ def summarise(
         prior_share=found.prior_share,
         smooth=found.smooth,
         left=left_open(solution),
+        copies=copies,
+        weights=solution.problem.weights,
+        noise_parts=noise_parts(found),
     )
     dofs = found.intervals.covariance.dof
     predicted = predicted_error(
@@ -116,9 +120,9 @@ def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSum
 
 
 def _estimates(
-    model: Model, solution: Solution, intervals: Intervals, left_out: set[int]
+    model: Model, solution: Solution, method: MethodResult, left_out: set[int]
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
-    reduction, x = solution.reduction, solution.fit.x
+    reduction, x, intervals = solution.reduction, solution.fit.x, method.intervals
     std, dof = intervals.covariance.std, intervals.covariance.dof
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
@@ -151,11 +155,20 @@ def _estimates(
         found[int(d)] = estimate(d, combined_with=tuple(partners[int(d)]), note=note)
     for c in reduction.at_bound:
         found[int(c)] = estimate(c, note=f"held at its bound {x[c]:g}: the data want it beyond")
+    for i, limits in method.limits.items():
+        found[i] = estimate(i, limits=limits, note=_hardly_shown(model.parameters[i], x[i]))
     for i in range(len(model.parameters)):
         if i not in found:
             zero = i in left_out
             found[i] = estimate(i, note=NOT_SHOWN if zero else "fixed by the user")
     return tuple(found[i] for i in range(len(model.parameters))), tuple(combinations)
+
+
+def _hardly_shown(p: Parameter, held: float) -> str:
+    """Why the readings' value of a parameter is not stated."""
+    if held == p.nominal and held != 0:
+        return "held at its nominal value: the readings hardly show it"
+    return f"the readings do not tell it from {p.lower if held < p.upper else p.upper:g}"
 
 
 def _correlations(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, option
+from elastocal.identification.assumptions import assumption_findings
 from elastocal.identification.mistakes import unheard_of
 from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary, held_out_residual
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
+from elastocal.identification.scrutiny import stage_of
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import weights_for
-from elastocal.model.effects import CATALOGUE
 from elastocal.text import listed
 from elastocal.units import Array
 
@@ -152,20 +153,15 @@ def resampled_rms(
     return rms, (float(low), float(high))
 
 
-def stage_of(effect: str) -> int:
-    """0 for what places base and markers, 1 for geometry, 2 for what yields under load."""
-    known = CATALOGUE[effect]
-    if known.registered:
-        return 0
-    return 2 if known.stage in ("compliance", "load") else 1
-
-
 # What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.
 #
 # Terminal, page, notebook and JSON print these findings and judge nothing of their own.  A
 # threshold stands here or nowhere.
 
-STATED = (0.025, 0.975)  # quantiles of χ² between which the residual agrees with the stated noise
+STATED = (0.005, 0.995)  # quantiles of χ² between which the residual agrees with the stated noise
+# Beside a stated variance of more than twice what the residual shows, an effect as large as all of
+# the noise would pass for noise.
+FAR_TOO_LARGE = math.sqrt(0.5)
 LACK_OF_FIT = 0.01  # p-value below which configurations scatter more than their repeats
 FLATTERS = 1.2  # held-out over fitted error, above which the fit flatters itself
 LITTLE = 1.25  # times better than the nominal arm, below which little was gained
@@ -175,12 +171,16 @@ WORSE, CHANCE = 1.25, 0.01
 MANY = 0.05  # share of the readings fitted, above which those beyond the noise are no accidents
 SCATTERS = 0.01  # p-value below which joints settle anew at each visit, or something drifts
 NOT_NORMAL = 0.01  # p-value below which standardised residuals are not normal
+# Excess kurtosis of the t distribution with 10 degrees of freedom, of which least squares uses
+# 94.5 % of the information: beyond it a robust method is worth its while.
+HEAVY = 1.0
 FEW_DOF_PER_PARAMETER = 1.0
 MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
 ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
 
 # How a parameter stands, in the order in which they are told.
 ALONE, COMBINED, ABSORBED, INVISIBLE, FIXED = "alone", "combined", "absorbed", "invisible", "fixed"
+WEAK = "weak"
 
 LACKING = (
     "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
@@ -212,6 +212,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
     found = [
         *_spoilt(result),
         *_unheard_of(result),
+        *assumption_findings(result),
         *_few_poses(result),
         *(f for f in of_solution if f.kind == "ill_conditioned"),
         *_against_stated_noise(result),
@@ -306,7 +307,12 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     if ratio > high:
         yield Finding("residual_above_stated_noise", "care", numbers, LACKING)
     elif ratio < low:
-        yield Finding("residual_below_stated_noise", "note", numbers)
+        severity: Severity = "care" if ratio < FAR_TOO_LARGE else "note"
+        yield Finding(
+            "residual_below_stated_noise", severity, numbers,
+            "State the noise that the tracker has: beside noise stated too large, nothing shows "
+            "whether the model lacks something.",
+        )  # fmt: skip
     else:
         yield Finding("residual_agrees_with_stated_noise", "good", numbers)
 
@@ -450,7 +456,10 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
         verb = "1 reading that lies" if n == 1 else f"{n} readings that lie"
         yield Finding(
             "faulty_readings", "note",
-            {"fitted": len(result.outliers), "left_out": len(result.excluded)},
+            {
+                "fitted": len(result.outliers), "left_out": len(result.excluded),
+                "heldout_all_rms_um": _um(result.heldout_all_rms),
+            },
             f"Look at the {verb} beyond the noise.",
         )  # fmt: skip
     if len(result.outliers) > MANY * fitted:
@@ -490,10 +499,13 @@ def _prior(result: Calibration) -> Iterator[Finding]:
 
 
 def standings(result: Calibration) -> dict[str, str]:
-    """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, INVISIBLE or FIXED."""
+    """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, WEAK (hardly shown),
+    INVISIBLE or FIXED."""
     first = {next(iter(c.terms)) for c in result.combinations}
 
     def standing(e: Estimate) -> str:
+        if e.limits is not None:
+            return WEAK
         if e.identifiable:
             return ALONE
         if e.name in first:
@@ -527,8 +539,15 @@ def shape_of(summary: ResidualSummary) -> Finding:
     # Of a normal sample, kurtosis has twice the standard deviation of skewness.
     if abs(whole.skewness) > abs(whole.excess_kurtosis) / 2:
         return Finding("residuals_skew", "note", numbers)
-    kind = "residuals_heavy_tailed" if whole.excess_kurtosis > 0 else "residuals_light_tailed"
-    return Finding(kind, "note", numbers)
+    if whole.excess_kurtosis <= 0:
+        return Finding("residuals_light_tailed", "note", numbers)
+    severity: Severity = "care" if whole.excess_kurtosis > HEAVY else "note"
+    return Finding(
+        "residuals_heavy_tailed", severity, numbers,
+        f"Compare with a robust fit ({option('method')} huber or student-t): where parameters "
+        "differ by more than their intervals, far readings decide them; look for what makes single "
+        "readings err (line of sight, vibration, a tracker that has not settled).",
+    )  # fmt: skip
 
 
 def _test(result: Calibration) -> Iterator[Finding]:
@@ -577,6 +596,7 @@ def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
 
 def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
     at_bound = {result.model.names[c] for c in solution.reduction.at_bound}
+    at = {name: k for k, name in enumerate(result.determined)}
     for e, p in zip(result.estimates, result.model.parameters, strict=True):
         if p.lower < e.held < p.upper or not (np.isfinite(p.lower) or np.isfinite(p.upper)):
             continue
@@ -587,9 +607,10 @@ def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
                 "at_bound", "note", numbers,
                 "Check load direction and torque signs, or measure poses that load it more.",
             )  # fmt: skip
-        elif e.value is not None and e.std is not None and abs(e.value - bound) > 2 * e.std:
+        elif e.limits is not None and (e.limits[1] < p.lower or e.limits[0] > p.upper):
+            std = float(np.sqrt(result.covariance[at[e.name], at[e.name]]))
             yield Finding(
-                "beyond_bound", "note", numbers | {"value": e.value, "std": e.std},
+                "beyond_bound", "note", numbers | {"value": e.held, "std": std},
                 "Check load direction and torque signs, measure poses that load it more, or fit "
                 "with bounds.",
             )  # fmt: skip
@@ -599,6 +620,12 @@ def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
 
 # What a warning says of a finding: its numbers and its remedy by name.
 SENTENCES = {
+    "copied_readings": (
+        "{copies} readings repeat others to the last digit (lines {lines}) and were left out: a "
+        "copy tells nothing new, and intervals that count it are too narrow. {remedy}"
+    ),
+    "load_unit": "{remedy}",
+    "scatter_not_counted": "{remedy}",
     "not_converged": "The fit did not converge: {reason}. {remedy}",
     "few_degrees_of_freedom": (
         "Only {dof} degrees of freedom for {parameters} determined parameters: intervals are wide "
@@ -657,6 +684,8 @@ def warning_sentences(result: Calibration) -> tuple[str, ...]:
         elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
             words = {k: ", ".join(map(_word, v)) if isinstance(v, tuple) else v
                      for k, v in f.numbers.items()}  # fmt: skip
+            if f.kind == "copied_readings":
+                words["lines"] = _runs(result.copies)
             within = f.kind == "beyond_bound"  # there the remedy ends a sentence
             remedy = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
             told.append(SENTENCES[f.kind].format(**words, remedy=remedy))
@@ -685,10 +714,14 @@ def _faulty_readings(result: Calibration) -> list[str]:
 
 
 def _lines(readings: tuple[Outlier, ...]) -> str:
-    """ "lines 142–507, 610 …": runs of lines, the first eight."""
-    runs = blocks([o.line for o in readings])
+    return f"lines {_runs(o.line for o in readings)}"
+
+
+def _runs(lines: Iterable[int]) -> str:
+    """ "142–507, 610 …": runs of lines, the first eight."""
+    runs = blocks(list(lines))
     shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in runs[:8])
-    return f"lines {shown}{' …' if len(runs) > 8 else ''}"
+    return f"{shown}{' …' if len(runs) > 8 else ''}"
 
 
 def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
@@ -699,7 +732,8 @@ def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
 # Of these the warning, or the line on the prior, says what to do.
 TOLD_ELSEWHERE = (
     "not_converged", "few_degrees_of_freedom", "ill_conditioned", "at_bound", "beyond_bound",
-    "many_faulty_readings", "mostly_prior", "drift", "joint_scatter",
+    "many_faulty_readings", "mostly_prior", "drift", "joint_scatter", "copied_readings",
+    "load_unit", "scatter_not_counted",
 )  # fmt: skip
 
 

@@ -15,9 +15,10 @@ from elastocal.identification.methods import (
     Refit,
     is_exact,
     run_method,
+    with_limits,
     with_smooth,
 )
-from elastocal.identification.mistakes import refuse_nonsense, unheard_of
+from elastocal.identification.mistakes import copied, refuse_nonsense, unheard_of
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe, find_faulty
 from elastocal.identification.prediction import NewPoses
@@ -69,6 +70,11 @@ def identify(
     if test is not None:
         check_rows(model, test)
     observed = observe(table, model.observe)
+    again = copied(observed)
+    copies = tuple(table.row[observed.lead[again]].tolist())
+    if copies:
+        observed = subset(observed, ~again)
+        options = _without(options, again, observed.size)
     progress("finding the start")
     free = fixed_and_free(model, options.fixed)
     x0 = start_values(model, table, options.seed, free)
@@ -76,10 +82,7 @@ def identify(
     every = _solution(model, observed, x0, ordinary(model, free), options, progress, not smooth)
 
     def refit(good: NDArray[np.bool_], final: bool = False) -> Solution:
-        chosen = options
-        if options.covariance is not None:
-            rows = np.repeat(good, observed.size)
-            chosen = replace(options, covariance=options.covariance[np.ix_(rows, rows)])
+        chosen = _without(options, ~good, observed.size)
         silent = progress if final else _silent
         own = ordinary(model, free)
         wider = final and not smooth
@@ -98,9 +101,10 @@ def identify(
         found = run_method(every, sound, faulty, refit, options, progress)
         if not found.good.all() and options.faulty == "auto":
             found = _kept_where_sensible(found, every, sound, faulty, refit, options, progress)
+        found = with_limits(every, found, options)
     progress("intervals and held-out residuals")
     outliers = describe(every, found.solution, ~found.good)
-    result = summarise(model, every, sound, found, outliers, new_poses)
+    result = summarise(model, every, sound, found, outliers, new_poses, copies)
     if test is None:
         return result
     return judged(replace(result, test=_test_errors(model, result.x, test)))
@@ -121,6 +125,14 @@ def _kept_where_sensible(
     except (ElastocalError, np.linalg.LinAlgError):
         return found
     return found if unheard_of(model, kept.solution.fit.x) else kept
+
+
+def _without(options: Options, left_out: NDArray[np.bool_], size: int) -> Options:
+    """The options for the observations that are not `left_out` (N,)."""
+    if options.covariance is None:
+        return options
+    rows = np.repeat(~left_out, size)
+    return replace(options, covariance=options.covariance[np.ix_(rows, rows)])
 
 
 def _silent(message: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -132,6 +132,7 @@ def _steepest(at: Evaluation) -> float:
 # Relative change of the cost at which the trust region stops; one exact Gauss–Newton step follows
 # and squares what error is left.
 TOLERANCE = 1e-10
+FIRST, LAST, MOST_POLISHES = 1e-6, 1e-11, 50
 # The same of a large table, whose evaluations are dear.  The last step is taken: at a million rows
 # it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
 LARGE_TOLERANCE = 1e-8
@@ -338,17 +339,30 @@ def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
 
 
 def _polished(problem: FitProblem, x: Array, at: Regression) -> tuple[Array, Regression]:
-    """One Gauss–Newton step with the exact linear solver, kept where it does not cost."""
-    weights, columns = problem.weights, problem.columns
-    before = weights.apply(at.residual)
-    step = solve_weighted(weights.apply(at.B), before, scale=problem.sizes[columns])
-    moved = x.copy()
-    moved[columns] += step.x
-    try:
-        there = _regression(problem, moved)
-    except ElastocalError:
-        return x, at
-    after = weights.apply(there.residual)
-    if not np.isfinite(after).all() or after @ after > before @ before:
-        return x, at
-    return moved, there
+    """Gauss–Newton steps with the exact linear solver, kept where they do not cost.
+
+    For an arm one is enough, whose step is then less than FIRST of the residual; a model that
+    bends within its residual takes more, until what is left after them is less than LAST.
+    """
+    weights, columns, last = problem.weights, problem.columns, 0.0
+    if weights.even:
+        weights = replace(weights, whiten=None)
+    for _ in range(MOST_POLISHES):
+        B, before = weights.apply(at.B), weights.apply(at.residual)
+        step = solve_weighted(B, before, scale=problem.sizes[columns]).x
+        moved = x.copy()
+        moved[columns] += step
+        try:
+            there = _regression(problem, moved)
+        except ElastocalError:
+            break
+        after = weights.apply(there.residual)
+        cost = float(before @ before)
+        if not np.isfinite(after).all() or after @ after > cost * (1 + ROUNDING):
+            break
+        x, at = moved, there
+        moves = float(np.linalg.norm(B @ step)) / max(np.sqrt(cost), np.finfo(float).tiny)
+        if moves <= FIRST and not moves**2 > LAST * last > 0:
+            break
+        last = moves
+    return x, at

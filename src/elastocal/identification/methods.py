@@ -144,7 +144,8 @@ class MethodResult:
     many parameters the readings paid for (`effective`), `leverage` (rows,), and `warnings` where
     the readings contradict them; in a fit to readings alone effective and leverage follow from
     the solution.  `smooth` are the smooth functions, with which `standard` (N, size) are the
-    residuals of all readings free of the fit's part in them.
+    residuals of all readings free of the fit's part in them.  `limits` are the 95 % intervals of
+    the parameters that the readings `hardly_shown`, by their index.
     """
 
     method: str
@@ -159,6 +160,7 @@ class MethodResult:
     warnings: tuple[str, ...] = ()
     smooth: tuple[SmoothPart, ...] = ()
     standard: Array | None = None
+    limits: dict[int, tuple[float, float]] = field(default_factory=dict)
 
 
 def run_method(
@@ -234,6 +236,93 @@ def _with_knowledge(found: MethodResult, options: Options, progress: Progress) -
     )  # fmt: skip
 
 
+# Parameters that the readings hardly show.
+#
+# A compliance or a backlash has a sign, and one whose 95 % interval reaches beyond its physical
+# bound is told from nothing.  Its estimate is mostly noise, and worse than what was known before:
+# where the interval has room for the nominal value, that stands in its place; else the estimate,
+# or the bound where it lies beyond.  What the readings say of it is the interval.
+
+
+def hardly_shown(found: MethodResult) -> dict[int, tuple[float, float]]:
+    """The 95 % intervals, by parameter, of those fitted that reach beyond a physical bound and
+    stand alone."""
+    solution, intervals = found.solution, found.intervals
+    std, reach = intervals.covariance.std, {}
+    for k, c in enumerate(solution.reduction.kept.tolist()):
+        p = solution.problem.model.parameters[c]
+        low, high = (float(end) for end in intervals.ci95[k])
+        beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
+        if beyond and not p.shrunk and not solution.reduction.terms(k, solution.sizes, std[k]):
+            reach[c] = (low, high)
+    return reach
+
+
+def with_limits(every: Solution, found: MethodResult, options: Options) -> MethodResult:
+    """The result with the parameters that the readings hardly show held, and the others fitted
+    anew with the weights and the kind of noise found.
+
+    One that lies beyond its bound by more than its interval contradicts the model and stays
+    fitted: whoever reads it has to see that.  Of methods other than generalised and ordinary least
+    squares, and where bounds or knowledge were given, all stay fitted.
+    """
+    fitted = found.method in ("reml", "wls", "ols") and not (options.bounded or options.knows)
+    limits: dict[int, tuple[float, float]] = {}
+    while True:
+        limits = hardly_shown(found) | limits  # held ones keep what was found of them
+        held = _held(found, limits) if fitted else {}
+        again = _holding(every, found, held, options) if held else None
+        if again is None:
+            return replace(found, limits=limits)
+        found = again
+
+
+def _held(found: MethodResult, limits: dict[int, tuple[float, float]]) -> dict[int, float]:
+    """The fitted parameters to be held, and where."""
+    held, fit = {}, found.solution.fit
+    for c in set(limits) & set(fit.columns.tolist()):
+        p, (low, high), x = found.solution.problem.model.parameters[c], limits[c], float(fit.x[c])
+        if p.nominal != 0 and low <= p.nominal <= high:
+            held[c] = p.nominal
+        elif not p.lower <= x <= p.upper and low < p.upper and p.lower < high:
+            held[c] = min(max(x, p.lower), p.upper)
+    return held
+
+
+def _holding(
+    every: Solution, found: MethodResult, held: dict[int, float], options: Options
+) -> MethodResult | None:
+    """The result of a fit that holds some of its parameters; None where there is none."""
+    solution, noise = found.solution, found.noise
+    reduction, x0 = solution.reduction, solution.problem.x0.copy()
+    stays = ~np.isin(reduction.kept, list(held))
+    if not stays.any():
+        return None
+    x0[list(held)] = list(held.values())
+    lost = reduction.kept[~stays]
+    mixing = np.hstack([reduction.mixing[stays], np.zeros((int(stays.sum()), len(lost)))])
+    reduction = replace(
+        reduction, kept=reduction.kept[stays], dropped=np.append(reduction.dropped, lost),
+        mixing=mixing,
+    )  # fmt: skip
+    problem = replace(solution.problem, x0=x0)
+    fit = fit_kept(problem, solution.sizes, solution.fit.x, reduction)
+    if not fit.converged:
+        return None
+    solution = replace(
+        solution, problem=problem, fit=fit, reduction=reduction, heldout=heldout_of(problem, fit)
+    )
+    if noise is not None:
+        observed = every.problem.observations
+        readings = linearised(problem.model, observed, fit.x, reduction.kept)
+        if len(problem.observations.lead) < len(found.good):
+            readings = readings.take(found.good)
+        again = estimate_noise(readings, noise.kind, noise)
+        noise = replace(again, trials=noise.trials, reason=noise.reason, tests=noise.tests)
+    intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
+    return replace(found, solution=solution, intervals=intervals, noise=noise)
+
+
 def is_exact(solution: Solution) -> bool:
     """Are these residuals mere rounding?"""
     return rms_3d(solution.fit.residual, solution.problem.observations.size) < EXACT
@@ -269,8 +358,9 @@ def _reml(
         progress("comparing with noise of the readings alone")
         plain = found(OF_READINGS)
         if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
+            tests = noise.tests
             solution, noise, good = plain
-            warnings = (LACKING,)
+            noise, warnings = replace(noise, tests=tests), (LACKING,)
     intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
     return MethodResult("reml", solution, intervals, noise, good, warnings=warnings)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy import stats
 
 from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
@@ -19,10 +20,17 @@ from elastocal.errors import InsufficientDataError
 from elastocal.identification.start import RegistrationProblem, register
 from elastocal.measurements import Measurements
 from elastocal.model.effects import effect_of
+from elastocal.model.effects.base import index
+from elastocal.model.effects.compliances import (
+    RATED_WIND_UP,
+    JointCompliance,
+    rated_torque,
+    weight_torque,
+)
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.units import Array
+from elastocal.units import Array, BoolArray
 
 FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
 POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
@@ -161,6 +169,94 @@ def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Me
             f"with the joint values of one pose {words}",
             other(q=np.roll(poses, shift, axis=0)[visit]),
         )
+
+
+# Readings that are copies of others.
+#
+# A repeat differs from its first reading by the noise.  It agrees to the last digit only where
+# that is rounded more coarsely than the noise, and then more often in one coordinate than in all.
+
+NO_FINER = 1e-7  # m; readings with more digits than this agree in all of them by no chance
+ROUNDS = 20  # of the equation for P
+COPIED = 0.01  # p-value below which equal readings are too many for rounding
+
+
+def copied(observed: Observations) -> BoolArray:
+    """Observations (N,) that repeat an earlier one to the last digit: joint values, load, marker
+    and reading, whatever they are called.
+
+    Where readings are rounded, those of one pose, load and marker that differ tell how often a
+    coordinate agrees by rounding (with half a reading more of either kind): of pairs that differ
+    somewhere, a share s_a = (p_a - P)/(1 - P) agrees in coordinate a, P the product of all p_a.
+    Equal readings that are no more frequent than P explains are true repeats.
+    """
+    table, n = observed.table, len(observed.lead)
+    value, own = observed.value.reshape(n, observed.size), observed.lead
+    if observed.kind == "pose" and table.rotation is not None:  # its value has zeros there
+        value = np.hstack([value[:, :3], table.rotation[own]])
+    said = [table.q, table.force, table.marker[:, None]]
+    said += [] if table.torque is None else [table.torque]
+    key = np.column_stack(said)[own]
+    found = np.zeros(n, dtype=bool)
+    # Sorting whole rows takes long, and most tables have none to look at.
+    _, code, count = np.unique(value[:, 0], return_inverse=True, return_counts=True)
+    alike = np.flatnonzero(count[code.ravel()] > 1)
+    _, first = np.unique(np.hstack([key, value])[alike], axis=0, return_index=True)
+    found[np.delete(alike, first)] = True
+    if not found.any():
+        return found
+    steps = value[:, :3] / NO_FINER
+    if np.abs(steps - np.round(steps)).max() > 1e-3:
+        return found
+    _, start, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    group = group.ravel()
+    others = np.flatnonzero(start[group] != np.arange(n))
+    same = value[others] == value[start[group[others]]]
+    differing = same[~same.all(axis=1)]
+    partly = (differing.sum(axis=0) + 0.5) / (len(differing) + 1)
+    share = 0.0
+    for _ in range(ROUNDS):
+        share = float(np.prod(partly * (1 - share) + share))
+    # A reading with k others before it is like one of them with probability 1 - (1 - P)^k.
+    before = np.arange(int(np.bincount(group).max()))
+    alike_by_chance = np.cumsum(1 - (1 - share) ** before)[np.bincount(group) - 1]
+    chance = stats.poisson.sf(int(found.sum()) - 1, float(alike_by_chance.sum()))
+    return found & bool(chance < COPIED)
+
+
+# Loads in another unit.
+#
+# Deflections tell compliance times load: loads that are too small by a factor make every
+# compliance too large by it, without a trace in the residual.
+
+KILOGRAMS = 9.80665  # N, the weight of one
+
+
+def load_ratio(model: Model, known: dict[str, float]) -> tuple[float, str] | None:
+    """Geometric mean of the joints' compliances over what they should be about, and by what;
+    None where nothing says it.
+
+    `known` (SI) are values by parameter name.  They should be those that the cell states, else
+    what winds each revolute joint up by RATED_WIND_UP at its rated torque, by the links' weights.
+    """
+    given, rated = [], []
+    for p in model.parameters:
+        value = known.get(p.name, 0.0)
+        if p.effect != JointCompliance.name or value <= 0:
+            continue
+        i = index(p.where)
+        if p.nominal > 0:
+            given.append(value / p.nominal)
+        elif model.chain.kinds[i] == "revolute" and weight_torque(model.chain, i) > 0:
+            torque = rated_torque(model.chain, model.cell, i)
+            rated.append(value * (torque or 0.0) / RATED_WIND_UP)
+    for ratios, by in ((given, CELL), (rated, WEIGHTS)):
+        if ratios:
+            return float(np.exp(np.mean(np.log(ratios)))), by
+    return None
+
+
+CELL, WEIGHTS = "the cell's nominal compliances", "the weights of the links"
 
 
 # What no arm can be.

@@ -250,6 +250,33 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
     )
 
 
+def noise_parts(found: MethodResult) -> dict[str, float]:
+    """Mean square 3-D noise (m²) of single "readings", and what readings of "visits" share.
+
+    Where no noise was estimated, all of the residual is taken for that of single readings.
+    """
+    solution = found.solution
+    observed, fit = solution.problem.observations, solution.fit
+    size, n = observed.size, len(observed.lead)
+    if found.noise is None:
+        squared = fit.residual.reshape(n, size)[:, :3] ** 2
+        spare = max(len(fit.residual) - _spent(found), 1)
+        return {"readings": float(squared.sum()) / n * len(fit.residual) / spare}
+    noise, few = found.noise.fit, fit.columns[~solution.problem.model.shrunk[fit.columns]]
+    readings = linearised(solution.problem.model, observed, fit.x, few)
+    own = np.diagonal(own_noise(noise, readings)[0], axis1=1, axis2=2)[:, :3].sum(axis=1).mean()
+    visits = 0.0
+    for effect, variance in zip(noise.shared, noise.common, strict=True):
+        if variance > 0:
+            mine = effect.of(readings)
+            loading = np.where(mine.unit[:, :, None, None] >= 0, mine.loading, 0.0)
+            visits += float(variance) * float((loading[:, :, :3] ** 2).sum(axis=(1, 2, 3)).mean())
+    drifting = noise.own[noise.structure.n_own :]
+    if len(drifting):
+        visits += float(drifting[0]) * min(size, 3)
+    return {"readings": float(own), "visits": visits}
+
+
 def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
     """Root mean square of the residual in units of the stated noise, per degree of freedom."""
     solution = found.solution

@@ -196,6 +196,7 @@ def median_scale(squared: Array, size: int) -> float:
 # Which observations does a fit of the others contradict?  Judged in turns until it stands.
 
 ROUNDS = 12
+TINY = np.finfo(float).tiny
 ALONE = 1e-9  # share of an observation's direction that the other observations must see
 
 
@@ -244,8 +245,11 @@ def judge(whole: Solution, fitted: Solution, good: BoolArray) -> tuple[BoolArray
     """Observations (N,) beyond the limit under a fit to the `good` ones, and its trimmed cost.
 
     An observation in the fit is judged by its residual as if left out, any other by its
-    prediction error; both have variance s² (1 ± leverage) and follow F(size, dof).  The trimmed
-    cost is the sum of the smaller half of the squared lengths.
+    prediction error; both have variance s² (1 ± leverage) and follow F(size, dof).  Where the
+    good ones determine fewer parameters than the whole table does, the others are held, and err by
+    their typical sizes: what such an error does to an observation outside the fit is no fault of
+    it, and adds to its variance.  The trimmed cost is the sum of the smaller half of the squared
+    lengths.
 
     Raises LinAlgError where the good ones do not determine the fitted parameters.
     """
@@ -255,15 +259,22 @@ def judge(whole: Solution, fitted: Solution, good: BoolArray) -> tuple[BoolArray
     r_factor = _inside(whole, fitted, good)
     s2 = r_factor.rss / max(r_factor.rows - len(kept), 1)
     alone_squared, squared = np.empty(n), np.empty(n)
+    reduction, held, mixing = fitted.reduction, kept[:0], np.zeros((len(kept), 0))
+    if len(kept) < len(whole.reduction.kept):
+        held, mixing = reduction.dropped, reduction.mixing
 
     def of_part(part: Part) -> None:
-        at = regressor(problem.model, part, fitted.fit.x, kept)
-        WB, e = part.weights.apply(at.B), part.weights.apply(at.residual)
+        at = regressor(problem.model, part, fitted.fit.x, np.concatenate([kept, held]))
+        B, e = part.weights.apply(at.B), part.weights.apply(at.residual)
+        WB, beside = B[:, : len(kept)], B[:, len(kept) :]
         Q = linalg.solve_triangular(r_factor.R, WB.T, trans="T").T
+        unknown = (beside - WB @ mixing) * fitted.sizes[held] / np.sqrt(max(s2, TINY))
         e2 = e.reshape(-1, size)
         squared[part.index] = (e2**2).sum(axis=1)
-        alone_squared[part.index] = _studentised(Q.reshape(-1, size, len(kept)), e2,
-                                                 good[part.index])  # fmt: skip
+        alone_squared[part.index] = _studentised(
+            Q.reshape(-1, size, len(kept)), e2, good[part.index],
+            unknown.reshape(len(part.index), size, len(held)),
+        )  # fmt: skip
 
     for _ in each(problem.parts, of_part):
         pass
@@ -288,13 +299,15 @@ def _inside(whole: Solution, fitted: Solution, good: BoolArray) -> RFactor:
     return merge(each(problem.parts, of_part))
 
 
-def _studentised(Q: Array, e: Array, good: BoolArray) -> Array:
-    """eᵀ (I ± QQᵀ)⁻¹ e per observation: minus in the fit, plus out of it.
+def _studentised(Q: Array, e: Array, good: BoolArray, unknown: Array) -> Array:
+    """eᵀ (I − QQᵀ)⁻¹ e per observation of the fit, eᵀ (I + QQᵀ + UUᵀ)⁻¹ e of any other.
 
-    Q (n, size, p), e (n, size); zero where an observation of the fit alone determines a direction.
+    Q (n, size, p), e (n, size), U `unknown` (n, size, u); zero where an observation of the fit
+    alone determines a direction.
     """
     size = e.shape[1]
     H = Q @ Q.transpose(0, 2, 1)
+    H[~good] += unknown[~good] @ unknown[~good].transpose(0, 2, 1)
     spread = np.eye(size) + np.where(good, -1.0, 1.0)[:, None, None] * np.minimum(H, 1e12)
     alone = np.zeros(len(e), dtype=bool)
     # The largest eigenvalue is at most the trace: only observations of weight need theirs.

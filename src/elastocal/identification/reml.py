@@ -506,7 +506,9 @@ def usual_start(structure: Structure, shared: tuple[SharedEffect, ...]) -> Array
     own = float(np.median((sets.e**2).mean(axis=1) * sets.repeats / unit))
     if sets.dof.sum() > 0:
         squares = float(np.trace(sets.scatter, axis1=1, axis2=2).sum())
-        own = max(squares / (float(sets.dof.sum()) * size), 1e-9 * own)
+        # A few repeats may agree by rounding: from near zero the search does not come back.
+        dof = float(sets.dof.sum()) * size
+        own = max((squares + own / dof) / (dof + 1 / dof), 1e-9 * own)
     # Shared effects start above zero, from where they are free to go there.
     share = 0.1 * float((sets.e**2).mean())
     moved = [float((effect.loading**2).sum(axis=(1, 3)).mean()) for effect in shared]

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from elastocal.above import Result
 from elastocal.errors import UnknownNameError
+from elastocal.identification import scrutiny
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.noise_summary import Noise
@@ -26,7 +27,10 @@ from elastocal.identification.prediction import (
     scatter_of,
 )
 from elastocal.identification.residuals import ResidualSummary
+from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.smooth_part import SmoothPart
+from elastocal.identification.weighted_problem import Weights
+from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm, OpenParameters, nominal_flange_rows
 from elastocal.model.calibrated_tool import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
@@ -54,6 +58,8 @@ class Estimate:
         dof: Degrees of freedom of the t distribution behind `ci95`, infinite for a normal one.
         combined_with: Names that the data know only together with it.
         note: Why there is no value, and what else there is to know.
+        limits: Where the readings hardly show it, so that it has no value: the 95 % interval that
+            they leave it, with ends beyond its physical bound.
     """
 
     name: str
@@ -66,6 +72,7 @@ class Estimate:
     dof: float | None = None
     combined_with: tuple[str, ...] = ()
     note: str = ""
+    limits: tuple[float, float] | None = None
 
     @property
     def identifiable(self) -> bool:
@@ -222,6 +229,10 @@ class Calibration(Result):
         left: The parameters that the data left open, and what they stand for.
         predicted: The error to be expected at poses that nobody measured, without the noise of
             a reading; None where it cannot be told.
+        copies: Lines of readings that were left out: they repeat others to the last digit.
+        weights: Those of the fit.
+        noise_parts: Mean square 3-D noise (m²) of single "readings", and what readings of
+            "visits" have in common.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -267,6 +278,9 @@ class Calibration(Result):
     smooth: tuple[SmoothPart, ...] = ()
     left: OpenParameters | None = None
     predicted: PredictedError | None = None
+    copies: tuple[int, ...] = ()
+    weights: Weights | None = field(default=None, compare=False)
+    noise_parts: dict[str, float] = field(default_factory=dict)
 
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
@@ -321,6 +335,14 @@ class Calibration(Result):
         """Readings beyond the noise, whether they had a part in the fit or were set apart."""
         return self.outliers + self.excluded
 
+    @property
+    def heldout_all_rms(self) -> float:
+        """The held-out 3-D rms in m with the readings that were set apart, by their errors under
+        the fit to the others; infinite where none could be held out."""
+        apart = sum(o.residual**2 for o in self.excluded)
+        n, k = len(self.observations.lead), len(self.excluded)
+        return math.sqrt((n * self.heldout_rms**2 + apart) / (n + k))
+
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of the parameter `name`; UnknownNameError with the nearest name."""
         found = self._by_name.get(name)
@@ -363,6 +385,45 @@ class Calibration(Result):
         """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
         observed = self.observations
         return self.model.regressor(observed.table, self.x, observations=observed).B
+
+    @cached_property
+    def _looked(self) -> scrutiny.Looked | None:
+        """The fit for a second look; None for a table too large to do it in passing."""
+        if self.weights is None or len(self.residual) * len(self.estimates) > MOST_NUMBERS:
+            return None
+        columns = np.array([self.model.names.index(name) for name in self.determined])
+        return scrutiny.Looked(
+            self.model, self.observations, self.weights, self.x, self.B, columns.astype(np.int64),
+            self.covariance, self.residual, self.held_out, self.dof,
+        )  # fmt: skip
+
+    def influence(self) -> tuple[scrutiny.Influence, ...]:
+        """Leverage and influence of every configuration, in the table's order; empty for tables
+        too large to look again.
+
+        Examples:
+            >>> fit = ec.identify("cell.toml", "data.csv")
+            >>> strongest = max(fit.influence(), key=lambda c: c.cook)
+            >>> strongest.configuration, strongest.leverage, strongest.moved
+            ('...', 1..., 'joint...')
+        """
+        return () if self._looked is None else scrutiny.influence(self._looked)
+
+    def parameter_sets(self) -> tuple[scrutiny.ParameterSet, ...]:
+        """Sets of parameters side by side: held-out errors and restricted likelihoods."""
+        return () if self._looked is None else scrutiny.parameter_sets(self._looked)
+
+    def uncertainty(self, table: Measurements | None = None) -> scrutiny.UncertaintyBudget | None:
+        """What a predicted reading's error is made of, at the poses and loads of a `table` or those
+        fitted; None for tables too large to look again."""
+        if self._looked is None:
+            return None
+        return scrutiny.uncertainty_budget(self._looked, self.noise_parts, table)
+
+    @cached_property
+    def autocorrelation(self) -> scrutiny.Autocorrelation | None:
+        """How alike the residuals of visits are that follow each other; None for few visits."""
+        return scrutiny.autocorrelation(self.residual, self.observations)
 
     @cached_property
     def arm(self) -> CalibratedArm:
@@ -473,6 +534,7 @@ class Calibration(Result):
             "dof": self.dof,
             "residual_rms_um": _um(self.residual_rms),
             "heldout_rms_um": _um(self.heldout_rms),
+            "heldout_all_rms_um": _um(self.heldout_all_rms),
             "nominal_rms_um": _um(self.nominal_rms),
             "test": None if self.test is None else {
                 "rms_um": _um(self.test.rms), "mean_um": _um(self.test.mean),
@@ -502,9 +564,20 @@ class Calibration(Result):
             "backend": self.model.backend_report(),
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
+            "copies": list(self.copies),
+            **self._second_look(),
             "warnings": list(self.warnings),
             "findings": [f.to_json() for f in self.findings],
         }  # fmt: skip
+
+    def _second_look(self) -> dict[str, Any]:
+        budget, course = self.uncertainty(), self.autocorrelation
+        return {
+            "influence": [c.to_json() for c in self.influence()],
+            "parameter_sets": [s.to_json() for s in self.parameter_sets()],
+            "autocorrelation": None if course is None else course.to_json(),
+            "uncertainty": None if budget is None else budget.to_json(),
+        }
 
 
 def _estimate_json(e: Estimate) -> dict[str, Any]:
@@ -515,6 +588,7 @@ def _estimate_json(e: Estimate) -> dict[str, Any]:
         "dof": None if e.dof is None else _finite(e.dof), "identifiable": e.identifiable,
         "combined_with": list(e.combined_with), "nominal": e.nominal, "held": e.held,
         "note": e.note or _endless(e.ci95),
+        **({} if e.limits is None else {"limits95": [_finite(v) for v in e.limits]}),
     }  # fmt: skip
 
 

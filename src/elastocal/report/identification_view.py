@@ -16,6 +16,7 @@ from elastocal.identification.findings import (
     COMBINED,
     FIXED,
     INVISIBLE,
+    WEAK,
     ErrorBudget,
     next_steps,
     stage_of,
@@ -55,6 +56,7 @@ from elastocal.report.method_and_noise import (
     false_alarm_line,
     fault_lines,
     group_name,
+    in_time_line,
     intervals_line,
     method_and_weights,
     noise_model_line,
@@ -100,9 +102,26 @@ def short_note(result: Calibration, e: Estimate) -> str:
         several = len(e.combined_with) - 3
         names = ", ".join(printable(n) for n in e.combined_with[:3])
         return f"held: absorbed in {names}" + (f" + {several} more" if several > 0 else "")
+    if standing == WEAK:
+        return f"hardly shown: {limits(result, e)}"
     if standing == INVISIBLE:
         return "held: not visible in these data"
     return "fixed by the user" if standing == FIXED else printable(e.note)
+
+
+def limits(result: Calibration, e: Estimate) -> str:
+    """What the readings say of a parameter that they hardly show, and what the model uses."""
+    assert e.limits is not None
+    p = result.model.parameters[result.model.names.index(e.name)]
+    low, high = (significant(display(end, e.unit)[0], 2) for end in e.limits)
+    held, unit = display(e.held, e.unit)
+    text = f"{low} to {high} {unit}"
+    if e.limits[0] <= p.lower <= e.limits[1]:
+        text = f"at most {high} {unit}"
+    elif e.limits[0] <= p.upper <= e.limits[1]:
+        text = f"at least {low} {unit}"
+    used = "nominal" if e.held == e.nominal and e.held else significant(held, 2)
+    return f"{text}; {used} is used"
 
 
 def held_where(result: Calibration, names: list[str]) -> str:
@@ -145,6 +164,13 @@ def undetermined_lines(result: Calibration) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason."""
     lines = []
     extra = {printable(name) for name in result.left.redundant} if result.left else set()
+    weak = [
+        f"{printable(e.name)} ({limits(result, e)})"
+        for e in result.ordinary
+        if e.limits is not None
+    ]
+    if weak:
+        lines.append(f"hardly shown, so without a value (95 %): {', '.join(weak)}")
     if names := [n for n in names_of(result, INVISIBLE) if n not in extra]:
         where = held_where(result, names)
         lines.append(f"{where} (not visible in these data): {', '.join(names)}")
@@ -180,6 +206,8 @@ def what_was_identified(result: Calibration) -> str:
             f", and {counted(n, 'combination')} of parameters that no reading tells apart "
             f"({absorbed} held in exchange)"
         )
+    if weak := len(names_of(result, WEAK)):
+        text += f"; {weak} hardly shown"
     if unseen := len(names_of(result, INVISIBLE)):
         text += f"; {unseen} not visible in these data"
     if fixed := len(names_of(result, FIXED)):
@@ -209,6 +237,9 @@ def how_well_it_predicts(result: Calibration) -> str:
         elif result.finding("no_better_than_nominal") is not None:
             text += f", no better than the nominal arm ({length(nominal)})"
         text += "."
+        if result.excluded:
+            apart = counted(len(result.excluded), "reading")
+            text += f" With the {apart} set apart as faulty: {length(result.heldout_all_rms)}."
         if result.finding("fit_flatters") is not None:
             text += (
                 f" The fitted poses look better ({length(result.residual_rms)}) than unseen ones: "
@@ -319,6 +350,7 @@ def noise_lines(result: Calibration) -> list[tuple[str, str]]:
         ("Noise model", noise_model_line(result)),
         ("Repeats", repeats_line(result)),
         ("Residuals", None if summary is None else shape_line(summary)),
+        ("In time", in_time_line(result)),
     ]
     return [(label, text) for label, text in found if text is not None]
 
@@ -603,6 +635,24 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "residual_above_stated_noise": lambda f: (
         f"the residual is {significant(f.number('ratio'))} times the stated noise"
     ),
+    "residual_below_stated_noise": lambda f: (
+        f"the noise is stated too large (the residual is {significant(f.number('ratio'))} times "
+        "it), so nothing shows whether the model lacks something"
+    ),
+    "residuals_heavy_tailed": lambda f: (
+        "far errors are more frequent than normal noise makes them (excess kurtosis "
+        f"{f.number('excess_kurtosis'):+.2g})"
+    ),
+    "autocorrelated": lambda f: (
+        "residuals of visits that follow each other are alike, as under a drift"
+    ),
+    "load_unit": lambda f: (
+        f"the compliances are {significant(f.number('ratio'), 2)} times what {f.numbers['by']} let "
+        "expect: the loads may be in another unit"
+    ),
+    "scatter_not_counted": lambda f: (
+        "residuals scatter from visit to visit, or drift, as the noise model does not have it"
+    ),
     "lack_of_fit": lambda f: "configurations scatter more than repeats of one explain",
     "fit_flatters": lambda f: (
         f"unseen poses are worse than fitted ones ({_length(f, 'residual_rms_um')})"
@@ -671,6 +721,77 @@ def _accuracy(result: Calibration) -> str:
     return text
 
 
+# A second look: who decides the fit, what else would do, what its errors are of.
+
+MOST_INFLUENTIAL = 12
+
+
+def influence_table(result: Calibration) -> ShownTable:
+    """The configurations that decide most, by Cook's distance; those without others to judge them
+    first."""
+    found = sorted(result.influence(), key=lambda c: (-c.cook, -c.leverage))[:MOST_INFLUENTIAL]
+    rows = [
+        (
+            printable(c.configuration), str(c.readings), significant(c.leverage, 2),
+            significant(c.cook, 2) if math.isfinite(c.cook) else "∞", printable(c.moved),
+            significant(c.by, 2) if math.isfinite(c.by) else "undetermined",
+        )
+        for c in found
+    ]  # fmt: skip
+    heads = (
+        "configuration", "readings", "parameters it pays for", "Cook's distance", "moves most",
+        "by (std)",
+    )  # fmt: skip
+    return ShownTable(heads, rows, (0, 4))
+
+
+def sets_table(result: Calibration) -> ShownTable:
+    """Sets of parameters side by side."""
+    rows = []
+    for s in result.parameter_sets():
+        over, ends = "", ""
+        if s.heldout_over_chosen and math.isfinite(s.heldout_over_chosen):
+            over = _signed(s.heldout_over_chosen)
+            ends = f"{_signed(s.ci95[0])} to {_signed(s.ci95[1])}"
+        rows.append((
+            s.name, str(s.parameters), length(s.residual_rms),
+            length(s.heldout_rms) if math.isfinite(s.heldout_rms) else "undetermined", over, ends,
+            f"{s.log_likelihood:+.1f}" if s.log_likelihood else "0",
+        ))  # fmt: skip
+    heads = (
+        "set", "parameters", "fitted rms", "held-out rms", "over the chosen", "95 %",
+        "log-likelihood over the chosen",
+    )  # fmt: skip
+    return ShownTable(heads, rows)
+
+
+def _signed(metres: float) -> str:
+    return f"{'-' if metres < 0 else '+'}{length(abs(metres))}"
+
+
+SOURCES = {
+    "parameters": "parameters: what the estimates leave uncertain",
+    "repeatability": "repeatability: what readings of a visit have in common",
+    "instrument": "instrument: single readings",
+    "lack_of_fit": "lack of fit: what the held-out error has beyond these",
+    "total": "together",
+}
+
+
+def uncertainty_table(result: Calibration) -> ShownTable:
+    """What the error of a predicted reading is made of."""
+    budget = result.uncertainty()
+    if budget is None:
+        return ShownTable((), [])
+    total = budget.total
+    rows = [
+        (words, length(part), f"{100 * (part / total) ** 2 if total else 0:.0f} %")
+        for name, words in SOURCES.items()
+        for part in (getattr(budget, name),)
+    ]
+    return ShownTable(("source", "3-D rms", "share of the square"), rows)
+
+
 # What the page shows, by the names that its template has for it.
 
 MOST_CORRELATIONS_LISTED = 30
@@ -710,6 +831,9 @@ def identification_contents(
         "shape": None if summary is None else shape_line(summary),
         "sizes": size_rows(result.noise),
         "candidates": candidate_rows(result.noise),
+        "influence": influence_table(result),
+        "sets": sets_table(result),
+        "uncertainty": uncertainty_table(result),
         "deviating": [(group_name(by, g), g.n, ratio(g), f"{g.p_holm:.1g}") for by, g in deviating],
         "held_out_scatter": "" if scatter is None else (
             f"In held-out configurations the scatter is {significant(scatter**0.5)} times that of "

@@ -395,6 +395,27 @@ def shape_line(summary: ResidualSummary) -> str:
     return f"{text} Scatter unlike the noise model: {', '.join(named)}{tail}."
 
 
+def in_time_line(result: Calibration) -> str | None:
+    """How alike the residuals of visits are that follow each other; None for few visits."""
+    found = result.autocorrelation
+    if found is None:
+        return None
+    numbers = (
+        f"correlation {found.correlations[0]:+.2f} over {found.visits} visits in the order of "
+        f"{'their times' if found.by == 'times' else 'the rows'}, {_p(found.p)}"
+    )
+    told = result.finding("autocorrelated")
+    which = "Residuals of visits that follow each other are"
+    if told is None:
+        return f"{which} no more alike than others ({numbers})."
+    if told.numbers["counted"] == "yes":
+        return f"{which} alike ({numbers}); the noise model has this as a drift."
+    return (
+        f"{which} alike ({numbers}): something drifts, or the model lacks what neighbouring poses "
+        "have in common. Intervals are too narrow by that."
+    )
+
+
 def group_name(by: str, group: GroupSummary) -> str:
     return f"{by} {printable(group.name)}"
 

@@ -12,6 +12,7 @@ from elastocal.identification.estimates import CORRELATED
 from elastocal.identification.findings import ErrorBudget
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
+from elastocal.identification.scrutiny import Autocorrelation
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.report.arm_view import Space, marker_positions, space_picture
@@ -325,6 +326,24 @@ def over_time(observed: Observations, residuals: Residuals) -> str:
     return drawn(draw, WIDTH, 2.6, "Residuals over time")
 
 
+def in_time(course: Autocorrelation) -> str:
+    """Correlation of the residuals of visits, over how far they are apart."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        lags = np.arange(1, len(course.correlations) + 1)
+        axes.axhline(0, color=FAINT, linewidth=0.8)
+        for side in (-1, 1):
+            axes.axhline(side * course.band, color=FAINT, linewidth=0.8, linestyle="--")
+        axes.vlines(lags, 0, course.correlations, color=SERIES[0], linewidth=2)
+        axes.plot(lags, course.correlations, "o", color=SERIES[0], markersize=4)
+        axes.set_xticks(lags)
+        axes.set_xlabel("visits apart")
+        axes.set_ylabel("correlation")
+
+    return drawn(draw, WIDTH, 2.2, "Correlation of residuals from visit to visit")
+
+
 def by_region(position: Array, residual: Array) -> str:
     """3-D rms residual (µm) of the readings in each part of the work space, from two sides.
 
@@ -457,6 +476,7 @@ def drawn_for(
         "matrix": correlation_matrix(result),
         "waterfall": "",
         "smooth": smooth_figure(result),
+        "in_time": "" if result.autocorrelation is None else in_time(result.autocorrelation),
     }  # fmt: skip
     if budget is not None:
         steps = budget_steps(result, budget)

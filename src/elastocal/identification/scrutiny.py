@@ -1,0 +1,378 @@
+"""What a statistician asks of a fit: who decides it, what else would do, what its errors are of.
+
+Leverage and influence of every configuration, correlation of residuals from visit to visit, sets of
+parameters side by side, and what the uncertainty of a prediction is made of.  All of it follows
+from the fit's B, its weights and its residual; nothing is fitted anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy import linalg
+
+from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
+from elastocal.identification.weighted_problem import Weights
+from elastocal.measurements import Measurements
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
+from elastocal.units import Array, BoolArray, IntArray
+
+MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
+
+
+@dataclass(frozen=True)
+class Looked:
+    """The fit as it ended: B (rows, parameters) of all parameters, which of them were fitted
+    (`columns`, by index), their covariance, residual (rows,) and held-out residual, weights."""
+
+    model: Model
+    observations: Observations
+    weights: Weights
+    x: Array
+    B: Array
+    columns: IntArray
+    covariance: Array
+    residual: Array
+    held_out: Array
+    dof: int
+
+    @property
+    def fitted(self) -> Array:
+        return self.B[:, self.columns]
+
+
+# Leverage and influence.
+#
+# With whitened B = QR and whitened residual e, configuration c takes tr Q_c Q_cᵀ of the parameters
+# for itself (its leverage; all sum to their number), and without it the estimate would move by
+# Δ_c = R⁻¹ Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c.  Cook's distance is Δ_cᵀ RᵀR Δ_c / (p s²) (Cook 1977,
+# Technometrics 19, 15): at 1 the estimate moves about to the edge of its 50 % region.
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What a configuration does to the fit.
+
+    `leverage`: how many of the parameters it pays for.  `cook`: Cook's distance, infinite where it
+    alone determines something.  Without it `moved` would move by `by` standard deviations, more
+    than any other parameter.
+    """
+
+    configuration: str
+    readings: int
+    leverage: float
+    cook: float
+    moved: str
+    by: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers; what is infinite is None."""
+        return {
+            k: None if isinstance(v, float) and not np.isfinite(v) else v
+            for k, v in asdict(self).items()
+        }
+
+
+def influence(fit: Looked) -> tuple[Influence, ...]:
+    """Leverage and influence of every configuration, in the order of the table."""
+    observed, weights, B = fit.observations, fit.weights, fit.fitted
+    p, F = B.shape[1], fit.weights.common
+    if F is None:
+        rows, e = weights.apply(B), weights.apply(fit.residual)
+    else:  # what all readings share is fitted along, held by rows of its own that stay
+        k = F.shape[1]
+        rows = np.vstack([weights.alone(np.hstack([B, F])), np.eye(k, p + k, p)])
+        e = np.concatenate([weights.alone(fit.residual), np.zeros(k)])
+    Q, R = linalg.qr(rows, mode="economic")
+    e = e - Q @ (Q.T @ e)
+    s2 = float(e @ e) / max(fit.dof, 1)
+    back = linalg.solve_triangular(R, np.eye(len(R)))[:p]  # of the parameters alone
+    information = np.linalg.inv(back @ back.T)
+    std = np.sqrt(s2 * np.diag(back @ back.T))
+    labels = np.repeat(observed.configuration, observed.size)
+    codes, first = np.unique(labels, return_index=True)
+    found = []
+    for c in codes[np.argsort(first)]:
+        mine = np.flatnonzero(labels == c)
+        Qc = Q[mine]
+        gap = np.eye(len(mine)) - Qc @ Qc.T
+        name = observed.table.configuration_labels[int(c)]
+        count, leverage = len(mine) // observed.size, float((Qc**2).sum())
+        if np.linalg.eigvalsh(gap)[0] < ALONE:
+            k = int(np.argmax(np.abs(back @ Qc.T).max(axis=1) / std))
+            found.append(Influence(name, count, leverage, np.inf, _name(fit, k), np.inf))
+            continue
+        move = back @ (Qc.T @ np.linalg.solve(gap, e[mine]))
+        shift = np.divide(np.abs(move), std, out=np.zeros(p), where=std > 0)
+        k = int(np.argmax(shift))
+        cook = float(move @ information @ move) / (p * s2) if s2 > 0 else 0.0
+        found.append(Influence(name, count, leverage, cook, _name(fit, k), float(shift[k])))
+    return tuple(found)
+
+
+def _name(fit: Looked, k: int) -> str:
+    return str(fit.model.names[fit.columns[k]])
+
+
+# Residuals from visit to visit.
+
+LAGS = 10
+FEWEST_VISITS = 12
+PERMUTATIONS = 999
+
+
+@dataclass(frozen=True)
+class Autocorrelation:
+    """Correlations of the mean residuals of visits that are 1, 2, … apart, and the p-value of the
+    first being no larger than in a random order; `band` holds 95 % of single ones by chance.
+
+    Visits follow each other by the table's times, or by the order of its rows (`by`).
+    """
+
+    correlations: tuple[float, ...]
+    p: float
+    band: float
+    visits: int
+    by: str
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self) | {"correlations": list(self.correlations)}
+
+
+def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation | None:
+    """The correlation of residuals (rows,) from visit to visit of a configuration; None for fewer
+    than 12 visits.
+
+    The p-value is that of a permutation test: exact where visits are exchangeable, whatever the
+    distribution of the noise.
+    """
+    parts = residual.reshape(-1, observed.size)[:, :3]
+    spread = np.sqrt((parts**2).mean(axis=0))
+    table, lead = observed.table, observed.lead
+    timed = table.time is not None and bool(np.ptp(np.asarray(table.time)) > 0)
+    order = np.argsort(np.asarray(table.time)[lead] if timed else lead, kind="stable")
+    configuration = observed.configuration[order]
+    visit = np.cumsum(np.r_[0, np.diff(configuration) != 0])
+    number = int(visit[-1]) + 1 if len(visit) else 0
+    if number < FEWEST_VISITS or not (spread > 0).all():
+        return None
+    unit = parts[order] / spread
+    count = np.bincount(visit)
+    mean = np.column_stack([np.bincount(visit, u) for u in unit.T]) / np.sqrt(count)[:, None]
+    mean -= mean.mean(axis=0)
+    total = float((mean**2).sum())
+    lags = range(1, min(LAGS, number // 4) + 1)
+    found = tuple(float((mean[:-k] * mean[k:]).sum()) / total for k in lags)
+    rng = np.random.default_rng(0)
+    chance = np.empty(PERMUTATIONS)
+    for k in range(PERMUTATIONS):
+        other = mean[rng.permutation(number)]
+        chance[k] = float((other[:-1] * other[1:]).sum()) / total
+    p = (1 + int((chance >= found[0]).sum())) / (1 + PERMUTATIONS)
+    band = float(np.quantile(np.abs(chance), 0.95))
+    return Autocorrelation(found, p, band, number, "times" if timed else "order of the rows")
+
+
+# Sets of parameters side by side, on the model linearised at the fit.
+#
+# Restricted likelihoods of different columns of B are no measure of each other.  Here those of base
+# and markers, which every set has, are taken out, and the others of a set vary by their typical
+# sizes S about nominal: y ~ N(0, s²I + B_S S² B_Sᵀ) in the coordinates that base and markers leave.
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """A set of parameters: how many are fitted, 3-D rms (m) of its residual and held out.
+
+    `heldout_over_chosen`: its held-out rms less that of the parameters that were chosen, and
+    `ci95` of this difference, by resampling configurations.  `log_likelihood`: restricted, less
+    that of the chosen ones.
+    """
+
+    name: str
+    parameters: int
+    residual_rms: float
+    heldout_rms: float
+    heldout_over_chosen: float
+    ci95: tuple[float, float]
+    log_likelihood: float
+
+    def to_json(self) -> dict[str, Any]:
+        um = {k: _um(getattr(self, k)) for k in ("residual_rms", "heldout_rms")}
+        return {
+            "set": self.name, "parameters": self.parameters,
+            **{f"{k}_um": v for k, v in um.items()},
+            "heldout_over_chosen_um": _um(self.heldout_over_chosen),
+            "ci95_um": [_um(v) for v in self.ci95], "log_likelihood": self.log_likelihood,
+        }  # fmt: skip
+
+
+def _um(metres: float) -> float | None:
+    return metres * 1e6 if np.isfinite(metres) else None
+
+
+CHOSEN = "chosen"
+STRUCTURAL = 1e-7  # share of a column's length off the span of others, below which it lies in it
+RESAMPLED = 1000
+
+
+def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
+    """Base and markers alone, with geometry, with compliance, with what was chosen, and with all
+    that is told apart at all; those that are the same as another once."""
+    model, free = fit.model, ~fit.model.shrunk
+    stage = np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
+    fitted = np.isin(np.arange(len(stage)), fit.columns) & free
+    named: list[tuple[str, BoolArray]] = [
+        ("base and markers", fitted & (stage == 0)),
+        ("with geometry", fitted & (stage <= 1)),
+        ("with compliance", fitted & (stage != 1)),
+        (CHOSEN, fitted),
+        ("all that readings tell apart", _independent(fit, fitted, free)),
+    ]
+    seen: dict[bytes, tuple[str, BoolArray]] = {}
+    for name, chosen in named:
+        if chosen.any() and (name == CHOSEN or chosen.tobytes() not in seen):
+            seen[chosen.tobytes()] = (name, chosen)
+    sets = list(seen.values())
+    if len(sets) < 2:
+        return ()
+    observed, weights, size = fit.observations, fit.weights, fit.observations.size
+    moves = np.where(fitted & (stage > 0), fit.x - model.nominal, 0.0)
+    y = fit.residual + fit.B @ moves
+    typical = model.sizes(fit.B)
+    e = weights.apply(fit.residual)
+    s2 = float(e @ e) / max(fit.dof, 1)
+    white, target = weights.apply(fit.B), weights.apply(y)
+    held, plain = [], []
+    for _, chosen in sets:
+        # Whole rows count by the fit's weights, whatever the set.
+        left = y - fit.B[:, chosen] @ linalg.lstsq(white[:, chosen], target)[0]
+        plain.append(rms_3d(left, size))
+        own = held_out_residual(
+            fit.B[:, chosen], left, weights, observed.configuration, observed.size
+        )
+        held.append((own.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
+    likelihood = [
+        _restricted(white, target, chosen & (stage == 0), chosen & (stage > 0), typical, s2)
+        for _, chosen in sets
+    ]
+    at = next(k for k, (name, _) in enumerate(sets) if name == CHOSEN)
+    _, code = np.unique(observed.configuration, return_inverse=True)
+    share = np.random.default_rng(0).dirichlet(np.ones(code.max() + 1), RESAMPLED)
+    draws = share @ np.bincount(code)
+    rms = [np.sqrt(share @ np.bincount(code, h) / draws) for h in held]
+    found = []
+    for k, (name, chosen) in enumerate(sets):
+        over = rms[k] - rms[at] if np.isfinite(held[k]).all() else np.full(RESAMPLED, np.inf)
+        low, high = (float(v) for v in np.quantile(over, [0.025, 0.975], method="nearest"))
+        whole = float(np.sqrt(held[k].mean())), float(np.sqrt(held[at].mean()))
+        found.append(
+            ParameterSet(
+                name, int(chosen.sum()), plain[k], whole[0], whole[0] - whole[1], (low, high),
+                likelihood[k] - likelihood[at],
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def _independent(fit: Looked, fitted: BoolArray, free: BoolArray) -> BoolArray:
+    """The fitted parameters and, beside them, those whose columns lie in no span of others."""
+    white = fit.weights.apply(fit.B)
+    length = np.linalg.norm(white, axis=0)
+    others = np.flatnonzero(free & ~fitted & (length > 0))
+    if not len(others):
+        return fitted
+    basis = linalg.qr(white[:, fitted], mode="economic")[0]
+    off = white[:, others] / length[others]
+    off -= basis @ (basis.T @ off)
+    off -= basis @ (basis.T @ off)
+    _, R, order = linalg.qr(off, mode="economic", pivoting=True)
+    more = np.abs(np.diag(R)) > STRUCTURAL
+    found = fitted.copy()
+    found[others[order[: len(more)][more]]] = True
+    room = len(white) - int(fitted.sum())  # as many columns as rows fit anything
+    return found if int(found.sum()) < len(fitted) + room and found.sum() < len(white) else fitted
+
+
+def _restricted(
+    white: Array, y: Array, placed: BoolArray, others: BoolArray, sizes: Array, s2: float
+) -> float:
+    """log density of y off the span of the `placed` columns, the `others` varying by `sizes`."""
+    A, y = white[:, others] * sizes[others], y.copy()
+    if placed.any():
+        basis = linalg.qr(white[:, placed], mode="economic")[0]
+        A, y = A - basis @ (basis.T @ A), y - basis @ (basis.T @ y)
+    U, s, _ = linalg.svd(A, full_matrices=False)
+    along = U.T @ y
+    rest = float(y @ y) - float((along**2 * s**2 / (s**2 + s2)).sum())
+    return -0.5 * (float(np.log1p(s**2 / s2).sum()) + rest / s2)
+
+
+def stage_of(effect: str) -> int:
+    """0 for what places base and markers, 1 for geometry, 2 for what yields under load."""
+    known = CATALOGUE[effect]
+    if known.registered:
+        return 0
+    return 2 if known.stage in ("compliance", "load") else 1
+
+
+# What the uncertainty of a prediction is made of.
+
+
+@dataclass(frozen=True)
+class UncertaintyBudget:
+    """3-D rms errors (m) of a reading that was not fitted, by source; the squares add up.
+
+    `parameters`: the estimates' own, at the poses of `at`.  `repeatability`: what readings of a
+    visit share, scatter of joints and drift included.  `instrument`: single readings.
+    `lack_of_fit`: what the held-out error has beyond these, 0 where it has nothing.
+    """
+
+    parameters: float
+    repeatability: float
+    instrument: float
+    lack_of_fit: float
+    at: str
+
+    @property
+    def total(self) -> float:
+        parts = (self.parameters, self.repeatability, self.instrument, self.lack_of_fit)
+        return float(np.sqrt(sum(p**2 for p in parts)))
+
+    def to_json(self) -> dict[str, Any]:
+        parts = ("parameters", "repeatability", "instrument", "lack_of_fit", "total")
+        return {"at": self.at, **{f"{k}_um": _um(getattr(self, k)) for k in parts}}
+
+
+def uncertainty_budget(
+    fit: Looked, parts: dict[str, float], table: Measurements | None = None
+) -> UncertaintyBudget:
+    """The budget at the poses and loads of a `table`, by default those fitted.
+
+    `parts`: mean squares (m²) of the noise, "readings" and "visits".
+    """
+    size = fit.observations.size
+    B, own = fit.fitted, _spread(fit.fitted, fit.covariance, size)
+    # Held out, a configuration has no part in the estimate: their own uncertainty is larger there
+    # by the share that it paid for.
+    rows = len(fit.residual)
+    out = own * rows / max(rows - len(fit.columns), 1)
+    held = rms_3d(fit.held_out, size) ** 2
+    noise = parts.get("readings", 0.0) + parts.get("visits", 0.0)
+    lack = max(held - noise - out, 0.0) if np.isfinite(held) else 0.0
+    at = "the poses fitted"
+    if table is not None:
+        B = fit.model.regressor(table, fit.x, fit.columns).B
+        own, at = _spread(B, fit.covariance, size), table.source
+    roots = np.sqrt([own, parts.get("visits", 0.0), parts.get("readings", 0.0), lack])
+    return UncertaintyBudget(*(float(v) for v in roots), at)
+
+
+def _spread(B: Array, covariance: Array, size: int) -> float:
+    """Mean over readings of tr(B_i C B_iᵀ), of the position alone."""
+    variance = np.einsum("rj,jk,rk->r", B, covariance, B, optimize=True)
+    return float(variance.reshape(-1, size)[:, :3].sum(axis=1).mean())

@@ -1,0 +1,255 @@
+"""What an attack on `identify` found: copies, other units, numbers that the data cannot support."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.calibration import SPRINGS, cell_of, measured, random_chain, table_at, true_values
+from support.cells import random_poses
+
+from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.identification import judged, warning_sentences
+from elastocal.identification.identify import identify
+from elastocal.identification.mistakes import copied
+from elastocal.identification.noise_choice import NoiseTest
+from elastocal.model import Model
+from elastocal.model.observations import observe
+from elastocal.report.identification_view import (
+    how_well_it_predicts,
+    judgement,
+    undetermined_lines,
+)
+
+SIGMA = 1e-5
+MARKERS = {"M1": np.array([0.1, 0, 0.05]), "M2": np.array([-0.05, 0.1, 0.1])}
+STIFF = tuple(np.array([1.0, 0.9, 1.2, 8.0, 10.0, 6.0]) * 1e-7)
+LOADS = ((0, 0, 0), (0, 0, -2000.0))
+
+
+def arm(poses=20, stated=None, nominal=STIFF, effects=SPRINGS):
+    tracker = Tracker(noise=CartesianNoise(np.full(3, stated))) if stated else None
+    model = {} if nominal is None else {"nominal": Nominal(joint_compliance=nominal)}
+    cell = cell_of(effects, markers=MARKERS, tracker=tracker, **model)
+    chosen = Model.assembled(random_chain(3), cell)
+    return chosen, table_at(random_poses(chosen.chain, poses, 3), LOADS, tuple(MARKERS))
+
+
+def compliances(model):
+    return [i for i, name in enumerate(model.names) if name.endswith(".compliance")]
+
+
+def campaign(model, plan, seed=0, stiffness=STIFF):
+    rng = np.random.default_rng(seed)
+    x = true_values(model, rng, 5e-4, anywhere=False)
+    x[compliances(model)] = stiffness
+    return measured(model, plan, x, SIGMA, rng), x
+
+
+@pytest.fixture(scope="module")
+def clean():
+    model, plan = arm(stated=SIGMA)
+    table, x = campaign(model, plan)
+    return model, table, x, identify(model, table)
+
+
+def doubled(table, lines, configurations=False):
+    """The table with rows twice, as repeats or as other configurations."""
+    lines = np.asarray(lines)
+    both = table.take(np.r_[np.arange(len(table)), lines])
+    both = replace(both, row=np.arange(len(both)) + 2)
+    if not configurations:
+        return replace(both, repeat=np.r_[table.repeat, table.repeat[lines] + 1])
+    n = len(table.configuration_labels)
+    return replace(
+        both, configuration=np.r_[table.configuration, table.configuration[lines] + n],
+        configuration_labels=tuple(map(str, range(2 * n))),
+    )  # fmt: skip
+
+
+# Copies.
+
+
+def test_copies_under_new_labels_are_counted_once(clean):
+    model, table, _, alone = clean
+    result = identify(model, doubled(table, np.arange(len(table)), configurations=True))
+    assert result.copies == tuple(range(len(table) + 2, 2 * len(table) + 2))
+    assert np.allclose(result.covariance, alone.covariance, rtol=1e-3, atol=0)
+    assert result.finding("copied_readings").numbers["copies"] == len(table)
+    assert any("repeat others to the last digit (lines" in w for w in result.warnings)
+    assert result.to_json()["copies"] == list(result.copies)
+
+
+@pytest.mark.parametrize("digits", [None, 6], ids=["all digits", "micrometres"])
+def test_one_repeated_reading_stops_nothing(clean, digits):
+    """With all digits it is a copy; rounded, one equal pair may be a repeat, and counts as one."""
+    model, table, _, alone = clean
+    if digits:
+        table = replace(table, position=np.round(table.position, digits))
+    result = identify(model, doubled(table, [5]))
+    assert len(result.copies) == (0 if digits else 1)
+    assert result.heldout_rms == pytest.approx(alone.heldout_rms, rel=0.02)
+
+
+def test_repeats_that_rounding_makes_equal_are_no_copies():
+    """Hardly any clean table loses a reading; nearly every one does of which a third is copied."""
+    model, plan = arm(poses=8, nominal=None, effects=("base_frame",))
+    found, caught = [], []
+    for seed in range(60):
+        table, _ = campaign_of_repeats(model, plan, seed)
+        found.append(copied(observe(table, "position")).any())
+        n = len(table)
+        caught.append(
+            copied(observe(doubled(table, np.arange(n // 3)), "position")).sum() >= n // 3
+        )
+    assert sum(found) <= 3 and sum(caught) >= 54
+
+
+def campaign_of_repeats(model, plan, seed):
+    """Six repeats, rounded to 1.5 times their noise."""
+    rng = np.random.default_rng(seed)
+    rows = np.repeat(np.arange(len(plan)), 6)
+    table = plan.take(rows)
+    step = 1.5 * SIGMA
+    position = rng.normal(size=(len(plan), 3))[rows] + SIGMA * rng.normal(size=(len(rows), 3))
+    position = np.round(position / step) * step
+    return replace(table, repeat=np.tile(np.arange(6), len(plan)), position=position), rows
+
+
+# Loads in another unit.
+
+
+def test_kilograms_given_as_newtons_are_told(clean):
+    model, table, _, result = clean
+    assert result.finding("load_unit") is None
+    kilograms = identify(model, replace(table, force=table.force / 9.80665))
+    f = kilograms.finding("load_unit")
+    assert f.severity == "care" and f.number("ratio") == pytest.approx(9.80665, rel=0.15)
+    assert any("Check the unit of the loads" in w for w in kilograms.warnings)
+    assert "another unit" in judgement(kilograms).headline
+
+
+def test_without_nominal_compliances_the_weights_of_the_links_tell():
+    """A rule of thumb is worth a note, whatever the loads."""
+    rated = (5e-6, 5e-6, 6e-6, 1.2e-5, 1.2e-5, 1.2e-5)
+    model, plan = arm(nominal=None)
+    table, _ = campaign(model, plan, stiffness=rated)
+    assert identify(model, table).finding("load_unit") is None
+    found = identify(model, replace(table, force=table.force / 9.80665)).finding("load_unit")
+    assert found is not None and found.severity == "note"
+
+
+# Numbers that the data cannot support.
+
+
+def weak_arm(joint=5, size=3.0):
+    """Light loads, which hardly show the compliance of one joint: `size` times its std."""
+    model, plan = arm(nominal=None)
+    stiffness = np.array(STIFF)
+    stiffness[joint] = 0.0
+    table, _ = campaign(model, plan, 1, stiffness)
+    return model, table
+
+
+def test_a_compliance_that_hardly_shows_has_no_value():
+    model, table = weak_arm()
+    result = identify(model, table)
+    e = result["joint6.compliance"]
+    assert e.value is None and e.std is None and e.ci95 is None
+    low, high = e.limits
+    assert low <= 0 <= high and e.held >= 0
+    text = "\n".join(undetermined_lines(result))
+    assert "hardly shown" in text and "joint6.compliance (at most" in text
+    assert "joint6.compliance" in result.finding("hardly_shown").numbers["parameters"]
+    entry = next(p for p in result.to_json()["parameters"] if p["name"] == e.name)
+    assert entry["value"] is None and entry["limits95"] == [low, high]
+
+
+def test_no_compliance_is_stated_below_zero():
+    """Over clean campaigns with compliances of zero; the model that is used has none either."""
+    model, plan = arm(poses=12, nominal=None)
+    for seed in range(4):
+        table, _ = campaign(model, plan, seed, np.zeros(6))
+        result = identify(model, table)
+        for i in compliances(model):
+            e = result.estimates[i]
+            assert e.value is None or e.ci95[0] > 0
+            assert e.held >= 0 or result.finding("beyond_bound") is not None
+
+
+def test_the_nominal_stands_where_the_readings_hardly_tell_better():
+    """Where nominal values are good, holding them errs less than estimating what hardly shows."""
+    nominal = tuple(0.03 * np.array(STIFF))
+    model, plan = arm(poses=12, nominal=nominal)
+    rng, held, free = np.random.default_rng(4), [], []
+    for seed in range(4):
+        truth = np.array(nominal) * rng.uniform(0.8, 1.2, 6)
+        table, _ = campaign(model, plan, seed, truth)
+        result = identify(model, table)
+        for i, true in zip(compliances(model), truth, strict=True):
+            e = result.estimates[i]
+            if e.limits is not None and e.held == e.nominal:
+                held.append((e.held - true) ** 2)
+                free.append((np.mean(e.limits) - true) ** 2)
+    assert len(held) >= 4 and np.mean(held) < 0.5 * np.mean(free)
+
+
+# Assumptions that fail.
+
+
+def test_noise_stated_far_too_large_is_no_noise_that_explains_the_residual(clean):
+    _, table, _, _ = clean
+    model, _ = arm(stated=10 * SIGMA)
+    result = identify(model, table)
+    f = result.finding("residual_below_stated_noise")
+    assert f.severity == "care" and f.number("ratio") == pytest.approx(0.1, rel=0.15)
+    assert "stated too large" in judgement(result).headline
+    slightly = judged(replace(result, noise=replace(result.noise, ratio_to_stated=0.8)))
+    assert slightly.finding("residual_below_stated_noise").severity == "note"
+
+
+@pytest.mark.parametrize(("kurtosis", "severity"), [(0.5, "note"), (1.5, "care")])
+def test_heavy_tails_call_for_care_where_least_squares_wastes_readings(clean, kurtosis, severity):
+    summary = clean[3].residual_summary
+    whole = replace(summary.whole, normality_p=0.009, excess_kurtosis=kurtosis, skewness=0.0)
+    found = judged(replace(clean[3], residual_summary=replace(summary, whole=whole)))
+    f = found.finding("residuals_heavy_tailed")
+    assert f.severity == severity and "robust fit" in f.remedy
+    assert ("residuals_heavy_tailed" in found.findings[0].listed("because")) == (severity == "care")
+    assert ("far errors" in judgement(found).headline) == (severity == "care")
+    calm = replace(whole, normality_p=0.011)
+    calm = judged(replace(clean[3], residual_summary=replace(summary, whole=calm)))
+    assert calm.finding("residuals_heavy_tailed") is None
+
+
+def test_readings_set_apart_count(clean):
+    model, table, x, _ = clean
+    rng = np.random.default_rng(8)
+    exact = measured(model, table, x, 0.0, rng)
+    tails = SIGMA * rng.standard_t(3, size=exact.position.shape)
+    result = identify(model, replace(exact, position=exact.position + tails))
+    assert result.excluded and result.heldout_all_rms > 1.02 * result.heldout_rms
+    n, k = len(result.observations.lead), len(result.excluded)
+    apart = sum(o.residual**2 for o in result.excluded)
+    assert (n + k) * result.heldout_all_rms**2 == pytest.approx(n * result.heldout_rms**2 + apart)
+    assert "set apart as faulty" in how_well_it_predicts(result)
+    assert result.to_json()["heldout_all_rms_um"] == pytest.approx(result.heldout_all_rms * 1e6)
+
+
+def test_scatter_that_a_test_finds_and_the_noise_lacks_is_told(clean):
+    result = clean[3]
+    for part, p, told in (("+joints", 1e-4, True), ("+time", 1e-4, True), ("+time", 0.02, False)):
+        found = judged(replace(result, noise=replace(result.noise, tests=(NoiseTest(part, p),))))
+        assert (found.finding("scatter_not_counted") is not None) == told
+        assert any("visit" in w for w in warning_sentences(found)) == told
+
+
+def test_few_clean_configurations_accuse_nobody():
+    """The others' fit does not determine all that a configuration tells."""
+    model, plan = arm(poses=5, nominal=None)
+    for seed in range(3):
+        table, _ = campaign(model, plan, seed)
+        result = identify(model, table)
+        assert not result.faulty
+        assert not result.faulty_report.findings
