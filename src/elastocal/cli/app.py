@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 # The order of the work, in which --help lists the verbs.
 VERBS = (
-    "design", "simulate", "import", "identify", "diagnose", "compensate", "export", "study", "demo",
+    "init", "effects", "design", "simulate", "import", "identify", "diagnose", "compensate",
+    "export", "study", "demo",
 )  # fmt: skip
 
 
@@ -40,7 +41,7 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 # Arguments and options that name what a command reads.
 READ = (
     "cell", "data", "result", "targets", "files", "folder", "test", "covariance", "knowledge",
-    "augment", "mapping",
+    "augment", "mapping", "robot",
 )  # fmt: skip
 
 
