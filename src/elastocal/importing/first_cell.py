@@ -163,7 +163,8 @@ def _range(joint: Joint) -> tuple[float, float, bool]:
 def _tool(reach: float, sites: dict[str, Array]) -> Iterator[str]:
     side = reach / 12
     yield "[tool]                                 # all in m, in the flange frame"
-    yield f"load_point_m = {_vector([0, 0, side])}".ljust(38) + " # guess: where a load hangs"
+    # Off the last joint's axis, which a load on it would not turn.
+    yield f"load_point_m = {_vector([side, 0, side])}".ljust(38) + " # guess: where a load hangs"
     yield ""
     stub = {
         "M1": np.array([side, 0.0, side / 3]),
@@ -201,7 +202,10 @@ def _model(chain: Chain) -> Iterator[str]:
     yield "effects = ["
     for pair in (("base_frame", "marker_position"), ("joint_offset", "link_geometry")):
         yield "    " + " ".join(f'"{name}",' for name in pair)
-    yield '    "joint_compliance",'
+    # What hangs does not turn an upright first joint.
+    sprung = [f'"joint_compliance:joint{i}",' for i in range(2, chain.n_joints + 1)]
+    for k in range(0, len(sprung), 2):
+        yield "    " + " ".join(sprung[k : k + 2])
     yield "]"
     weighed = bool(chain.masses)
     told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"

@@ -11,6 +11,7 @@ which is a chain whose joint frames are T_b … Trans(p_j) J(a_j, −r_j).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -67,9 +68,13 @@ class MjcfArm:
 
     @classmethod
     def read(
-        cls, path: str | Path, base: str | None = None, flange: str | None = None
+        cls,
+        path: str | Path,
+        base: str | None = None,
+        flange: str | None = None,
+        text: str | None = None,
     ) -> MjcfArm:
-        """The arm of an MJCF file.
+        """The arm of an MJCF file, or of a `text` that is to stand in its place.
 
         Without `flange` it is the body from which on the bodies with the most joints branch off,
         as fingers do from a hand.  Raises InputError where MuJoCo is not installed or cannot read
@@ -77,13 +82,14 @@ class MjcfArm:
         none that a chain has.
         """
         path = Path(path)
-        root = xml_tree(path, read_bytes(path, "MuJoCo model", MAX_BYTES), "an MJCF file")
+        data = mjcf_bytes(path) if text is None else text.encode("utf-8")
+        root = xml_tree(path, data, "an MJCF file")
         hint = '; this is a URDF, give it as urdf = "…"' if root.tag == "robot" else ""
         require(
             root.tag == "mujoco",
             f"{path}: the root element is <{printable(root.tag)}>, an MJCF file has <mujoco>{hint}",
         )
-        spec = _parsed(path)
+        spec = parsed(path, text)
         coupled, tied = _couplings(spec)
         model, weighed = _compiled(path, spec)
         names = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
@@ -136,6 +142,10 @@ class MjcfArm:
         """T_parent_body (4, 4) with all joints at `ref`."""
         return transform(self.model.body_pos[body], self.model.body_quat[body])
 
+    def placed(self, body: int) -> Array:
+        """T_world_body (4, 4) with all joints at `ref`."""
+        return self._world()[body]
+
     def before(self, j: int) -> Array:
         """X (4, 4): the chain's frame of joint j in its body's, Trans(p) J(a, −r)."""
         kind, axis = self._kind(j), np.array(self.model.jnt_axis[j])
@@ -158,16 +168,19 @@ class MjcfArm:
                     Joint(self.joint_name(j), self._kind(j), placement, axis, lower, upper)
                 )
                 T = shift(-self.model.jnt_pos[j])
-        if self.site is not None:
-            T = T @ transform(self.model.site_pos[self.site], self.model.site_quat[self.site])
-        return Chain(self.name, tuple(joints), T, self._masses())
+        return Chain(self.name, tuple(joints), T @ self.flange_in_body, self._masses())
+
+    @property
+    def flange_in_body(self) -> Array:
+        """T_body_flange (4, 4): of a site its place in its body."""
+        if self.site is None:
+            return np.eye(4)
+        return transform(self.model.site_pos[self.site], self.model.site_quat[self.site])
 
     def sites(self) -> dict[str, Array]:
         """Name → place (3,) in m in the flange frame of every site that moves with the flange."""
         world = self._world()
-        T = world[self.flange]
-        if self.site is not None:
-            T = T @ transform(self.model.site_pos[self.site], self.model.site_quat[self.site])
+        T = world[self.flange] @ self.flange_in_body
         found = {}
         for i in range(self.model.nsite):
             body, name = int(self.model.site_bodyid[i]), self.model.site(i).name
@@ -189,7 +202,7 @@ class MjcfArm:
         return lower, upper
 
     def _world(self) -> list[Array]:
-        """T_world_body (4, 4) of every body with all joints at `ref`."""
+        """`placed` for every body."""
         found = [np.eye(4)]
         for body in range(1, self.model.nbody):
             found.append(found[int(self.model.body_parentid[body])] @ self.local(body))
@@ -316,10 +329,22 @@ def import_mujoco() -> Any:
     return mujoco
 
 
-def _parsed(path: Path) -> Any:
+def mjcf_bytes(path: Path) -> bytes:
+    """The content of an MJCF file.  Raises InputError where it cannot be read or is too large."""
+    return read_bytes(path, "MuJoCo model", MAX_BYTES)
+
+
+def parsed(path: Path, text: str | None = None) -> Any:
+    """MuJoCo's MjSpec of a file, or of a `text` that is to stand in its place."""
     mujoco = import_mujoco()
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        if text is None:
+            return mujoco.MjSpec.from_file(str(path))
+        names = re.findall(r"""<include\s[^>]*?file\s*=\s*["']([^"']+)["']""", text)
+        inside = {n: mjcf_bytes(path.parent / n) for n in names if (path.parent / n).is_file()}
+        spec = mujoco.MjSpec.from_string(text, include=inside)
+        spec.modelfiledir = f"{path.parent}/"
+        return spec
     except ValueError as error:
         raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(error)}") from None
 
@@ -350,12 +375,12 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, bool]:
     from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     # The geoms of a body that states its inertia say nothing more.
     idle = [] if from_geoms else [g for b in spec.bodies if b.explicitinertial for g in b.geoms]
-    _strip(spec, idle)
+    strip(spec, idle)
     try:
         return spec.compile(), True
     except ValueError as error:
         first = error
-    _strip(spec, list(spec.geoms))
+    strip(spec, list(spec.geoms))
     spec.compiler.boundmass = spec.compiler.boundinertia = STAND_IN
     try:
         return spec.compile(), False
@@ -363,7 +388,7 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, bool]:
         raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(first)}") from None
 
 
-def _strip(spec: Any, geoms: Iterable[Any]) -> None:
+def strip(spec: Any, geoms: Iterable[Any]) -> None:
     """Take out geoms, and all that frames and masses do without."""
     for geom in geoms:
         spec.delete(geom)
