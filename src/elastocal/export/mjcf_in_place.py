@@ -379,9 +379,9 @@ def held_arm(text: str, robot: Robot, pieces: ExportNumbers) -> tuple[Any, Array
         body.mass, body.inertia = model.body_mass[body.id], model.body_inertia[body.id]
         body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
     driven = {j: f"joint{i + 1}" for i, j in enumerate(arm.joints)}
-    for joint in list(spec.joints):
-        if joint.id in driven:
-            joint.name, joint.frictionloss = f"{HELD}{driven[joint.id]}", 0.0
+    for joint, j in [(joint, joint.id) for joint in spec.joints]:  # numbers change with the first
+        if j in driven:
+            joint.name, joint.frictionloss = f"{HELD}{driven[j]}", 0.0
             joint.stiffness = joint.damping = 0.0 * joint.stiffness
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
