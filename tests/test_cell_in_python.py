@@ -130,7 +130,7 @@ MISTAKES = {
         "gravity_compensator: unknown key arm; missing unit: did you mean arm_m",
     ),
     "not a part": (lambda: Cell("a", robot="arm.urdf"), "Cell: robot takes an instance of Robot"),
-    "two robots": (lambda: Robot(urdf="a", dh="b"), "exactly one of urdf and dh"),
+    "two robots": (lambda: Robot(urdf="a", dh="b"), "exactly one of urdf, mjcf, dh"),
     "marker": (lambda: Tool(markers={" ": [0, 0, 0]}), "marker name ' '"),
     "limits": (lambda: Cell("a", limits={"joint1": (1, 0)}), "limits of joint1.*lower < upper"),
     "size": (lambda: Solid("a", "sphere", [1, 2]), "size of a sphere takes 1 number"),

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from elastocal.model.manipulator import Model
     from elastocal.planning.plan import Plan
     from elastocal.plugins import register_criterion, register_effect, register_noise_model
-    from elastocal.verbs import compensate, design, diagnose, identify, simulate
+    from elastocal.verbs import compensate, design, diagnose, identify, init, simulate
 
 __version__ = "0.1.0"
 
@@ -74,7 +74,7 @@ ROOMS = {
     "model.manipulator": "Model",
     "planning.plan": "Plan",
     "plugins": "register_criterion register_effect register_noise_model",
-    "verbs": "compensate design diagnose identify simulate",
+    "verbs": "compensate design diagnose identify init simulate",
 }
 
 __all__ = [
@@ -101,6 +101,7 @@ __all__ = [
     "design",
     "diagnose",
     "identify",
+    "init",
     "read_calibrated",
     "read_cell",
     "register_criterion",

@@ -1,4 +1,4 @@
-"""The verbs of the front door: design, simulate, identify, diagnose, compensate.
+"""The verbs of the front door: init, design, simulate, identify, diagnose, compensate.
 
 Each takes the model first (or a cell, or the path of one) and its options as keyword arguments;
 it checks them, makes the option objects that the packages below work with, and calls them.  What
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from elastocal.cell.arm_description import Robot
 from elastocal.cell.plan_wishes import Motion, TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
@@ -47,6 +48,54 @@ Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
 MOST = 10_000_000  # of poses, candidates, processes: more is a slip of the key
 Progress: TypeAlias = Callable[[str], None]
 T = TypeVar("T")
+
+
+def init(
+    robot: str | Path | Robot,
+    output: str | Path | None = None,
+    *,
+    base: str | None = None,
+    flange: str | None = None,
+    convention: Literal["standard", "modified"] = "standard",
+    force: bool = False,
+) -> str:
+    """How does a first cell for my arm look?
+
+    What the robot's file says (joints, limits, flange, masses, a MuJoCo model's sites) and guesses
+    of what it does not, marked as such: a cell file that `design` and `simulate` run with.
+
+    Args:
+        robot: A URDF, MuJoCo model (MJCF) or DH table, or a `Robot`.
+        output: The cell file to write; None writes none.
+        base: First link or body, None for the root.
+        flange: Last link, body or site; None for the one that is found.
+        convention: Of a DH table: "standard" or "modified".
+        force: Write over a file that is there.
+
+    Returns:
+        The text of the cell file.
+
+    Raises:
+        InputError: The robot's file is wrong, leaves a choice open, or `output` is there already.
+
+    Examples:
+        >>> text = ec.init("kr270_2.urdf", "first.toml")
+        >>> ec.Model("first.toml").chain.n_joints
+        6
+    """
+    from elastocal.files import atomic_write_text
+    from elastocal.importing.first_cell import first_cell, robot_of
+
+    target = None if output is None else Path(output)
+    require(
+        target is None or force or not target.exists(),
+        f"{target} is there already; name another file, or give {option('force', True)}",
+    )
+    found = robot if isinstance(robot, Robot) else robot_of(robot, base, flange, convention)
+    text = first_cell(found, "." if target is None else target.parent)
+    if target is not None:
+        atomic_write_text(target, text)
+    return text
 
 
 def design(
@@ -342,7 +391,8 @@ def simulated(
     poses = _poses(made, plan)
     check_limits(made, poses)
     rng = np.random.default_rng(_whole("seed", seed, 0))
-    drawn = draw_errors(made, float(draw), rng) if draw else {}
+    rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)
+    drawn = draw_errors(made, float(draw), rng, rows) if draw else {}
     if values is None or isinstance(values, Mapping):
         x = values_from(made, drawn | dict(values or {}))
     else:
@@ -352,7 +402,6 @@ def simulated(
             f"{option('values')} takes {len(made.parameters)} finite numbers, one per parameter, "
             f"or some of them by name; found an array of shape {x.shape}",
         )
-    rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)
     return run(made, rows, x, rng, noise=noise), x
 
 

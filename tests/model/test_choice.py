@@ -288,5 +288,5 @@ def test_the_robot_is_read_from_the_cell() -> None:
 
 
 def test_a_cell_without_a_robot_is_refused() -> None:
-    with pytest.raises(InputError, match=r"\[robot\] needs urdf or dh"):
+    with pytest.raises(InputError, match=r"\[robot\] needs urdf, mjcf or dh"):
         load_chain(replace(kr270_cell(), robot=Robot()))

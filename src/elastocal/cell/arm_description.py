@@ -34,7 +34,7 @@ from elastocal.config import (
     required,
 )
 from elastocal.errors import InputError, require
-from elastocal.text import is_label, quoted
+from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, to_si
 
 Observe = Literal["position", "deflection", "pose", "distance"]
@@ -43,12 +43,13 @@ Sigma = Annotated[Array, numbers(3, above=0, one_for_all=True)]
 Compliances = Annotated[Many[NonNegative], Field(min_length=1)]
 JointName = Annotated[str, Field(pattern=r"^joint[1-9][0-9]{0,2}$")]
 ZEROS = partial(np.zeros, 3)
+SOURCES = ("urdf", "mjcf", "dh")  # keys of [robot] that state the nominal arm
 POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
 
 
 @record
 class Robot:
-    """A URDF with the names of its first and last link, or a DH table with its convention.
+    """A URDF or a MuJoCo model with the names of its first and last link, or a DH table.
 
     `masses`: the table of link masses of a DH robot.  Files as absolute or relative paths.
 
@@ -59,8 +60,13 @@ class Robot:
     """
 
     urdf: File | None = keyed('the path of a URDF file, e.g. "arm.urdf"', default=None)
-    base: Text | None = keyed("the name of a link of the URDF", default=None)
-    flange: Text | None = keyed("the name of a link of the URDF", default=None)
+    mjcf: File | None = keyed('the path of a MuJoCo model, e.g. "arm.xml"', default=None)
+    base: Text | None = keyed(
+        "the name of a link of the URDF, or of a body of the MuJoCo model", default=None
+    )
+    flange: Text | None = keyed(
+        "the name of a link of the URDF, or of a body or site of the MuJoCo model", default=None
+    )
     dh: File | None = keyed('the path of a DH table, e.g. "nominal_dh.csv"', default=None)
     dh_convention: Convention = keyed(default="standard")
     masses: File | None = keyed(
@@ -68,15 +74,18 @@ class Robot:
     )
 
     def __post_init__(self) -> None:
-        both = self.urdf is not None and self.dh is not None
-        require(not both, "[robot] takes exactly one of urdf and dh; both are given")
+        given = [name for name in SOURCES if getattr(self, name) is not None]
+        told = f"{listed(given)} are given"
+        require(len(given) < 2, f"[robot] takes exactly one of {listed(SOURCES)}; {told}")
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         """Checks that one robot is stated, with the keys that belong to it."""
-        given = [name for name in ("urdf", "dh") if getattr(table, name) is not None]
-        spot.require(bool(given), "[robot] takes exactly one of urdf and dh; neither is given")
-        other = {"urdf": ("dh_convention", "masses"), "dh": ("base", "flange")}
+        given = [name for name in SOURCES if getattr(table, name) is not None]
+        told = f"[robot] takes exactly one of {listed(SOURCES)}; none is given"
+        spot.require(bool(given), told)
+        of_a_table = ("dh_convention", "masses")
+        other = {"urdf": of_a_table, "mjcf": of_a_table, "dh": ("base", "flange")}
         for name in other[given[0]] if len(given) == 1 else ():
             spot.require(
                 getattr(table, name) is None,
@@ -102,6 +111,25 @@ class Robot:
         'tool0'
         """
         return cls(urdf=Path(path), base=base, flange=flange)
+
+    @classmethod
+    def from_mjcf(
+        cls, path: str | Path, base: str | None = None, flange: str | None = None
+    ) -> Robot:
+        """Returns the arm of a MuJoCo model from body `base` to body or site `flange`.
+
+        Args:
+            path: the MJCF file; its meshes are not needed where bodies state their inertia.
+            base: name of the body in whose frame the chain starts; None takes the world.
+            flange: name of a body or a site; None takes the body before the fingers branch off.
+
+        Raises:
+            InputError: a value is of the wrong type.
+
+        >>> Robot.from_mjcf("arm.xml", flange="attachment_site").flange
+        'attachment_site'
+        """
+        return cls(mjcf=Path(path), base=base, flange=flange)
 
     @classmethod
     def from_dh(

@@ -16,6 +16,7 @@ from elastocal.cli import (  # noqa: F401
     export_command,
     identify_command,
     import_command,
+    init_command,
     simulate_command,
     study_command,
 )

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 # The order of the work, in which --help lists the verbs.
 VERBS = (
-    "design", "simulate", "import", "identify", "diagnose", "compensate", "export", "study", "demo",
+    "init", "effects", "design", "simulate", "import", "identify", "diagnose", "compensate",
+    "export", "study", "demo",
 )  # fmt: skip
 
 
@@ -40,7 +41,7 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 # Arguments and options that name what a command reads.
 READ = (
     "cell", "data", "result", "targets", "files", "folder", "test", "covariance", "knowledge",
-    "augment", "mapping",
+    "augment", "mapping", "robot",
 )  # fmt: skip
 
 
@@ -219,7 +220,7 @@ def files_of(cell: Cell) -> list[Path]:
 
     robot, targets = cell.robot, cell.design.test_path
     solids = [*cell.workspace.obstacles, *(body.solid for body in cell.workspace.bodies)]
-    named = [robot.urdf, robot.dh, robot.masses, None if targets is None else targets.file]
+    named = [robot.urdf, robot.mjcf, robot.dh, robot.masses, None if targets is None else targets.file]
     named += [solid.mesh for solid in solids]
     named += [Path(name) for name in cell.plugins if is_plugin_file(name)]
     return [path for path in named if path is not None]

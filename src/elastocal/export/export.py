@@ -33,6 +33,7 @@ from elastocal.export.exportable import (
     rpy,
 )
 from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
+from elastocal.export.mjcf_in_place import NotInPlace, corrected_mjcf, held_arm
 from elastocal.export.urdf_file import BASE, FLANGE, Frames, calibrated_urdf, new_urdf
 from elastocal.files import atomic_write_text
 from elastocal.model.calibrated import CalibratedArm
@@ -266,19 +267,23 @@ def check_chain(
 
 
 def check_rest(
-    mjcf: str, pieces: ExportNumbers, kept: Kept, base_frame: bool, poses: int, seed: int
+    mjcf: Any,
+    pieces: ExportNumbers,
+    kept: Kept,
+    T_world_base: Array,
+    names: list[str],
+    poses: int,
+    seed: int,
 ) -> float:
     """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
 
-    Raises InputError where MuJoCo is not installed, ElastocalError where they differ.
+    `T_world_base` (4, 4) in the MJCF; `names` of the sites of `pieces.points`.  Raises InputError where MuJoCo is not installed, ElastocalError where they differ.
     """
     arm = MujocoRest(mjcf)
     part, force = kept.exported, kept.conditions.force
     table = random_table(kept.full.model, kept.conditions, poses, seed)
-    expected = part.model.flange_poses(table, part.x)
-    if not base_frame:
-        expected = np.linalg.inv(pieces.T_tracker_base) @ expected
-    names = ["flange", *(f"marker_{name}" for name in pieces.markers)]
+    placed = T_world_base @ np.linalg.inv(pieces.T_tracker_base)
+    expected = placed @ part.model.flange_poses(table, part.x)
     worst = 0.0
     for q, T in zip(table.q, expected, strict=True):
         if np.isfinite(T).all():
@@ -414,34 +419,79 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
 
 
 def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
-    cell = calibrated.model.cell
+    robot, warnings = calibrated.model.cell.robot, []
+    if robot.mjcf is not None:
+        try:
+            return _corrected(calibrated, wish, kept, pieces)
+        except NotInPlace as reason:
+            warnings.append(
+                f"{robot.mjcf.name} itself cannot take the corrections: {reason}; this file is a "
+                "new one with the arm alone"
+            )
     inertias: tuple[Array, ...] = ()
-    if pieces.masses and cell.robot.urdf is not None:
-        inertias = link_inertias(cell.robot.urdf, pieces.chain)
+    if pieces.masses and robot.urdf is not None:
+        inertias = link_inertias(robot.urdf, pieces.chain)
     text = calibrated_mjcf(
         pieces, _note(calibrated, wish), inertias, _compensator(kept.exported), wish.frames.base
     )
-    warnings = []
     if not pieces.masses:
         warnings.append(
             "the links weigh nothing in this file, as in the model it was identified with: "
             "weights would deflect the arm a second time; set [model] link_gravity = true and "
             "identify anew for an arm with weights"
         )
-    springs = {s.site for s in pieces.springs if s.compliance > 0}
-    joints = [f"joint{i + 1}" for i in range(pieces.chain.n_joints)]
-    if rigid := [joint for joint in joints if joint not in springs]:
-        warnings.append(
-            f"no compliance was identified for {', '.join(rigid)}: rigid in this file "
-            f"(gain {RIGID:g})"
-        )
+    warnings += _rigid_joints(pieces, f" (gain {RIGID:g})")
     try:
         import mujoco  # noqa: F401
     except ImportError:
         warnings.append("not read back: MuJoCo is not installed (pip install elastocal[mujoco])")
         return text, None, "", warnings, None
-    distance = check_rest(text, pieces, kept, wish.frames.base, POSES_AT_REST, wish.seed)
+    names = ["flange", *(f"marker_{name}" for name in pieces.markers)]
+    placed = pieces.T_tracker_base if wish.frames.base else np.eye(4)
+    distance = check_rest(text, pieces, kept, placed, names, POSES_AT_REST, wish.seed)
     return text, distance, "MuJoCo, at rest under the load", warnings, None
+
+
+def _corrected(
+    calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
+) -> Written:
+    """The user's own MJCF; raises NotInPlace where it cannot take the corrections."""
+    cell = calibrated.model.cell
+    if wish.frames.base:
+        raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")
+    if _compensator(kept.exported) is not None:
+        raise NotInPlace("it has no gravity compensator")
+    if pieces.masses and not cell.model.link_gravity:
+        raise NotInPlace("weights were identified without those of the file (link_gravity = false)")
+    text, warnings = corrected_mjcf(cell.robot, pieces, wish.frames.tool, _note(calibrated, wish))
+    arm, placed, names = held_arm(text, cell.robot, pieces)
+    distance = check_rest(arm, pieces, kept, placed, names, POSES_AT_REST, wish.seed)
+    springs = [s for s in pieces.springs if s.compliance > 0]
+    if springs and not pieces.masses:
+        warnings.append(
+            "the links weigh in this file and did not in the model that was identified: their "
+            "weights deflect the springs a second time; set [model] link_gravity = true and "
+            "identify anew, or switch gravity off in the file"
+        )
+    if springs:
+        warnings += _rigid_joints(pieces, "")
+        warnings.append(
+            "the springs stand in series with the joints: hold those by stiff actuators, whose "
+            "own error would come on top"
+        )
+    if b"file=" in text.encode():
+        warnings.append(
+            "meshes and included files are named relative to the file: keep it in the folder of "
+            f"{cell.robot.mjcf.name if cell.robot.mjcf else 'the old one'}"
+        )
+    return text, distance, "MuJoCo, at rest under the load", warnings, None
+
+
+def _rigid_joints(pieces: ExportNumbers, how: str) -> list[str]:
+    springs = {s.site for s in pieces.springs if s.compliance > 0}
+    joints = [f"joint{i + 1}" for i in range(pieces.chain.n_joints)]
+    rigid = ", ".join(joint for joint in joints if joint not in springs)
+    return [f"no compliance was identified for {rigid}: rigid in this file{how}"] if rigid else []
 
 
 def _compensator(part: Valued) -> dict[str, float] | None:

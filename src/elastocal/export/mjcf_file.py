@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -65,7 +66,7 @@ def calibrated_mjcf(
     actuators = ET.Element("actuator")
     T_base = pieces.T_tracker_base if base_frame else np.eye(4)
     body = _body(world, "base", T_base, None, None)
-    for spring in _springs(pieces, "base"):
+    for spring in springs_at(pieces, "base"):
         _passive(body, spring, np.eye(4))
     before: list[SpringValue] = []
     for i, joint in enumerate(chain.joints):
@@ -86,7 +87,7 @@ def calibrated_mjcf(
         _motor(body, actuators, pieces, i, own)
         if compensator is not None and compensator["joint"] == i:
             _arm_end(body, joint.axis, offset, compensator)
-        before = _springs(pieces, f"link{i + 1}")
+        before = springs_at(pieces, f"link{i + 1}")
         _draw(body, pieces.links[i])
     flange = _body(body, "flange", pieces.links[-1], None, None)
     for spring in before:
@@ -100,7 +101,7 @@ def calibrated_mjcf(
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _springs(pieces: ExportNumbers, site: str) -> list[SpringValue]:
+def springs_at(pieces: ExportNumbers, site: str) -> list[SpringValue]:
     return [s for s in pieces.springs if s.site == site and s.compliance > 0]
 
 
@@ -111,7 +112,7 @@ def _drive(pieces: ExportNumbers, i: int) -> tuple[float, list[SpringValue]]:
     axes do not commute, and so that spring is a passive joint as well, with a rigid drive.
     """
     axis = tuple(map(float, pieces.chain.joints[i].axis))
-    springs = _springs(pieces, f"joint{i + 1}")
+    springs = springs_at(pieces, f"joint{i + 1}")
     if all(s.axis == axis and s.kind == pieces.chain.joints[i].kind for s in springs):
         return sum(s.compliance for s in springs), []
     return 0.0, springs
@@ -141,11 +142,11 @@ def _passive(body: ET.Element, spring: SpringValue, offset: Array) -> None:
         body, "joint", name=f"spring_{spring.name}", type=MOTIONS[spring.kind],
         pos=numbers(back[:3, 3]), axis=numbers(back[:3, :3] @ spring.axis),
         stiffness=repr(stiffness), damping=repr(SETTLING * stiffness),
-        armature=_armature(stiffness),
+        armature=armature(stiffness),
     )  # fmt: skip
 
 
-def _armature(stiffness: float) -> str:
+def armature(stiffness: float) -> str:
     return repr(max(ARMATURE, ARMATURE_PER_STIFFNESS * stiffness))
 
 
@@ -157,7 +158,7 @@ def _motor(
     kp = 1.0 / compliance if compliance > 0 else RIGID
     ET.SubElement(
         body, "joint", name=name, type=MOTIONS[joint.kind], axis=numbers(joint.axis),
-        armature=_armature(kp),
+        armature=armature(kp),
     )  # fmt: skip
     drive = {"name": name, "joint": name, "kp": repr(kp), "kv": repr(SETTLING * kp)}
     # Limits are stated for what is commanded; the joint itself may yield past them.
@@ -234,9 +235,12 @@ DIFFERENCE_STEP = 1e-6  # rad or m
 
 
 class MujocoRest:
-    """An exported MJCF in MuJoCo.  Raises InputError where MuJoCo is missing or refuses it."""
+    """An exported MJCF in MuJoCo, as text or as MuJoCo's model of it.
 
-    def __init__(self, mjcf: str) -> None:
+    Raises InputError where MuJoCo is missing or refuses it.
+    """
+
+    def __init__(self, mjcf: Any) -> None:
         try:
             import mujoco
         except ImportError:
@@ -245,7 +249,8 @@ class MujocoRest:
             ) from None
         self._mujoco = mujoco
         try:
-            self.model = mujoco.MjModel.from_xml_string(mjcf)
+            text = isinstance(mjcf, str)
+            self.model = mujoco.MjModel.from_xml_string(mjcf) if text else mjcf
         except ValueError as error:
             raise InputError(f"MuJoCo refuses the exported MJCF: {error}") from None
         self._data = mujoco.MjData(self.model)

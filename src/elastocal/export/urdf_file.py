@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -32,44 +32,32 @@ DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')"""
 
 
 @dataclass
-class UrdfText:
-    """The text of a URDF and the edits to make; offsets count bytes of `data`, which is UTF-8.
-
-    `joints`: joint → the offset of its start tag ("joint"), and of the first of each tag in it.
-    """
+class XmlText:
+    """The text of an XML file and the edits to make; offsets count bytes of `data` in UTF-8."""
 
     data: bytes
-    joints: dict[str, dict[str, int]]
-    end: int  # of the robot's content: where its end tag starts
-    edits: list[tuple[int, int, bytes]] = field(default_factory=list)
+    edits: list[tuple[int, int, bytes]] = field(default_factory=list, kw_only=True)
 
-    def set_origin(self, joint: str, attributes: Mapping[str, str]) -> None:
-        """Replace xyz and rpy of a joint's <origin>, or give it one."""
-        tags = self.joints[joint]
-        if "origin" in tags:
-            self._set_attributes(tags["origin"], attributes)
-            return
-        after = _tag_end(self.data, tags["joint"])
-        self.edits.append((after, after, element("origin", attributes).encode()))
-
-    def set_child(self, joint: str, link: str) -> None:
-        """Let a joint carry another link."""
-        self._set_attributes(self.joints[joint]["child"], {"link": link})
-
-    def append(self, text: str) -> None:
-        """Add elements at the end of the robot."""
-        self.edits.append((self.end, self.end, text.encode("utf-8")))
+    def insert(self, at: int, text: str) -> None:
+        """Put text at an offset, behind what was put there before."""
+        self.edits.append((at, at, text.encode("utf-8")))
 
     def result(self) -> str:
         """The text with all edits made."""
-        data = self.data
-        for start, end, new in sorted(self.edits, key=lambda e: e[:2], reverse=True):
-            data = data[:start] + new + data[end:]
-        return data.decode("utf-8")
+        parts, last = [], 0
+        for start, end, new in sorted(self.edits, key=lambda edit: edit[:2]):
+            parts += [self.data[last:start], new]
+            last = end
+        return b"".join([*parts, self.data[last:]]).decode("utf-8")
 
-    def _set_attributes(self, start: int, attributes: Mapping[str, str]) -> None:
-        end = _tag_end(self.data, start)
+    def set_attributes(
+        self, start: int, attributes: Mapping[str, str], without: Collection[str] = ()
+    ) -> None:
+        """Set attributes of the start tag at an offset, and take out those named `without`."""
+        end = tag_end(self.data, start)
         tag = self.data[start:end].decode("utf-8")
+        for name in without:
+            tag = re.sub(rf"""\s{name}\s*=\s*("[^"]*"|'[^']*')""", "", tag)
         for name, value in attributes.items():
             given = re.compile(rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""")
             new = quoteattr(value)
@@ -80,6 +68,33 @@ class UrdfText:
                 closing = "/>" if tag.endswith("/>") else ">"
                 tag = f"{body} {name}={new}{closing}"
         self.edits.append((start, end, tag.encode("utf-8")))
+
+
+@dataclass
+class UrdfText(XmlText):
+    """The text of a URDF.
+
+    `joints`: joint → the offset of its start tag ("joint"), and of the first of each tag in it.
+    """
+
+    joints: dict[str, dict[str, int]]
+    end: int  # of the robot's content: where its end tag starts
+
+    def set_origin(self, joint: str, attributes: Mapping[str, str]) -> None:
+        """Replace xyz and rpy of a joint's <origin>, or give it one."""
+        tags = self.joints[joint]
+        if "origin" in tags:
+            self.set_attributes(tags["origin"], attributes)
+            return
+        self.insert(tag_end(self.data, tags["joint"]), element("origin", attributes))
+
+    def set_child(self, joint: str, link: str) -> None:
+        """Let a joint carry another link."""
+        self.set_attributes(self.joints[joint]["child"], {"link": link})
+
+    def append(self, text: str) -> None:
+        """Add elements at the end of the robot."""
+        self.insert(self.end, text)
 
 
 def element(tag: str, attributes: Mapping[str, str]) -> str:
@@ -93,7 +108,7 @@ def read_urdf_text(path: Path) -> UrdfText:
     A file in another encoding is taken over as UTF-8, its declaration with it.
     Raises InputError where it cannot be decoded.
     """
-    data = _as_utf8(path)
+    data = as_utf8(path, urdf_bytes(path))
     found = UrdfText(data, {}, len(data))
     parser = expat.ParserCreate()
     stack: list[str] = []
@@ -118,8 +133,11 @@ def read_urdf_text(path: Path) -> UrdfText:
     return found
 
 
-def _as_utf8(path: Path) -> bytes:
-    data = urdf_bytes(path)
+def as_utf8(path: Path, data: bytes) -> bytes:
+    """An XML file's content as UTF-8, its declaration with it.
+
+    Raises InputError where it cannot be decoded.
+    """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         name = "utf-16"
     else:
@@ -134,7 +152,7 @@ def _as_utf8(path: Path) -> bytes:
     return DECLARATION.sub(r'\g<1>"UTF-8"', text, count=1).encode("utf-8")
 
 
-def _tag_end(data: bytes, start: int) -> int:
+def tag_end(data: bytes, start: int) -> int:
     """Offset just after the `>` that closes the tag at `start`; one in quotes does not."""
     tag = TAG.match(data, start)
     assert tag, "a parsed tag ends"
@@ -236,16 +254,16 @@ def _correct_joints(
     for i, joint in enumerate(moving):
         correction = pieces.offset_motion(i)
         if i > 0:
-            correction = _error_of_link(pieces, i - 1) @ correction
-        if not _nothing(correction):
+            correction = error_of_link(pieces, i - 1) @ correction
+        if not nothing(correction):
             text.set_origin(joint.name, origin_attributes(_origin(joint) @ correction))
 
 
 def _correct_flange(
     tree: Tree, text: UrdfText, pieces: ExportNumbers, base: str, flange: str
 ) -> list[str]:
-    error = _error_of_link(pieces, pieces.chain.n_joints - 1)
-    if _nothing(error):
+    error = error_of_link(pieces, pieces.chain.n_joints - 1)
+    if nothing(error):
         return []
     last = tree.parent_joint[flange]
     if last.kind == "fixed":
@@ -256,7 +274,7 @@ def _correct_flange(
     return _fixed(tree, text, MOUNT, MOUNT, flange, error)
 
 
-def _error_of_link(pieces: ExportNumbers, i: int) -> Array:
+def error_of_link(pieces: ExportNumbers, i: int) -> Array:
     """E (4, 4) of link i (0-based): calibrated = nominal distal frame · E."""
     nominal = link_ends(pieces.chain)[i]
     if np.array_equal(nominal, pieces.links[i]):
@@ -264,7 +282,7 @@ def _error_of_link(pieces: ExportNumbers, i: int) -> Array:
     return np.asarray(np.linalg.solve(nominal, pieces.links[i]))
 
 
-def _nothing(T: Array) -> bool:
+def nothing(T: Array) -> bool:
     return bool(np.max(np.abs(T - np.eye(4))) < 4 * np.finfo(float).eps)
 
 

@@ -18,6 +18,7 @@ ROOMS = {
     "function_cache": "HashedFunction cache_folder content_key fetch store",
     "inverse_kinematics": "Postures",
     "manipulator": "Model",
+    "mjcf": "MjcfArm read_mjcf",
     "observations": "Observations observe pair_loaded_with_unloaded subset",
     "rigid": "nominal_flange",
     "symbolic": "SymbolicArm configuration_rows",

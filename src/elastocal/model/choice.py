@@ -22,16 +22,19 @@ def cell_of(cell: Cell | str | Path) -> Cell:
 
 
 def load_chain(cell: Cell) -> Chain:
-    """The nominal chain of the cell's robot, from its URDF or its DH table."""
+    """The nominal chain of the cell's robot, from its URDF, MuJoCo model or DH table."""
     from elastocal.model.dh import read_dh
+    from elastocal.model.mjcf import read_mjcf
     from elastocal.model.urdf import read_urdf
 
     robot = cell.robot
+    if robot.mjcf is not None:
+        return read_mjcf(robot.mjcf, base=robot.base, flange=robot.flange)
     if robot.urdf is not None:
         return read_urdf(robot.urdf, base=robot.base, flange=robot.flange)
     if robot.dh is not None:
         return read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
-    raise InputError(f"{cell.path}: [robot] needs urdf or dh")
+    raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
 
 
 def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:

@@ -332,16 +332,23 @@ def check_urdf(path: str | Path) -> Tree:
 
 
 def _parse(path: Path) -> ET.Element:
-    data = urdf_bytes(path)
+    return xml_tree(path, urdf_bytes(path), "a URDF")
+
+
+def xml_tree(path: Path, data: bytes, what: str) -> ET.Element:
+    """The elements of an XML file; `what` it should be ("a URDF") stands in messages.
+
+    Raises InputError for what is not XML, nests too deep, declares entities or has xacro macros.
+    """
     try:
-        return ET.fromstring(data, ET.XMLParser(target=_Bounded(path)))
+        return ET.fromstring(data, ET.XMLParser(target=_Bounded(path, what)))
     except ET.ParseError as error:
         if "unbound prefix" in str(error) and b"<xacro:" in data:
             raise InputError(_xacro(path, "<xacro:…> elements")) from None
         line, column = error.position
         reason = str(error).split(": line")[0]
         raise InputError(
-            f"{path}: not XML: {reason} in line {line}, column {column + 1}; a URDF is an XML file"
+            f"{path}: not XML: {reason} in line {line}, column {column + 1}; {what} is an XML file"
         ) from None
     except (LookupError, ValueError) as error:
         raise InputError(f"{path}: not XML: {error}; save it as UTF-8") from None
@@ -358,17 +365,17 @@ class _Bounded(ET.TreeBuilder):
     A parser that calls itself, as those of other libraries do, would end with the stack.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, what: str) -> None:
         super().__init__()
-        self._path, self._depth = path, 0
+        self._path, self._what, self._depth = path, what, 0
 
     def start(self, tag: Any, attributes: Any) -> Any:
         """As inherited; raises InputError beyond DEEPEST."""
         self._depth += 1
         require(
             self._depth <= DEEPEST,
-            f"{self._path}: <{printable(tag)}> is nested more than {DEEPEST} deep; a URDF needs "
-            "five levels",
+            f"{self._path}: <{printable(tag)}> is nested more than {DEEPEST} deep, which no robot "
+            "needs",
         )
         return super().start(tag, attributes)
 
@@ -379,7 +386,7 @@ class _Bounded(ET.TreeBuilder):
 
     def doctype(self, name: str, public: str | None, system: str | None) -> None:
         """Raise InputError: entities may stand for more text than memory holds."""
-        raise InputError(f"{self._path}: has a <!DOCTYPE>, which a URDF does not; remove it")
+        raise InputError(f"{self._path}: has a <!DOCTYPE>, which {self._what} does not; remove it")
 
 
 def _without_namespace(path: Path, root: ET.Element) -> ET.Element:
@@ -390,7 +397,8 @@ def _without_namespace(path: Path, root: ET.Element) -> ET.Element:
         require(macro is None, _xacro(path, f"'{macro}' in <{local}>"))
         element.tag = local
     other = {"mujoco": "MJCF", "sdf": "SDF"}.get(root.tag)
-    hint = f"; this is {other}, export it as URDF" if other else ""
+    way = 'give it as mjcf = "…"' if other == "MJCF" else "export it as URDF"
+    hint = f"; this is {other}, {way}" if other else ""
     require(
         root.tag == "robot",
         f'{path}: the root element is <{root.tag}>, a URDF has <robot name="…">{hint}',

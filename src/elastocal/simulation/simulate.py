@@ -15,6 +15,9 @@ from elastocal.model.observations import available_noise, position_covariance
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
+MOST_ROWS = 200  # of a plan, from which sizes are taken
+SHOWS = 1e-6  # of the largest slope of a parameter of the same unit
+
 
 def values_from(model: Model, chosen: dict[str, float]) -> Array:
     """Parameter values (parameters,): nominal, with the `chosen` ones replaced by name (SI).
@@ -33,18 +36,45 @@ def values_from(model: Model, chosen: dict[str, float]) -> Array:
     return x
 
 
-def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[str, float]:
+def draw_errors(
+    model: Model, scale: float, rng: np.random.Generator, rows: Measurements | None = None
+) -> dict[str, float]:
     """Random true values: nominal + scale · typical size · N(0, 1) for every parameter.
 
-    Parameters without a known typical size vary by 20 % of their nominal value.
+    Compliances vary by 20 % of their nominal value.  Those that have none are drawn positive, of
+    a size that the loads of `rows` show: where one moves a reading most, it moves it by a
+    millimetre.  Without rows, or a load in them, they stay at nominal.
     """
-    drawn = {}
-    for p in model.parameters:
+    drawn, shown = {}, None
+    for k, p in enumerate(model.parameters):
         size = p.typical if p.typical is not None else 0.2 * abs(p.nominal)
         if p.effect == JointCompliance.name:
             size = 0.2 * abs(p.nominal)
-        drawn[p.name] = p.nominal + scale * size * float(rng.normal())
+        step = scale * float(rng.normal())
+        if size == 0.0 and p.typical is None and rows is not None and scale:
+            shown = _sizes_shown(model, rows) if shown is None else shown
+            size, step = shown[k], abs(step)
+        drawn[p.name] = p.nominal + step * size
     return drawn
+
+
+def _sizes_shown(model: Model, rows: Measurements) -> Array:
+    """A size (parameters,) that moves a reading by 1 mm where it moves one most; 0 for none."""
+    seen = model
+    if model.observe != "position":
+        spec = replace(model.cell.model, observe="position")
+        seen = Model.assembled(model.chain, replace(model.cell, model=spec))
+    names = [name for name in model.names if name in seen.names]
+    columns = np.array([seen.names.index(name) for name in names])
+    some = rows.take(np.linspace(0, len(rows) - 1, min(len(rows), MOST_ROWS)).astype(int))
+    B = seen.regressor(replace(some, position=np.zeros((len(some), 3))), None, columns).B
+    moved = np.abs(B).max(axis=0)
+    # A load on a joint's own axis leaves rounding, from which no size follows.
+    units = np.array([seen.parameters[c].unit for c in columns])
+    most = np.array([moved[units == unit].max() for unit in units])
+    size = np.divide(1e-3, moved, out=np.zeros(len(moved)), where=moved > SHOWS * most)
+    found = dict(zip(names, size, strict=True))
+    return np.array([found.get(name, 0.0) for name in model.names])
 
 
 def expand_plan(

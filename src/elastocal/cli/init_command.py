@@ -1,0 +1,83 @@
+"""elastocal init and effects: how to begin, and what there is to fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from elastocal.cli.app import Json, check_apart, check_outputs, command, console
+from elastocal.screen import say
+from elastocal.text import json_text
+
+
+@command(short_help="How does a first cell for my arm look?")
+def init(
+    robot: Annotated[
+        Path, typer.Argument(help="URDF (.urdf), MuJoCo model (.xml, .mjcf) or DH table (.csv).")
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Cell file to write (TOML).")
+    ] = Path("cell.toml"),
+    base: Annotated[str | None, typer.Option(help="First link or body; default: the root.")] = None,
+    flange: Annotated[
+        str | None, typer.Option(help="Last link, body or site; default: as found.")
+    ] = None,
+    convention: Annotated[
+        str, typer.Option(help="Of a DH table: standard or modified.")
+    ] = "standard",
+    force: Annotated[bool, typer.Option("--force", help="Write over a file.")] = False,
+) -> None:
+    """Write a commented cell that runs: joints and limits of the robot's file, guesses elsewhere.
+
+    Example: elastocal init arm.urdf -o cell.toml
+    """
+    from elastocal import verbs
+    from elastocal.cell.work_cell import read_cell
+    from elastocal.model.choice import load_chain
+
+    check_apart(check_outputs(output), [robot])
+    verbs.init(robot, output, base=base, flange=flange, convention=convention, force=force)  # type: ignore[arg-type]
+    cell = read_cell(output)
+    names = [joint.name for joint in load_chain(cell).joints]
+    say(f"wrote {output}: {len(names)} joints ({', '.join(names)})")
+    if cell.robot.flange is not None:
+        say(f"The flange is '{cell.robot.flange}'; --flange names another.")
+    say("Replace what is marked as a guess. It runs as it is:")
+    say(f"  elastocal design {output} -o plan.csv")
+    say(f"  elastocal simulate {output} plan.csv -o data.csv --draw 1")
+
+
+@command(short_help="What can be fitted?")
+def effects(
+    cell: Annotated[
+        Path | None, typer.Argument(help="Cell file (TOML); default: the KR 270 of the demo.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Every effect of the catalogue: its parameters' unit and typical size, what it is, and where.
+
+    Example: elastocal effects cell.toml
+    """
+    from rich.padding import Padding
+
+    from elastocal.report.effects_view import effect_entries, effect_lines
+
+    entries = effect_entries(cell)
+    if as_json:
+        say(json_text({"schema": "elastocal/effects/1", "effects": entries}))
+        return
+    screen, stage = console(), ""
+    for its_stage, head, what in effect_lines(entries):
+        if its_stage != stage:
+            stage = its_stage
+            screen.print(f"\n{stage.capitalize()}", style="bold")
+        screen.print(Padding(head, (0, 0, 0, 2)))
+        screen.print(Padding(what, (0, 0, 0, 6)), style="dim")
+    screen.print()
+    for line in (
+        "Each line: effect (* fitted or acting), places, typical size of its parameters.",
+        'In the cell: [model] effects = ["joint_offset", "backlash:joint2"].',
+    ):
+        screen.print(line)

@@ -1,0 +1,251 @@
+"""A first cell for an arm: what its file says, and guesses of what it does not, marked as such.
+
+The text is a cell file that runs as it is (`design`, `simulate`), so that one begins with plans
+and readings of an arm like one's own and puts the true numbers in one by one.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from elastocal.cell.arm_description import SOURCES, Convention, Robot
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError, option, require
+from elastocal.model.chain import Chain, Joint
+from elastocal.model.choice import load_chain
+from elastocal.model.mjcf import MjcfArm
+from elastocal.model.rigid import nominal_flange
+from elastocal.model.urdf import check_urdf
+from elastocal.text import printable
+from elastocal.units import Array
+
+ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
+# Sites that are flanges by what MuJoCo users call them.
+FLANGE_SITES = ("attachment_site", "flange", "tool0", "ee_site")
+MOST_SITES = 8  # listed as markers; of more most are something else
+# The KR 270 of the demo, from which guesses are scaled: reach in m, load in N, rad/(N m) of its
+# main and its wrist joints.  Stress at equal strain: loads grow with the reach cubed.
+REACH, LOAD = 2.9, 2600.0
+THICKNESS = 15.0  # reach over a link's radius
+POSES, CANDIDATES = 20, 2000  # three markers read nine numbers in each pose and load state
+
+
+def robot_of(
+    path: str | Path,
+    base: str | None = None,
+    flange: str | None = None,
+    convention: Convention = "standard",
+) -> Robot:
+    """The robot that a file describes: URDF, MuJoCo model or DH table, by its ending.
+
+    Base and flange are those that are found where none are named, so that a cell states them.
+    Raises InputError for an ending that tells none, and for what the file's reader refuses.
+    """
+    path = Path(path)
+    kind = ENDINGS.get(path.suffix.lower())
+    if kind is None:
+        raise InputError(
+            f"{path}: the ending '{printable(path.suffix)}' tells no robot; give a URDF (.urdf), a "
+            "MuJoCo model (.xml, .mjcf) or a DH table (.csv)"
+        )
+    if kind == "dh":
+        for name, given in (("base", base), ("flange", flange)):
+            require(given is None, f"{option(name)} has no meaning for a DH table; leave it out")
+        return Robot.from_dh(path, convention)
+    require(
+        convention == "standard",
+        f"{option('convention')} is for DH tables; leave it out for {path}",
+    )
+    if kind == "urdf":
+        tree = check_urdf(path)
+        base = tree.root if base is None else tree.find_link("base", base)
+        return Robot.from_urdf(path, base, flange or tree.last_link(base))
+    arm = MjcfArm.read(path, base, flange)
+    found = (site for site in FLANGE_SITES if flange is None and site in arm.sites())
+    return Robot.from_mjcf(path, base, next(found, arm.end_name) or None)
+
+
+def first_cell(robot: Robot, folder: str | Path = ".") -> str:
+    """Text of a cell file for a robot, to stand in `folder`.
+
+    Raises InputError for what the reader of the robot's file refuses.
+    """
+    kind, path = next((k, p) for k in SOURCES if (p := getattr(robot, k)) is not None)
+    chain = load_chain(Cell(name=path.stem, robot=robot))
+    sites = MjcfArm.read(path, robot.base, robot.flange).sites() if kind == "mjcf" else {}
+    reach = max(reach_of(chain), 0.05)
+    lines = [
+        f"# {printable(chain.name)}: a first cell, made of {printable(path.name)} by elastocal"
+        " init. It runs as it is.",
+        "# What the robot's file does not say is a guess, and marked so: replace it by your own.",
+        f"name = {_text(chain.name)}",
+        "",
+        *_robot(robot, kind, path, Path(folder)),
+        *_joints(chain),
+        *_tool(reach, sites),
+        *_tracker(reach),
+        *_model(chain),
+        *_workspace(chain, reach),
+        *_design(reach),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def reach_of(chain: Chain) -> float:
+    """How far the flange gets from the first joint, in m: the largest of 500 drawn poses."""
+    import casadi as ca
+
+    from elastocal.model.chain import finite_ranges
+
+    symbol = ca.SX.sym("q", chain.n_joints)
+    flange = ca.Function("reach", [symbol], [nominal_flange(chain, symbol)[:3, 3]])
+    limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
+    q = np.random.default_rng(0).uniform(*finite_ranges(chain, *limits), (500, chain.n_joints))
+    away = np.asarray(flange.map(len(q))(q.T).full()) - chain.joints[0].placement[:3, 3][:, None]
+    return float(np.linalg.norm(away, axis=0).max())
+
+
+def _text(value: str) -> str:
+    """A TOML string."""
+    import tomli_w
+
+    return tomli_w.dumps({"x": value}).removeprefix("x = ").rstrip("\n")
+
+
+def _vector(values: Any) -> str:
+    return "[" + ", ".join(f"{round(float(v), 4) + 0.0:g}" for v in values) + "]"
+
+
+def _one(value: float) -> float:
+    """A number with one digit: guesses should look like what they are."""
+    return float(f"{value:.1g}")
+
+
+def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
+    yield "[robot]"
+    yield f"{kind} = {_text(Path(os.path.relpath(path, folder)).as_posix())}"
+    if kind == "dh":
+        yield f'dh_convention = "{robot.dh_convention}"' + " " * 7 + '# or "modified" (Craig)'
+        yield '# masses = "links.csv"               # link masses, for weights: docs, File formats'
+    for name in ("base", "flange"):
+        if (value := getattr(robot, name)) is not None:
+            yield f"{name} = {_text(value)}"
+    yield ""
+
+
+def _joints(chain: Chain) -> Iterator[str]:
+    yield f"[limits]                               # of {chain.n_joints} joints, in their order"
+    for i, joint in enumerate(chain.joints, 1):
+        unit, scale = ("deg", math.degrees(1.0)) if joint.kind == "revolute" else ("mm", 1e3)
+        low, high, guessed = _range(joint)
+        ends = ", ".join(f"{value * scale:.6g}" for value in (low, high))
+        told = f"{printable(joint.name)}, {joint.kind}"
+        told += "; the file has no limit: guess" if guessed else ""
+        yield f"joint{i}_{unit} = [{ends}]".ljust(38) + f" # {told}"
+    yield ""
+
+
+def _range(joint: Joint) -> tuple[float, float, bool]:
+    """Limits in rad or m, and whether they are guessed."""
+    half = math.pi if joint.kind == "revolute" else 0.5
+    low, high = joint.lower, joint.upper
+    guessed = not (math.isfinite(low) and math.isfinite(high))
+    low = low if math.isfinite(low) else (high - 2 * half if math.isfinite(high) else -half)
+    return low, (high if math.isfinite(high) else low + 2 * half), guessed
+
+
+def _tool(reach: float, sites: dict[str, Array]) -> Iterator[str]:
+    side = reach / 12
+    yield "[tool]                                 # all in m, in the flange frame"
+    # Off the last joint's axis, which a load on it would not turn.
+    yield f"load_point_m = {_vector([side, 0, side])}".ljust(38) + " # guess: where a load hangs"
+    yield ""
+    stub = {
+        "M1": np.array([side, 0.0, side / 3]),
+        "M2": np.array([-side / 2, side * 0.9, side / 2]),
+        "M3": np.array([-side / 2, -side * 0.9, side]),
+    }
+    usable = {n: p for n, p in sites.items() if n == n.strip() == printable(n)}
+    if 0 < len(usable) <= MOST_SITES:
+        yield "[tool.markers_m]                       # the model's sites; keep the reflectors"
+        stub = usable
+    else:
+        yield "[tool.markers_m]                       # guess; marker_position below fits them"
+    for name, place in stub.items():
+        yield f"{_key(name)} = {_vector(place)}"
+    yield ""
+
+
+def _key(name: str) -> str:
+    bare = name.isascii() and name.replace("-", "_").replace("_", "a").isalnum()
+    return name if bare else _text(name)
+
+
+def _tracker(reach: float) -> Iterator[str]:
+    place = _vector([round(2 * reach, 1), 0.0, round(0.5 * reach, 1)])
+    yield "[tracker]"
+    yield f"position_m = {place}".ljust(38) + " # guess: where it stands, in the data's frame"
+    yield "sigma_um = 15".ljust(38) + " # guess; or range_um, range_ppm, transverse_um, …"
+    yield ""
+
+
+def _model(chain: Chain) -> Iterator[str]:
+    yield "[model]"
+    yield 'observe = "position"'.ljust(38) + " # or deflection, pose, distance"
+    yield "# What is fitted; elastocal effects lists all that can be."
+    yield "effects = ["
+    for pair in (("base_frame", "marker_position"), ("joint_offset", "link_geometry")):
+        yield "    " + " ".join(f'"{name}",' for name in pair)
+    # What hangs does not turn an upright first joint.
+    sprung = [f'"joint_compliance:joint{i}",' for i in range(2, chain.n_joints + 1)]
+    for k in range(0, len(sprung), 2):
+        yield "    " + " ".join(sprung[k : k + 2])
+    yield "]"
+    weighed = bool(chain.masses)
+    told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"
+    yield f"link_gravity = {str(weighed).lower()}".ljust(38) + f" # {told}"
+    yield ""
+    yield "[model.nominal]                        # the robot's base in the data's frame"
+    yield "base_position_m = [0, 0, 0]".ljust(38) + " # guess: the data are in the base's frame"
+    yield "base_rpy_deg = [0, 0, 0]"
+    yield ""
+
+
+def _workspace(chain: Chain, reach: float) -> Iterator[str]:
+    # In mm, fives; the links get thinner towards the wrist.
+    thick = max(5 * round(reach * 1e3 / THICKNESS / 5), 5)
+    thin = max(5 * round(thick * 0.6 / 5), 5)
+    n = chain.n_joints
+    radii = [thick if i < n - 3 else thin for i in range(n)]
+    # What stands on the mounting plane is no body that could strike it.
+    if chain.joints[0].placement[2, 3] * 1e3 <= radii[0]:
+        radii[0] = 0
+    yield "[workspace]                            # where the arm may be; design keeps to it"
+    yield f"link_radius_mm = [{', '.join(map(str, radii))}]".ljust(38) + " # guess"
+    yield f"clearance_mm = {thin}"
+    yield ""
+    yield "[[workspace.keep_out]]"
+    yield 'name = "mounting plane"'.ljust(38) + " # the arm stays above it; for a ceiling or"
+    yield "point_m = [0, 0, 0]".ljust(38) + " # a wall turn the normal, and the base above"
+    yield "normal = [0, 0, 1]"
+    yield ""
+    yield "# [[workspace.obstacle]]"
+    yield '# name = "table"'
+    yield '# shape = "box"'
+    yield "# size_m = [1.0, 0.8, 0.7]"
+    yield "# position_m = [1.2, 0.0, 0.35]"
+    yield ""
+
+
+def _design(reach: float) -> Iterator[str]:
+    load = max(_one(LOAD * (reach / REACH) ** 3), 5.0)
+    yield "[design]                               # elastocal design"
+    yield f"poses = {POSES}"
+    yield f"candidates = {CANDIDATES}".ljust(38) + " # to choose from; more take longer"
+    yield f"loads_N = [[0, 0, 0], [0, 0, -{load:g}]]".ljust(38) + " # guess: without and with it"

@@ -1,0 +1,102 @@
+"""An exported MJCF is the user's own file, and rests in MuJoCo where the model does."""
+
+import mujoco
+import numpy as np
+import pytest
+from support.exports import GEOMETRY, LOAD, SPRINGS, exported, poses_of, write_result
+from support.mjcf_text import ARM, LOADABLE, write_arm
+
+from elastocal.export.export import flanges
+from elastocal.export.exportable import Conditions, evaluate_pieces, keep
+from elastocal.model import MjcfArm
+
+MICROMETRE = 1e-6
+
+
+def corrected(folder, robot, effects, model="", text=LOADABLE, **how):
+    write_arm(folder, text)
+    cell, result = write_result(folder, f'mjcf = "arm.xml"\n{robot}', effects, model)
+    calibrated, done = exported(cell, result, "mjcf", force=LOAD, **how)
+    (folder / "new.xml").write_text(done.text, encoding="utf-8")
+    return calibrated, done
+
+
+@pytest.mark.parametrize("robot", ['base = "foot"', 'flange = "attachment_site"', 'flange = "l5"'])
+def test_both_files_loaded_in_mujoco_differ_by_the_calibration(robot, tmp_path):
+    calibrated, done = corrected(tmp_path, robot, GEOMETRY)
+    assert done.checked is not None and done.checked < MICROMETRE
+    assert not [w for w in done.warnings if "cannot take" in w]
+    named = {**dict(line.split(" = ") for line in robot.splitlines())}
+    flange = named.get("flange", '"hand"').strip('"')
+    flange = "elastocal_flange" if flange == "l5" else flange
+    arm = MjcfArm.read(tmp_path / "new.xml", named.get("base", "").strip('"') or None, flange)
+    kept = keep(calibrated, elastic=True, conditions=Conditions())
+    expected = evaluate_pieces(kept.exported, Conditions()).calibrated_chain()
+    q = poses_of(calibrated, 20, seed=3)
+    assert np.abs(flanges(arm.chain, q) - flanges(expected, q)).max() < 1e-9
+    # And by MuJoCo alone, where it was wrong by millimetres before.
+    model, data = (lambda m: (m, mujoco.MjData(m)))(
+        mujoco.MjModel.from_xml_string(done.text)
+    )
+    data.qpos[[model.jnt_qposadr[j] for j in arm.joints]] = q[0]
+    mujoco.mj_kinematics(model, data)
+    T = np.eye(4) if arm.base == 0 else arm.placed(arm.base)
+    end = data.site(flange) if arm.site is not None else data.body(flange)
+    wanted = (T @ flanges(expected, q[:1])[0])[:3, 3]
+    assert np.linalg.norm(end.xpos - wanted) < MICROMETRE
+    before = (T @ flanges(calibrated.model.chain, q[:1])[0])[:3, 3]
+    assert np.linalg.norm(end.xpos - before) > 1e-4
+
+
+def test_springs_weights_and_all_else_of_the_file(tmp_path):
+    effects = (*SPRINGS, "off_axis_compliance:joint2", "link_mass_error")
+    _, done = corrected(tmp_path, "", effects, "link_gravity = true")
+    assert done.checked is not None and done.checked < MICROMETRE
+    assert not [w for w in done.warnings if "cannot take" in w]
+    for kept in ("<!-- a comment that stays -->", 'name="drive2"', 'timestep="0.001"',
+                 '<site name="reflector" pos="0.05 0 0.02"/>'):  # fmt: skip
+        assert kept in done.text
+    model = mujoco.MjModel.from_xml_string(done.text)
+    assert model.nv == mujoco.MjModel.from_xml_string(LOADABLE).nv + 7
+    stiffness = float(np.ravel(model.joint("elastocal_spring_joint2").stiffness)[0])
+    assert stiffness == pytest.approx(1 / 2e-6)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)  # longer by the springs' zeros
+    assert data.joint("a2").qpos == 0.2 and data.joint("f1").qpos == 0
+    assert data.joint("elastocal_spring_joint2").qpos == 0
+    assert model.site("elastocal_marker_M1").bodyid == model.body("hand").id
+
+
+def test_an_export_of_an_export_keeps_one_set_of_springs_and_sites(tmp_path):
+    _, done = corrected(tmp_path, 'flange = "hand"', SPRINGS, "link_gravity = true")
+    _, again = corrected(tmp_path, 'flange = "hand"', SPRINGS, "link_gravity = true", done.text)
+    for name in ("elastocal_spring_joint3", "elastocal_marker_M1", "elastocal_load_point"):
+        assert again.text.count(f'name="{name}"') == 1
+    assert again.checked is not None and again.checked < MICROMETRE
+
+
+def test_meshes_need_not_be_there(tmp_path):
+    _, done = corrected(tmp_path, 'base = "foot"', GEOMETRY, text=ARM)
+    assert done.checked is not None and done.checked < MICROMETRE
+    assert '<mesh name="hull" file="hull.stl"/>' in done.text
+    assert any("keep it in the folder of arm.xml" in w for w in done.warnings)
+
+
+NEW = {
+    "base spring": ("", "base_compliance", "spring of the base"),
+    "two joints on a body": ('<joint name="b4" axis="0 0 1"/>', "", "shares its body"),
+    "include": ('<include file="more.xml"/>', "", "do not all stand in the file"),
+}
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_what_the_file_cannot_take_goes_into_a_new_one(name, tmp_path):
+    more, effect, reason = NEW[name]
+    (tmp_path / "more.xml").write_text(
+        '<mujocoinclude><body name="more"><geom size="0.1"/></body></mujocoinclude>'
+    )
+    text = LOADABLE.replace('<joint name="a4"/>', f'<joint name="a4"/>{more}')
+    text = text.split("<keyframe>")[0] + "</mujoco>"
+    _, done = corrected(tmp_path, "", [*SPRINGS, *([effect] if effect else [])], text=text)
+    assert any("cannot take" in w and reason in w for w in done.warnings), done.warnings
+    assert done.checked is not None and done.checked < MICROMETRE
