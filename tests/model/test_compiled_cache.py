@@ -10,7 +10,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from support.backends import compilations, counting_compiler, system_compiler
+from support.backends import compilations, counting_compiler
 
 from elastocal.model import BatchFunction
 from elastocal.model import c_engine as compiled_build
@@ -165,22 +165,3 @@ def test_no_source_or_object_is_left_behind(folder: Path, monkeypatch: pytest.Mo
     small()(AT)
     assert not list(scratch.iterdir())
     assert len(os.listdir(folder / "cache")) == 1
-
-
-def test_generated_code_that_is_not_known_is_not_compiled(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A CasADi that writes statements otherwise must not be cut into pieces wrongly."""
-    from elastocal.errors import InputError
-    from elastocal.model import c_engine as compiled_source
-
-    system_compiler()
-
-    class Otherwise(ca.CodeGenerator):
-        def dump(self) -> str:
-            return super().dump().replace("w[0]=", "if (1) w[0]=")
-
-    monkeypatch.setattr(compiled_source.ca, "CodeGenerator", Otherwise)
-    with pytest.raises(InputError, match="writes C that is not known here"):
-        small(5.0)(AT)
-    assert compilations(folder) == 0

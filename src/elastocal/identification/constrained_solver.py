@@ -488,7 +488,7 @@ def least_excess(system: System) -> dict[str, float]:
     }
 
 
-def extremes(system: System, index: int) -> tuple[float, float]:
+def extent(system: System, index: int) -> tuple[float, float]:
     """Smallest and largest x[index] that the constraints allow; infinite where unbounded."""
     import cvxpy as cp
 
@@ -517,6 +517,9 @@ def _solve(problem: Any) -> str:
     with warnings.catch_warnings():
         # Inaccurate solutions are polished and judged by their KKT residual.
         warnings.simplefilter("ignore")
+        if problem.is_lp():  # by the simplex method: at a vertex as few multipliers as can be
+            problem.solve(solver="SCIPY", scipy_options={"method": "highs"})
+            return str(problem.status)
         for tolerance in TOLERANCES:
             options = {f"tol_{name}": tolerance for name in ("gap_abs", "gap_rel", "feas")}
             try:

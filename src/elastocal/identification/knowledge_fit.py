@@ -16,7 +16,6 @@ from elastocal.identification.constrained import (
     ActiveConstraint,
     ConstrainedFit,
     constrained_fit,
-    extent,
     fit_system,
     fitted_columns,
     minimise,
@@ -28,6 +27,7 @@ from elastocal.identification.constrained_solver import (
     ResidualLoss,
     active_at,
     equality_space,
+    extent,
     loss_of,
     tangent_rows,
 )

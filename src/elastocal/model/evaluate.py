@@ -83,7 +83,8 @@ VARIABLE = "ELASTOCAL_BACKEND"
 # is then bound by the second-level cache; compiled code keeps most operands in registers.
 NUMPY_CALL = 0.3e-6  # per instruction and block
 NUMPY_ROW = 0.15e-9  # per instruction and row, above compiled code
-COMPILE_START, COMPILE_INSTRUCTION = 0.2, 1.2e-4  # one run of the compiler
+COMPILE_START, COMPILE_INSTRUCTION = 0.2, 1.0e-4  # one run of the compiler, and for each
+COMPILE_LENGTH = 4.4e-9  # instruction and each of the others in the same function
 LOOKUP_START, LOOKUP_INSTRUCTION = 0.02, 1e-6  # hash, verify and load a library
 
 _default: str | None = None
@@ -139,7 +140,8 @@ class Work:
     @property
     def pays_to_compile(self) -> bool:
         """Compiling would have paid by now."""
-        return self.wasted >= COMPILE_START + COMPILE_INSTRUCTION * self.instructions
+        each = COMPILE_INSTRUCTION + COMPILE_LENGTH * self.instructions
+        return self.wasted >= COMPILE_START + each * self.instructions
 
 
 @dataclass(frozen=True)

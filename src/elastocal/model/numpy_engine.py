@@ -7,7 +7,6 @@ import operator
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
@@ -178,127 +177,6 @@ def _steps(f: ca.Function, constants: list[float]) -> Iterator[tuple[int, int, i
             raise NotImplementedError(f"CasADi operation {code} has no numpy counterpart")
 
 
-# In which order instructions are carried out, and where their operands stand.
-
-
-@dataclass(frozen=True)
-class Steps:
-    """Functions, the slots of their first and second operands (−1: none) and of their results.
-
-    Four lists and not a tuple for every step: thousands of these would have Python look for
-    garbage in all that is loaded, 0.07 s each time.
-    """
-
-    operation: list[Any] = field(default_factory=list)
-    first: list[int] = field(default_factory=list)
-    second: list[int] = field(default_factory=list)
-    out: list[int] = field(default_factory=list)
-
-    def add(self, operation: Any, first: int, second: int, out: int) -> None:
-        self.operation.append(operation)
-        self.first.append(first)
-        self.second.append(second)
-        self.out.append(out)
-
-    def __len__(self) -> int:
-        return len(self.out)
-
-    def __iter__(self) -> Iterator[tuple[Any, int, int, int]]:
-        return zip(self.operation, self.first, self.second, self.out, strict=True)
-
-
-class EvaluationOrder:
-    """What is done where the inputs `by_row` vary by row and the others do not.
-
-    Slots hold, in this order: components of the inputs, components of the outputs, every value
-    that is the same in all rows, and `n_registers` registers.  `constants` are the slots of
-    constants with their numbers, `once` makes the other values in common, and `shared` lists
-    those of both that rows need.  `steps` is what remains for a block of rows; a value that is an
-    output is computed where it is put out.
-    """
-
-    def __init__(
-        self, table: NDArray[np.int32], ends: Sequence[int], by_row: Sequence[bool]
-    ) -> None:
-        """`ends`: first slot of every input, of every output, and of the values in common."""
-        self.once = Steps()
-        self.constants: list[tuple[int, int]] = []
-        self.first_common = free = ends[-1]
-        steps = Steps()  # the k-th result of all rows is value `unplaced` + k
-        unplaced = free + len(table)
-        varies = [False] * unplaced  # of inputs and of values in common; results all do
-        for k, rows in enumerate(by_row):
-            varies[ends[k] : ends[k + 1]] = [rows] * (ends[k + 1] - ends[k])
-        value = [0] * (1 + int(table[:, 2].max(initial=0)))  # what a register holds now
-        home: dict[int, int] = {}  # the output's slot where a result is put out
-        copies: list[tuple[int, int]] = []
-        # Column by column: a list per instruction is garbage that the collector would count.
-        for kind, code, out, a, b in zip(*(column.tolist() for column in table.T), strict=True):
-            if kind >= UNARY_OP:
-                first, second = value[a], -1
-                per_row = first >= unplaced or varies[first]
-                if kind == BINARY_OP:
-                    second, operation = value[b], BINARY[code]
-                    per_row = per_row or second >= unplaced or varies[second]
-                else:
-                    operation = UNARY[code]
-                if per_row:
-                    value[out] = unplaced + len(steps)
-                    steps.add(operation, first, second, value[out])
-                else:
-                    operation = ON_NUMBERS.get(operation, operation)
-                    self.once.add(operation, first, second, free)
-                    value[out], free = free, free + 1
-            elif kind == READ:
-                value[out] = ends[a] + b
-            elif kind == CONSTANT:
-                self.constants.append((free, code))
-                value[out], free = free, free + 1
-            else:
-                source, place = value[out], ends[len(by_row) + a] + b
-                if source >= unplaced and source not in home:
-                    home[source] = place
-                else:
-                    copies.append((home.get(source, source), place))
-        self.n_common = free - self.first_common
-        self.steps, self.n_registers = _placed(steps, home, unplaced, free)
-        for source, place in copies:
-            self.steps.add(np.positive, source, -1, place)
-        read = {*self.steps.first, *self.steps.second}
-        self.shared = sorted(slot for slot in read if self.first_common <= slot < free)
-
-
-def _placed(steps: Steps, home: dict[int, int], unplaced: int, first: int) -> tuple[Steps, int]:
-    """The steps with their results in output slots and registers `first`…, and how many of these.
-
-    A register is free after the last step that reads it, and what became free last is taken
-    first: it is in cache.
-    """
-    last = {slot: k for k, pair in enumerate(zip(steps.first, steps.second, strict=True))
-            for slot in pair}  # fmt: skip
-    slot_of = dict(home)
-    placed = Steps()
-    unused: list[int] = []
-    count = 0
-    for k, (operation, a, b, out) in enumerate(steps):
-        x, y = a, b
-        if a >= unplaced:
-            x = slot_of[a]
-            if x >= first and last[a] == k:
-                unused.append(x)
-        if b >= unplaced:
-            y = slot_of[b]
-            if y >= first and last[b] == k and b != a:
-                unused.append(y)
-        if out not in slot_of:
-            if not unused:
-                unused.append(first + count)
-                count += 1
-            slot_of[out] = unused.pop()
-        placed.add(operation, x, y, slot_of[out])
-    return placed, count
-
-
 # Instructions carried out on numpy arrays, one call per instruction and block of rows.
 #
 # A CasADi `SX` function is a list of scalar instructions.  Carrying out each once on an
@@ -309,8 +187,10 @@ def _placed(steps: Steps, home: dict[int, int], unplaced: int, first: int) -> tu
 class NumpyFunction:
     """Instructions, and `evaluate`, which carries them out on whole blocks of rows.
 
-    `n_registers` is the most that any plan needs.  Raises NotImplementedError for a CasADi
-    operation that numpy has no counterpart for.
+    Results stand in the `n_registers` registers that CasADi gave the instructions, each as long as
+    a block: few are in use at a time, and these stay in cache.  What is the same in all rows is
+    one number.  Raises NotImplementedError for a CasADi operation that numpy has no counterpart
+    for.
     """
 
     def __init__(
@@ -328,14 +208,7 @@ class NumpyFunction:
             output, (_, width) = len(wider.shapes) - 1, wider.shapes[-1]
             self._table = of_columns(wider._table, output, width, columns)
             self._constants, self.n_registers = wider._constants, wider.n_registers
-        widths = [*function.sizes, *[rows * columns for rows, columns in function.shapes]]
-        self._ends = [int(end) for end in np.cumsum([0, *widths])]
-        self._plans: dict[tuple[bool, ...], EvaluationOrder] = {}
-
-    def _plan(self, by_row: tuple[bool, ...]) -> EvaluationOrder:
-        if by_row not in self._plans:
-            self._plans[by_row] = EvaluationOrder(self._table, self._ends, by_row)
-        return self._plans[by_row]
+        self._steps: dict[tuple[bool, ...], Steps] = {}
 
     def evaluate(
         self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
@@ -343,50 +216,57 @@ class NumpyFunction:
         """Rows of `blocks` of `results` (n, rows, columns), all of one type."""
         if not results:
             return
-        plan = self._plan(tuple(a.ndim == 2 for a in inputs))
-        common = self._in_common(plan, inputs)
+        by_row = tuple(a.ndim == 2 for a in inputs)
+        if by_row not in self._steps:
+            self._steps[by_row] = _steps_where(self._table, by_row)
         size = max((block.stop - block.start for block in blocks), default=0)
-        buffer = np.empty((plan.n_registers, size), dtype=results[0].dtype)
+        registers = np.empty((self.n_registers, size), dtype=results[0].dtype)
         flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
         stage = [np.zeros((f.shape[1], size), dtype=f.dtype) for f in flat]
         for block in blocks:
             m = block.stop - block.start
-            slots: list[Any] = []
-            for a in inputs:
-                slots += list(a[block].T.copy()) if a.ndim == 2 else _cells(a)
-            for s in stage:
-                slots += list(s[:, :m])
-            slots += common
-            slots += list(buffer[:, :m])
-            for operation, first, second, out in plan.steps:
-                if second >= 0:
-                    operation(slots[first], slots[second], slots[out])
+            given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
+            given.append(self._constants.tolist())
+            outputs, rows = [s[:, :m] for s in stage], list(registers[:, :m])
+            held: list[Any] = [None] * self.n_registers
+            for kind, operation, out, a, b in zip(*self._steps[by_row], strict=True):
+                if kind == BY_ROW:
+                    if b >= 0:
+                        held[out] = operation(held[a], held[b], rows[out])
+                    else:
+                        held[out] = operation(held[a], rows[out])
+                elif kind == IN_COMMON:
+                    held[out] = operation(held[a], held[b]) if b >= 0 else operation(held[a])
+                elif kind == READ:
+                    held[out] = given[a][b]
                 else:
-                    operation(slots[first], slots[out])
-            for f, s in zip(flat, stage, strict=True):
-                f[block] = s[:, :m].T
-
-    def _in_common(self, plan: EvaluationOrder, inputs: Sequence[NDArray]) -> list[Any]:
-        """The values that are the same in all rows; None where only `plan.once` reads them."""
-        slots: list[Any] = [None] * (plan.first_common + plan.n_common)
-        for start, a in zip(self._ends, inputs, strict=False):
-            if a.ndim == 1:
-                slots[start : start + len(a)] = a.tolist()
-        constants = self._constants.tolist()
-        for place, k in plan.constants:
-            slots[place] = constants[k]
-        for operation, first, second, out in plan.once:
-            if second >= 0:
-                slots[out] = operation(slots[first], slots[second])
-            else:
-                slots[out] = operation(slots[first])
-        common: list[Any] = [None] * plan.n_common
-        for slot in plan.shared:
-            # numpy takes arrays without axes faster than scalars.
-            common[slot - plan.first_common] = np.asarray(slots[slot])
-        return common
+                    outputs[a][b] = held[out]
+            for f, output in zip(flat, outputs, strict=True):
+                f[block] = output.T
 
 
-def _cells(a: NDArray) -> list[NDArray]:
-    """The numbers of `a` (n,) as arrays without axes."""
-    return [a[k, ...] for k in range(len(a))]
+# Kind, function, register, first and second operand of every step (−1: no second).  Five lists and
+# not a tuple for every step: thousands of these would have Python look for garbage in all that is
+# loaded, 0.07 s each time.
+Steps = tuple[list[int], list[Any], list[int], list[int], list[int]]
+BY_ROW, IN_COMMON = UNARY_OP, BINARY_OP
+
+
+def _steps_where(table: NDArray[np.int32], by_row: Sequence[bool]) -> Steps:
+    """The instructions where the inputs `by_row` vary by row and the others do not."""
+    kinds, codes, outs, first, second = (column.tolist() for column in table.T)
+    operations: list[Any] = [None] * len(kinds)
+    varies = [False] * (1 + max(outs, default=0))  # what a register holds now
+    for k, (kind, code, out) in enumerate(zip(kinds, codes, outs, strict=True)):
+        if kind == CONSTANT:  # as if they were one more input
+            kinds[k], first[k], second[k] = READ, len(by_row), code
+            varies[out] = False
+        elif kind == READ:
+            varies[out] = by_row[first[k]]
+        elif kind != WRITE:
+            varies[out] = varies[first[k]] or (kind == BINARY_OP and varies[second[k]])
+            operation = BINARY[code] if kind == BINARY_OP else UNARY[code]
+            operations[k] = operation if varies[out] else ON_NUMBERS.get(operation, operation)
+            second[k] = second[k] if kind == BINARY_OP else -1
+            kinds[k] = BY_ROW if varies[out] else IN_COMMON
+    return kinds, operations, outs, first, second
