@@ -106,8 +106,8 @@ def turns(loaded: Sequence[bool], used: Sequence[int], changes: int | None) -> l
 
 
 def in_turns(tour: list[int], load: IntArray, sequence: list[int]) -> list[int]:
-    """The visits of a tour, of load states (V,), in blocks of `sequence`, as many visits in each block of a state, in
-    the order of the tour."""
+    """The visits of a tour, of load states (V,), in blocks of `sequence`, as many in each block of
+    a state, in the order of the tour."""
     of_state = {s: [v for v in tour if load[v - 1] == s] for s in set(sequence)}
     parts = {s: np.array_split(visits, sequence.count(s)) for s, visits in of_state.items()}
     return [int(v) for s in sequence for v in parts[s].pop(0)]
@@ -119,7 +119,7 @@ def _travel(costs: Costs) -> Array:
 
 # The order: first little bias, then little travel, by simulated annealing.
 
-STEPS = 100_000
+STEPS, TRIES = 40_000, 3
 FEW = 10_000  # while moves of the order still turn out to be blocked
 HOT, COLD = 20.0, 1e-3  # in units of a bias that is as good as none
 
@@ -242,7 +242,7 @@ def _moved(tour: list[int], load: IntArray, kind: float, i: int, j: int) -> list
     )
     if alone:
         return None  # its block would be gone
-    new.insert(j if j < i else j, new.pop(i))
+    new.insert(j, new.pop(i))
     after = load[np.array(new) - 1]
     return new if len(list(groupby(after))) <= len(list(groupby(state))) else None
 

@@ -19,6 +19,7 @@ from elastocal.planning.drift import (
     FEW,
     HOT,
     STEPS,
+    TRIES,
     Alias,
     Clock,
     Drifting,
@@ -404,8 +405,9 @@ def _against_drift(
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
     clock = Clock.of(moves, motion, costs, alias, tour)
     before = clock.bias(tour)
-    new = balanced(in_turns(tour, load, sequence), load, clock, seed, STEPS, HOT)
-    rounds = 0
+    begun = in_turns(tour, load, sequence)
+    tries = [balanced(begun, load, clock, seed + k, STEPS, HOT) for k in range(TRIES)]
+    new, rounds = min(tries, key=clock.price), 0
     while moves.check(new, costs):
         progress(f"order of execution against drift: {moves.checked} moves checked")
         rounds += 1

@@ -161,9 +161,10 @@ def plan_rows(
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
     row per pose and side, to be measured in every load state, `order` being its place in the
-    order in the first state, note_order_2 that in the second, and so on.  `configurations` and `level`: one per pose.  Where a
-    pose is approached from both sides, they are two configurations, 7+ (joints moving up to it)
-    and 7-: the difference between them is what such a plan is for, not noise of repeats.
+    order in the first state, note_order_2 that in the second, and so on.  `configurations` and
+    `level`: one per pose.  Where a pose is approached from both sides, they are two
+    configurations, 7+ (joints moving up to it) and 7-: the difference between them is what such a
+    plan is for, not noise of repeats.
     """
     numbered = list(enumerate(execution.stops, start=1))
     readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}

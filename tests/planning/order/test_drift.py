@@ -61,7 +61,7 @@ def test_every_visit_once_in_turns_and_the_drift_does_little(changes, sequence):
         (pose, load) for pose in range(12) for load in (0, 1)
     ]
     assert blocks(execution) == sequence and execution.load_changes == len(sequence) - 1
-    assert execution.drift.bias < 0.15 * execution.drift.shortest
+    assert execution.drift.bias < 0.25 * execution.drift.shortest
     shortest = ordered(alias=None)
     assert execution.bound <= execution.travel
     assert execution.travel <= shortest.travel + 0.05 * shortest.total
