@@ -126,6 +126,8 @@ def design(
     test_path: str | Path | TargetPath | None = None,
     test_box: tuple[ArrayLike, ArrayLike] | TargetBox | None = None,
     motion: Motion | None = None,
+    load_changes: int | None = None,
+    reference_every: int | None = None,
     seed: int = 0,
     jobs: int = 1,
     progress: Progress | None = None,
@@ -167,6 +169,9 @@ def design(
         test_path: A table (CSV) of such places.
         test_box: Lower and upper corner (3,) in m of a box of such places, in the data's frame.
         motion: How the arm moves between poses, which decides their order.
+        load_changes: How often the load may be hung, exchanged or taken off; default as rarely as
+            can be. More of them keep a drift further apart from what the loads show.
+        reference_every: Visit a reference pose again after so many stops.
         seed: Of all random draws.
         jobs: Processes; −1 for all cores.
         progress: Is told what is done.
@@ -276,6 +281,13 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
         chosen["levels"] = {k: tuple(map(float, v)) for k, v in chosen["levels"].items()}
         chosen.setdefault("per_level", ())
+    motion = {
+        key: _whole(key, chosen.pop(key), 1)
+        for key in ("load_changes", "reference_every")
+        if key in chosen
+    }
+    if motion:
+        chosen["motion"] = replace(chosen.get("motion", cell.design.motion), **motion)
     if "interest" in chosen:
         chosen["interest"] = _names("interest", chosen["interest"])
     if "test_poses" in chosen:

@@ -91,6 +91,16 @@ def design(
         int | None, typer.Option(min=1, help="Feasible candidates to choose from, over all levels.")
     ] = None,
     effort: Annotated[str, typer.Option(help="quick, normal or thorough.")] = "normal",
+    load_changes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Changes of load allowed; more keep a drift apart; default: the fewest."
+        ),
+    ] = None,
+    reference_every: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Visit a reference pose again after every N stops."),
+    ] = None,
     program: Annotated[
         list[Path] | None,
         typer.Option(
@@ -129,6 +139,8 @@ def design(
         "criterion": criterion,
         "target": _target(target, poses),
         "candidates": candidates,
+        "load_changes": load_changes,
+        "reference_every": reference_every,
     }
     with progress_line(quiet) as tell, Interrupts() as interrupts:
 

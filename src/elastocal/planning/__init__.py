@@ -16,6 +16,7 @@ ROOMS = {
     "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
     "design": "Checkpoint DesignOptions DesignSearch Effort Selection Stage key_of ordered",
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
+    "drift": "Alias Drifting",
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",
     "feasibility": "Feasibility PoseFeasibility",
     "information": "Estimable LoadStates PoseInformation load_states measured next_number rows_of",

@@ -27,6 +27,7 @@ from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.drift import Alias
 from elastocal.planning.exact_plan import exact_plan, random_plans, size_curve
 from elastocal.planning.execution import Execution, schedule
 from elastocal.planning.feasibility import Feasibility
@@ -427,6 +428,8 @@ def _execution(
         limits=joint_limits(cell, feasibility.chain),
         via=pool.q[:: max(len(pool) // VIA, 1)],
         blockers=Blockers(feasibility),
+        alias=Alias.of(setup, pool, chosen),
+        paired=not states.observed.all(),
         seed=seed, progress=progress,
     )  # fmt: skip
 

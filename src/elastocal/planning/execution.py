@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -14,6 +14,20 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import require
+from elastocal.planning.drift import (
+    DRIFT,
+    FEW,
+    HOT,
+    STEPS,
+    TRIES,
+    Alias,
+    Clock,
+    Drifting,
+    balanced,
+    in_turns,
+    turns,
+    with_references,
+)
 from elastocal.planning.moves import (
     BlockersOf,
     Costs,
@@ -34,7 +48,8 @@ class Stop:
     The arm moves straight through `via` (k, n), where nothing is measured, and then to `q`, in
     `travel` s.  `change_after`: the load is changed once that many of these k + 1 moves are done;
     None: it stays.  `approach` (n,): +1 or −1, the direction of each joint's last motion, and
-    `side` 0 or 1 where the pose is approached from both sides.
+    `side` 0 or 1 where the pose is approached from both sides.  `again`: how often it has been
+    visited for reference, this time included; 0 for the plan's own reading.
     """
 
     pose: int
@@ -45,6 +60,12 @@ class Stop:
     change_after: int | None = None
     approach: IntArray | None = None
     side: int = 0
+    again: int = 0
+
+    def name(self, configurations: Sequence[str]) -> str:
+        """That of its pose, of `configurations` (N,); "7r2" for the second time that pose 7 is
+        visited for reference only."""
+        return configurations[self.pose] + (f"r{self.again}" if self.again else "")
 
 
 @dataclass(frozen=True)
@@ -53,7 +74,8 @@ class Execution:
 
     `travel` s in all; no order of these visits, whose moves go straight or through the given
     points, travels less than `bound` s.  `checked` moves were tried, `blocked` of them in the
-    way of something.  `take_off`: the load hangs on the arm after the last stop.
+    way of something.  `take_off`: the load hangs on the arm after the last stop.  `drift`: what a
+    steady drift would do to the plan's result in this order; None where that was not asked.
     """
 
     stops: tuple[Stop, ...]
@@ -64,6 +86,7 @@ class Execution:
     bound: float
     checked: int
     blocked: int
+    drift: Drifting | None = None
 
     @property
     def travel(self) -> float:
@@ -79,7 +102,7 @@ class Execution:
     @property
     def one_sided(self) -> tuple[int, ...]:
         """Poses that were to be approached from both sides but can be from one only."""
-        sides = Counter((stop.pose, stop.load) for stop in self.stops)
+        sides = Counter((stop.pose, stop.load) for stop in self.stops if not stop.again)
         few = {pose for (pose, _), n in sides.items() if self.motion.both_directions and n < 2}
         return tuple(sorted(few))
 
@@ -131,7 +154,7 @@ def _time(moves: Moves, way: list[int]) -> float:
 
 # A lower bound on the cost of every tour, to say how far a found one can be from the best.
 
-STEPS = 400
+SUBGRADIENTS = 400
 
 
 def tour_bound(cost: Array, upper: float) -> float:
@@ -158,7 +181,7 @@ def held_karp_bound(cost: Array, upper: float) -> float:
         return float(2 * cost[0, 1])
     price, best, best_price = np.zeros(n), -np.inf, np.zeros(n)
     scale, stalled = 1.0, 0
-    for _ in range(STEPS):
+    for _ in range(SUBGRADIENTS):
         value, degree = _one_tree(cost + price[:, None] + price[None, :])
         value -= 2 * float(price.sum())
         if value > best:
@@ -278,6 +301,8 @@ def schedule(
     limits: tuple[Array, Array] | None = None,
     via: Array | None = None,
     blockers: BlockersOf | None = None,
+    alias: Alias | None = None,
+    paired: bool = False,
     seed: int = 0,
     iterations: int = ITERATIONS,
     progress: Callable[[str], None] = lambda message: None,
@@ -295,6 +320,11 @@ def schedule(
     Solve, check the moves of the solution, forbid the blocked ones, and again: at the end all
     moves are checked, and the tour is one that the routing solver holds best at costs that are
     nowhere above the true ones.  The same seed gives the same order.
+
+    With an `alias` the order found is one in which a drift does little to what the plan is for,
+    as far as `motion.extra_time` allows more travel than the shortest takes and
+    `motion.load_changes` more changes of load.  `motion.reference_every` visits one pose is
+    visited again; where readings are `paired`, loaded with unloaded, no more often loaded.
 
     Raises InsufficientDataError that names a pose which no free move reaches, or which cannot
     be approached as asked, and what is in the way if `blockers` can tell; InputError for
@@ -318,13 +348,31 @@ def schedule(
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
     refuse_impossible(moves, tour, costs, blockers)
-    stops = [stop for u, v in pairwise([0, *tour]) for stop in _stops(moves, u, v, costs)]
-    _, home = moves.way(tour[-1], 0, costs)  # empty without a home
-    home_travel = _time(moves, home)
-    travel = sum(stop.travel for stop in stops) + home_travel
     # The bound leaves open in which order the load states come: their number alone is fixed.
     open_cost = costs.cost - costs.changed
     bound = tour_bound(open_cost, tour_cost(open_cost, tour)) - tour_cost(costs.apart, tour)
+    drift = None
+    if (alias is not None or motion.load_changes) and motion.extra_time > 0:
+        tour, costs, drift = _against_drift(moves, motion, tour, costs, alias, seed, progress)
+        if len(set(moves.visits.load.tolist())) > 1:
+            # Load states may come more than once: nothing but the way itself bounds that.
+            way = costs.cost - costs.apart - costs.changed
+            bound = tour_bound(way, tour_cost(way, tour))
+    order = [(node, 0) for node in tour]
+    if motion.reference_every:
+        order = with_references(tour, moves, costs, motion.reference_every, paired)
+        while moves.check([node for node, _ in order], costs):
+            costs = moves.costs()
+    nodes = [node for node, _ in order]
+    refuse_impossible(moves, nodes, costs, blockers)
+    stops = [
+        replace(stop, again=again)
+        for (u, (v, again)) in zip([0, *nodes], order, strict=False)
+        for stop in _stops(moves, u, v, costs)
+    ]
+    _, home = moves.way(nodes[-1], 0, costs)  # empty without a home
+    home_travel = _time(moves, home)
+    travel = sum(stop.travel for stop in stops) + home_travel
     return Execution(
         stops=tuple(stops),
         home_via=moves.points[home[1:-1]],
@@ -334,7 +382,46 @@ def schedule(
         bound=float(np.clip(bound, 0.0, travel)),
         checked=moves.checked,
         blocked=moves.blocked,
+        drift=drift,
     )
+
+
+ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
+
+
+def _against_drift(
+    moves: Moves,
+    motion: Motion,
+    tour: list[int],
+    costs: Costs,
+    alias: Alias | None,
+    seed: int,
+    progress: Callable[[str], None],
+) -> tuple[list[int], Costs, Drifting | None]:
+    """The visits of the shortest `tour` in the order that a drift harms least, its costs, and what
+    the drift does to it; the shortest tour itself where no other is better."""
+    load = moves.visits.load
+    used = [int(s) for s in dict.fromkeys(load[np.array(tour) - 1])]
+    sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
+    clock = Clock.of(moves, motion, costs, alias, tour)
+    before = clock.bias(tour)
+    begun = in_turns(tour, load, sequence)
+    tries = [balanced(begun, load, clock, seed + k, STEPS, HOT) for k in range(TRIES)]
+    new, rounds = min(tries, key=clock.price), 0
+    while moves.check(new, costs):
+        progress(f"order of execution against drift: {moves.checked} moves checked")
+        rounds += 1
+        costs = moves.costs()
+        clock = clock.at(costs)
+        if rounds <= ROUNDS:
+            new = balanced(new, load, clock, seed + rounds, FEW, HOT / 2**rounds)
+    more = bool(motion.load_changes) and alias is None
+    keep = clock.possible(new) and (more or clock.bias(new) < before)
+    found = new if keep else tour
+    if alias is None:
+        return found, costs, None
+    noise, at_test = alias.noise, alias.at_test_poses
+    return found, costs, Drifting(DRIFT * clock.bias(found), DRIFT * before, noise, at_test)
 
 
 def _unloaded_first(tour: list[int], cost: Array, moves: Moves) -> list[int]:

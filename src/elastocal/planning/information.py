@@ -216,7 +216,7 @@ class PoseInformation:
         return marker_sigmas(self.model.cell, table)
 
     def _whitened(self, q: Array, load: IntArray, x: Array) -> Array:
-        observed, factor = self._noise(q, load, x)
+        observed, factor = self.noise(q, load, x)
         at = self.model.regressor(observed.table, x, self.columns, observed)
         B = at.B.reshape(len(q), -1, len(self.columns)) * self.sizes
         return np.asarray(np.linalg.solve(factor, B), dtype=np.float64)
@@ -224,10 +224,12 @@ class PoseInformation:
     def whitener(self, q: Array, load: int) -> Array:
         """W (S, r, r) of one pose q (n,): W B is its block before scaling."""
         one = q[None], np.array([load])
-        return np.stack([np.linalg.inv(self._noise(*one, x)[1][0]) for x in self.scenarios])
+        return np.stack([np.linalg.inv(self.noise(*one, x)[1][0]) for x in self.scenarios])
 
-    def _noise(self, q: Array, load: IntArray, x: Array) -> tuple[Observations, Array]:
-        """What is read at the poses, and the Cholesky factors (N, r, r) of its covariance."""
+    def noise(self, q: Array, load: IntArray, x: Array | None = None) -> tuple[Observations, Array]:
+        """What is read at the poses of the arm x, by default the one known best, and the Cholesky
+        factors (N, r, r) of its covariance."""
+        x = self.scenarios[0] if x is None else x
         observed = observe(self.rows(q, load, x), self.model.observe)
         covariance = pose_covariance(self.model, observed, len(q), self.states)
         return observed, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)

@@ -160,17 +160,20 @@ def plan_rows(
     """The rows of an execution, sorted by pose, then side of approach, then load state.
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
-    row per pose and side, to be measured in every load state, with the place in the order of the
-    second state as note_order_2, and so on.  `configurations` and `level`: one per pose.  Where a
-    pose is approached from both sides, they are two configurations, 7+ (joints moving up to it)
-    and 7-: the difference between them is what such a plan is for, not noise of repeats.
+    row per pose and side, to be measured in every load state, `order` being its place in the
+    order in the first state, note_order_2 that in the second, and so on.  `configurations` and
+    `level`: one per pose.  Where a pose is approached from both sides, they are two
+    configurations, 7+ (joints moving up to it) and 7-: the difference between them is what such a
+    plan is for, not noise of repeats.
     """
     numbered = list(enumerate(execution.stops, start=1))
-    readings: dict[tuple[int, int, int], list[tuple[int, Stop]]] = {}
-    for k, stop in sorted(numbered, key=lambda s: (s[1].pose, s[1].side, s[1].load)):
-        key = (stop.pose, stop.side, -1 if forces is None else stop.load)
+    readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
+    for k, stop in sorted(
+        numbered, key=lambda s: (s[1].again > 0, s[1].pose, s[1].again, s[1].side, s[1].load)
+    ):
+        key = (stop.pose, stop.again, stop.side, -1 if forces is None else stop.load)
         readings.setdefault(key, []).append((k, stop))
-    rows = [sorted(row, key=lambda s: s[0]) for row in readings.values()]
+    rows = list(readings.values())
     first = [row[0][1] for row in rows]
     sides = ("", "") if first[0].approach is None else ("+", "-")
     most = max(len(row) for row in rows)
@@ -180,7 +183,7 @@ def plan_rows(
     }
     approach = [stop.approach for stop in first if stop.approach is not None]
     return PlanRows(
-        configuration=tuple(configurations[stop.pose] + sides[stop.side] for stop in first),
+        configuration=tuple(stop.name(configurations) + sides[stop.side] for stop in first),
         q=np.array([stop.q for stop in first]),
         level=np.array([level[stop.pose] for stop in first]),
         order=np.array([row[0][0] for row in rows]),
@@ -411,11 +414,13 @@ class Plan(Result):
         """The load states where the plan must state them row by row.
 
         Not where every pose is measured unloaded, or unloaded and under one load, which is what
-        `simulate` does with a load to a plan without forces.
+        `simulate` does with a load to a plan without forces; but where poses are visited again
+        for reference, as that is under one of the loads.
         """
         loaded = np.any(self.forces != 0, axis=1)
         usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2
-        return None if usual and (self.load < 0).all() else self.forces
+        again = any(stop.again for stop in self.execution.stops)
+        return None if usual and (self.load < 0).all() and not again else self.forces
 
     def to_json(self) -> dict[str, Any]:
         """The plan as numbers and texts; the file adds its schema."""

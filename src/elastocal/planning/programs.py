@@ -66,7 +66,7 @@ def steps_of(
     if home is not None:
         yield "move", home, "home"
     for stop in execution.stops:
-        name = f"configuration {configurations[stop.pose]}"
+        name = f"configuration {stop.name(configurations)}"
         steps: list[Step] = [("move", q, "via point, not measured") for q in stop.via]
         steps.append(("move", stop.q, name))
         if stop.change_after is not None:

@@ -145,13 +145,18 @@ class FeasiblePool:
 
 @dataclass(frozen=True)
 class Setup:
-    """`information` over the kept parameters, `prior` (S, p, p) scaled, and the criterion."""
+    """`information` over the kept parameters, `prior` (S, p, p) scaled, and the criterion.
+
+    `target_rows` (r, p): |R x| is the rms error at the test poses in m; None where the criterion
+    knows of none.
+    """
 
     information: PoseInformation
     found: Estimable
     criterion: Criterion
     prior: Array
     warnings: tuple[str, ...]
+    target_rows: Array | None = None
 
     def pool(self, q: Array, load: IntArray, group: IntArray) -> FeasiblePool:
         return FeasiblePool(q, load, group, self.information.blocks(q, load))
@@ -219,7 +224,11 @@ def set_up(
         robust=spec.robust,
     )
     prior = np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0)
-    return Setup(information, found, criterion, prior, warnings)
+    R = None
+    if A is not None:
+        weighted = np.sqrt(targets.weight)[:, None, None] * A[0]
+        R = np.linalg.qr(weighted.reshape(-1, len(kept)), mode="r")
+    return Setup(information, found, criterion, prior, warnings, R)
 
 
 def _scenarios(model: Model, known: Known, seed: int) -> Array:

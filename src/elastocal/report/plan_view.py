@@ -7,6 +7,7 @@ from typing import Any
 
 from elastocal.errors import option
 from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.drift import DRIFT
 from elastocal.planning.plan import Plan, Predicted, Reason
 from elastocal.report.formatting import (
     ShownTable,
@@ -42,7 +43,8 @@ def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable
 
 def first_stops(plan: Plan) -> dict[int, int]:
     """Pose → its first place in the order of execution, from 1."""
-    return {stop.pose: k + 1 for k, stop in reversed(list(enumerate(plan.execution.stops)))}
+    stops = reversed(list(enumerate(plan.execution.stops)))
+    return {stop.pose: k + 1 for k, stop in stops if not stop.again}
 
 
 def force_text(plan: Plan, load: int) -> str:
@@ -113,7 +115,7 @@ def stop_rows(plan: Plan) -> ShownTable:
         rows.append(
             (
                 str(k + 1),
-                plan.configurations[stop.pose],
+                stop.name(plan.configurations),
                 force_text(plan, stop.load),
                 "by hand" if stop.change_after is not None else "",
                 str(len(stop.via)),
@@ -168,7 +170,10 @@ def plan_tone(plan: Plan) -> Tone:
 
 
 def plan_steps(plan: Plan) -> list[str]:
-    steps = ["Measure the poses in the order given: it is short, and every move was checked."]
+    steps = [
+        "Measure the poses in the order given: it keeps drift apart from what is sought, and every "
+        "move was checked. Record the time of each reading."
+    ]
     if plan.criterion == "test_pose":
         steps.append(
             f"If ρ₀ is not small enough: {option('target')} finds the fewest poses that reach a "
@@ -193,7 +198,7 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     """What the plan is worth, as (label, sentence)."""
     lines = [_criterion_line(plan), *_chance_lines(plan), _candidate_line(plan)]
     lines += _certificate_lines(plan)
-    lines.append(_execution_line(plan))
+    lines += [_execution_line(plan), *_drift_lines(plan)]
     if plan.polished:
         text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
         lines.append(("Polish", f"{text} candidates."))
@@ -267,7 +272,10 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     e = plan.execution
     stops, changes = len(e.stops), e.load_changes
     text = f"{stops} stops, {e.travel:.0f} s of travel"
-    if e.gap > 5e-4:
+    again = sum(stop.again > 0 for stop in e.stops)
+    if again:
+        text = f"{stops} stops, {again} of them at reference poses, {e.travel:.0f} s of travel"
+    if e.gap > 5e-4 and (e.drift is None or e.drift.bias == e.drift.shortest) and not again:
         text += f" (at most {100 * e.gap:.1f} % above the shortest order)"
     if changes:
         text += f", {changes} load change{'s' if changes > 1 else ''} by hand"
@@ -275,6 +283,23 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     if via:
         text += f", {via} points in between to get around obstacles"
     return "Execution", f"{text}, {e.total / 60:.0f} min in all; every move checked."
+
+
+def _drift_lines(plan: Plan) -> list[tuple[str, str]]:
+    """What a steady drift does in this order, and what it would do in the shortest."""
+    d = plan.execution.drift
+    if d is None:
+        return []
+    size = f"a steady drift of {DRIFT * 1e6:g} µm while measuring"
+    if d.at_test_poses:
+        text = f"{size} puts {d.bias * 1e6:.2g} µm on the test poses at worst"
+        other = f"{d.shortest * 1e6:.2g} µm"
+    else:
+        text = f"{size} moves the parameters by {d.bias:.2g} of their standard deviations at worst"
+        other = f"{d.shortest:.2g}"
+    if d.bias < d.shortest:
+        text += f" (in the shortest order {other})"
+    return [("Drift", f"{text}.")]
 
 
 def plan_contents(plan: Plan) -> dict[str, Any]:

@@ -1,0 +1,293 @@
+"""An order of visits in which a drift is not taken for a parameter: loads in turn, poses mixed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+from scipy import linalg
+
+from elastocal.cell.plan_wishes import Motion
+from elastocal.errors import require
+from elastocal.planning.moves import Costs, Moves
+from elastocal.planning.setup import FeasiblePool, Setup
+from elastocal.units import Array, IntArray
+
+# What a steady drift of tracker or base does to what the readings are evaluated for.
+
+DRIFT = 50e-6  # m, from the first reading to the last: a tracker or a base over an hour
+HARMLESS = 0.1  # of what noise leaves: adds half a per cent to the error
+
+
+@dataclass(frozen=True)
+class Alias:
+    """How a shift of single readings comes back as an error of what the plan is for.
+
+    `share` (N, L, m, 3): the error (m,) that a shift (3,) m of the readings of pose i in load
+    state l leaves: R M⁻¹ B_iᵀ Σ_i⁻¹ D_il, D_il how readings enter the observations, |R x| the rms
+    error at the test poses in m where `at_test_poses`, else x in its own standard deviations.
+    `noise`: what the readings' noise leaves, in the same terms.
+    """
+
+    share: Array
+    noise: float
+    at_test_poses: bool
+
+    @classmethod
+    def of(cls, setup: Setup, pool: FeasiblePool, chosen: IntArray) -> Alias | None:
+        """Of the plan `chosen` (N,) from the pool; None where readings are distances, which a
+        shift changes by no more than its part along the line of sight."""
+        information = setup.information
+        observed, factor = information.noise(pool.q[chosen], pool.load[chosen])
+        if observed.kind == "distance":
+            return None
+        blocks = pool.blocks[0, chosen]
+        M = setup.gathered(pool.blocks[:, chosen])[0]
+        V = linalg.cho_solve(linalg.cho_factor(M), np.eye(len(M)))
+        R = setup.target_rows
+        root = np.linalg.cholesky(M).T if R is None else R
+        n, n_states = len(chosen), len(information.states.forces)
+        rows = len(observed.table) // n
+        T = observed.combine[: len(observed.lead) // n, :rows].toarray()
+        force = observed.table.force.reshape(n, rows, 3)
+        shift = np.zeros((observed.size, 3))
+        shift[:3, :3] = np.eye(3)
+        share = np.zeros((n, n_states, len(root), 3))
+        for state, own in enumerate(information.states.forces):
+            here = (np.abs(force - own) < 1e-9).all(axis=2)
+            D = np.einsum("ak,nk,cx->nacx", T, here.astype(float), shift)
+            whitened = np.linalg.solve(factor, D.reshape(n, -1, 3))
+            share[:, state] = root @ V @ np.einsum("nrp,nrx->npx", blocks, whitened)
+        return cls(share, float(np.sqrt(np.trace(root @ V @ root.T))), R is not None)
+
+
+@dataclass(frozen=True)
+class Drifting:
+    """What a steady drift of DRIFT over the measurements puts on what the plan is for, at worst:
+    `bias` in this order, `shortest` in the shortest order, `noise` beside it, in m at the test
+    poses, or in standard deviations of the parameters where not `at_test_poses`."""
+
+    bias: float
+    shortest: float
+    noise: float
+    at_test_poses: bool
+
+
+# The load states in turn, within a number of changes of load.
+
+
+def turns(loaded: Sequence[bool], used: Sequence[int], changes: int | None) -> list[int]:
+    """Load states in the order in which they come, each entry one block of visits.
+
+    `loaded` (L,): which states have a load; `used`: those that are visited.  At most `changes`
+    loads are hung, exchanged or taken off, the arm beginning and ending without; None: as few as
+    the states allow.  Without load the arm is measured in every gap, first and last of all, so
+    that neither the loads nor their absence fall to one part of the time.  Raises InputError
+    where there are fewer changes than loads need.
+    """
+    free = [state for state in used if not loaded[state]]
+    heavy = [state for state in used if loaded[state]]
+    if not heavy:
+        return free[:1]
+    least = len(heavy) + 1
+    require(
+        changes is None or changes >= least,
+        f"[design.motion] load_changes is {changes}, but the loads are hung, exchanged and taken "
+        f"off {least} times at least; allow {least}, or plan fewer loads",
+    )
+    changes = changes or least
+    if len(heavy) == 1:
+        blocks = changes // 2 if free else 1
+        return [*free, *(heavy + free) * blocks]
+    there_and_back = heavy + heavy[-2:0:-1]
+    return [*free, *(there_and_back[k % len(there_and_back)] for k in range(changes - 1)), *free]
+
+
+def in_turns(tour: list[int], load: IntArray, sequence: list[int]) -> list[int]:
+    """The visits of a tour, of load states (V,), in blocks of `sequence`, as many in each block of
+    a state, in the order of the tour."""
+    of_state = {s: [v for v in tour if load[v - 1] == s] for s in set(sequence)}
+    parts = {s: np.array_split(visits, sequence.count(s)) for s, visits in of_state.items()}
+    return [int(v) for s in sequence for v in parts[s].pop(0)]
+
+
+def _travel(costs: Costs) -> Array:
+    return costs.cost - costs.apart - costs.changed
+
+
+# The order: first little bias, then little travel, by simulated annealing.
+
+STEPS, TRIES = 40_000, 3
+FEW = 10_000  # while moves of the order still turn out to be blocked
+HOT, COLD = 20.0, 1e-3  # in units of a bias that is as good as none
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When each visit of an order is read, and what a drift then does.
+
+    `travel` (V + 1, V + 1) s between nodes, `change` s where that changes the load, `visit` s of
+    reading at a node; `share` (V, m·3) of each visit.  Of travel `longest` s are allowed; a bias
+    of `enough` per m of drift is as good as none.
+    """
+
+    travel: Array
+    change: Array
+    visit: float
+    share: Array
+    longest: float
+    enough: float
+
+    @classmethod
+    def of(
+        cls, moves: Moves, motion: Motion, costs: Costs, alias: Alias | None, shortest: list[int]
+    ) -> Clock:
+        """Allows so much more travel than in the `shortest` tour as `motion` has extra time."""
+        visits = moves.visits
+        share = np.zeros((1 + visits.pose.max(), 1 + visits.load.max(), 1, 3))
+        if alias is not None:
+            share = alias.share
+        made = cls(
+            travel=_travel(costs),
+            change=np.where(costs.changed > 0, motion.load_change, 0.0),
+            visit=motion.dwell * (1 if moves.signs is None else 2),
+            share=share[visits.pose, visits.load].reshape(len(visits.pose), -1),
+            longest=np.inf,
+            enough=1.0 if alias is None else HARMLESS * alias.noise / DRIFT,
+        )
+        ring = np.array([0, *shortest, 0])
+        waiting = made.visit * len(shortest) + float(made.change[ring[:-1], ring[1:]].sum())
+        driving = made.driving(shortest)
+        return replace(made, longest=driving + motion.extra_time * (driving + waiting))
+
+    def at(self, costs: Costs) -> Clock:
+        """With what is known of the moves since."""
+        return replace(self, travel=_travel(costs))
+
+    def possible(self, tour: list[int]) -> bool:
+        """Has every move a way, within the time allowed?"""
+        return self.driving(tour) <= self.longest
+
+    def driving(self, tour: list[int]) -> float:
+        ring = np.array([0, *tour, 0])
+        return float(self.travel[ring[:-1], ring[1:]].sum())
+
+    def _errors(self, tour: list[int]) -> Array:
+        """(m·3,) error per m of drift in x, y, z, counted from the readings' mean time."""
+        there = np.array(tour)
+        before = np.concatenate([[0], there[:-1]])
+        step = self.travel[before, there] + self.change[before, there] + self.visit
+        time = np.cumsum(step)
+        span = max(float(time[-1] - time[0]), 1e-300)
+        return np.asarray((time - time.mean()) / span @ self.share[there - 1])
+
+    def bias(self, tour: list[int]) -> float:
+        """Error per m of drift in its worst direction."""
+        return float(np.linalg.norm(self._errors(tour).reshape(-1, 3), ord=2))
+
+    def price(self, tour: list[int]) -> float:
+        """What annealing makes small: bias beyond `enough`, travel beyond `longest`, travel."""
+        errors = self._errors(tour)
+        bias = float(np.sqrt(errors @ errors)) / self.enough
+        driving = self.driving(tour) / self.longest
+        return max(bias - 1, 0.0) + 100 * max(driving - 1, 0.0) + 0.1 * driving
+
+
+def balanced(
+    tour: list[int], load: IntArray, clock: Clock, seed: int, steps: int, hot: float
+) -> list[int]:
+    """The tour with its visits exchanged and moved between blocks of the same load state (V,),
+    never more changes of load, by annealing the clock's price from `hot` down to COLD."""
+    if len(tour) < 3 or not steps:
+        return tour
+    rng = np.random.default_rng(seed)
+    here, price = list(tour), clock.price(tour)
+    best, least = here, price
+    draws = rng.random((steps, 4))
+    cooling = (COLD / hot) ** (1 / steps)
+    temperature = hot
+    for kind, a, b, luck in draws:
+        temperature *= cooling
+        new = _moved(here, load, kind, int(a * len(here)), int(b * len(here)))
+        if new is None:
+            continue
+        found = clock.price(new)
+        if found <= price or luck < np.exp((price - found) / temperature):
+            here, price = new, found
+            if price < least:
+                best, least = here, price
+    return best
+
+
+def _moved(tour: list[int], load: IntArray, kind: float, i: int, j: int) -> list[int] | None:
+    """Visits i and j exchanged, i put beside j, or what lies between them turned round; None
+    where that would change the blocks."""
+    state = load[np.array(tour) - 1]
+    if i == j or state[i] != state[j]:
+        return None
+    new = tour.copy()
+    if kind < 0.5:
+        new[i], new[j] = new[j], new[i]
+        return new
+    low, high = min(i, j), max(i, j)
+    if kind < 0.7:
+        if (state[low : high + 1] != state[low]).any():
+            return None
+        new[low : high + 1] = new[low : high + 1][::-1]
+        return new
+    alone = (i == 0 or state[i - 1] != state[i]) and (
+        i + 1 == len(tour) or state[i + 1] != state[i]
+    )
+    if alone:
+        return None  # its block would be gone
+    new.insert(j, new.pop(i))
+    after = load[np.array(new) - 1]
+    return new if len(list(groupby(after))) <= len(list(groupby(state))) else None
+
+
+# Reference poses: the same pose again and again, which shows a drift by itself.
+
+
+def with_references(
+    tour: list[int], moves: Moves, costs: Costs, every: int, paired: bool
+) -> list[tuple[int, int]]:
+    """The tour's nodes, 0 behind each, with one pose of each load state visited again before the
+    first, after `every` visits, and at the end, under the load that hangs there, its number
+    behind it.
+
+    The pose is the one with the least way to the others, the same for all load states where one
+    is visited in all.  Where readings are `paired`, loaded with unloaded, it is visited loaded no
+    more often than without load.
+    """
+    visits = moves.visits
+    mean = _travel(costs)[1:, 1:].mean(axis=0)
+    states = [int(s) for s in dict.fromkeys(visits.load[np.array(tour) - 1])]
+    common = set.intersection(*(set(visits.pose[visits.load == s].tolist()) for s in states))
+    if common:
+        best = min(sorted(common), key=lambda k: float(mean[visits.pose == k].sum()))
+        candidates = visits.pose == best
+    else:
+        candidates = np.ones(len(visits.pose), dtype=bool)
+    chosen = {
+        s: 1 + min(np.flatnonzero(candidates & (visits.load == s)).tolist(), key=lambda v: mean[v])
+        for s in states
+    }
+    times = dict.fromkeys(states, 0)
+    found: list[tuple[int, int]] = []
+    for k, node in enumerate([*tour, tour[-1]]):
+        state = int(visits.load[node - 1])
+        if k % every == 0 or k == len(tour):
+            times[state] += 1
+            found.append((chosen[state], times[state]))
+        if k < len(tour):
+            found.append((node, 0))
+    most = min((n for s, n in times.items() if not moves.loaded[s]), default=0)
+    if paired:
+        found = [
+            (node, again)
+            for node, again in found
+            if again <= most or not moves.loaded[visits.load[node - 1]]
+        ]
+    return found

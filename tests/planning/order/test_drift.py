@@ -1,0 +1,110 @@
+"""The order keeps a drift apart from what the plan is for, within time and changes of load."""
+
+from itertools import groupby
+
+import numpy as np
+import pytest
+from support.cells import DOWN, kr270_chain, random_poses
+from support.design_cells import all_loads, plan_cell, setup_of
+from support.discs import Discs
+
+from elastocal.cell.plan_wishes import Motion
+from elastocal.errors import InputError
+from elastocal.planning import Alias, plan_rows, schedule
+from elastocal.planning import test_poses as target_poses
+from elastocal.planning.drift import DRIFT, turns
+from elastocal.planning.information import pose_covariance
+from elastocal.planning.test_poses import prediction_rows
+
+BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])
+RNG = np.random.default_rng(1)
+Q = RNG.uniform(-2, 2, (12, 2))
+# Loaded minus unloaded: what a shift does has opposite signs.
+OWN = RNG.normal(size=(12, 1, 4, 3))
+PAIRS = Alias(np.concatenate([-OWN, OWN], axis=1) / 12, 5e-6, True)
+
+
+def ordered(alias=PAIRS, **motion):
+    motion = {"dwell": 30.0, "load_change": 60.0} | motion
+    return schedule(Q, Motion(**motion), Discs(), loads=BOTH, alias=alias)
+
+
+def blocks(execution):
+    return "".join("UL"[load] for load, _ in groupby(s.load for s in execution.stops))
+
+
+@pytest.mark.parametrize(
+    ("loaded", "changes", "expected"),
+    [
+        ([False], None, [0]),
+        ([True], None, [0]),
+        ([False, True], None, [0, 1, 0]),
+        ([False, True], 5, [0, 1, 0, 1, 0]),
+        ([False, True, True], None, [0, 1, 2, 0]),
+        ([False, True, True, True], 6, [0, 1, 2, 3, 2, 1, 0]),
+        ([True, True], 4, [0, 1, 0]),
+    ],
+)
+def test_the_load_states_take_turns_within_the_changes_allowed(loaded, changes, expected):
+    assert turns(loaded, range(len(loaded)), changes) == expected
+
+
+def test_fewer_changes_than_the_loads_need_are_refused():
+    with pytest.raises(InputError, match="allow 3, or plan fewer loads"):
+        turns([False, True, True], [0, 1, 2], 2)
+
+
+@pytest.mark.parametrize(("changes", "sequence"), [(None, "ULU"), (4, "ULULU")])
+def test_every_visit_once_in_turns_and_the_drift_does_little(changes, sequence):
+    execution = ordered(load_changes=changes)
+    assert sorted((s.pose, s.load) for s in execution.stops) == [
+        (pose, load) for pose in range(12) for load in (0, 1)
+    ]
+    assert blocks(execution) == sequence and execution.load_changes == len(sequence) - 1
+    assert execution.drift.bias < 0.25 * execution.drift.shortest
+    shortest = ordered(alias=None)
+    assert execution.bound <= execution.travel
+    assert execution.travel <= shortest.travel + 0.05 * shortest.total
+
+
+def test_without_extra_time_the_order_is_the_shortest():
+    there, shortest = ordered(extra_time=0.0), ordered(alias=None)
+    assert [(s.pose, s.load) for s in there.stops] == [(s.pose, s.load) for s in shortest.stops]
+
+
+def test_a_reference_pose_comes_again_first_last_and_in_between():
+    execution = ordered(reference_every=10)
+    again = [k for k, stop in enumerate(execution.stops) if stop.again]
+    assert again == [0, 11, 22, 27] and len({execution.stops[k].pose for k in again}) == 1
+    names = tuple(map(str, range(1, 13)))
+    rows = plan_rows(execution, names, np.zeros(12, dtype=int), BOTH)
+    assert len(rows.configuration) == 28
+    assert sum("r" in name for name in rows.configuration) == 4
+    assert sorted(rows.order) == list(range(1, 29))
+
+
+def test_the_alias_is_what_least_squares_make_of_shifted_readings():
+    chain, cell = kr270_chain(), plan_cell(loads=DOWN[None])
+    q = random_poses(chain, 8, seed=4)
+    setup = setup_of(cell, q)
+    information = setup.information
+    pool = setup.pool(q, all_loads(q), np.zeros(8, dtype=int))
+    alias = Alias.of(setup, pool, np.arange(8))
+    rng = np.random.default_rng(0)
+    time, direction = rng.uniform(size=(8, 2)), rng.normal(size=3)
+    observed, _ = information.noise(q, all_loads(q))
+    table, model, x = observed.table, information.model, information.scenarios[0]
+    state = (table.force != 0).any(axis=1).astype(int)
+    d = observed.apply(time[table.configuration, state][:, None] * direction)
+    B = model.regressor(table, x, information.columns, observed).B
+    B = B.reshape(8, -1, len(information.columns))
+    root = np.linalg.cholesky(pose_covariance(model, observed, 8, information.states))
+    B, d = (np.linalg.solve(root, v) for v in (B, d.reshape(8, -1, 1)))
+    wrong = np.linalg.lstsq(B.reshape(-1, B.shape[-1]), d.ravel(), rcond=None)[0]
+    targets = target_poses.test_poses(cell, chain, None, 0)
+    A = prediction_rows(information, targets, x)[..., information.columns]
+    rms = np.sqrt(targets.weight @ ((A @ wrong) ** 2).sum(axis=1))
+    found = np.einsum("nl,nlmx,x->m", time, alias.share, direction)
+    assert np.linalg.norm(found) == pytest.approx(rms, rel=1e-8)
+    assert alias.noise == pytest.approx(np.sqrt(setup.value(q, all_loads(q))), rel=1e-9)
+    assert DRIFT > 0
