@@ -301,6 +301,8 @@ class Nominal:
     """Nominal values and start hints; compliances in rad/(N m), base rotation (3, 3).
 
     `settings`: place → key → value of the constants that effects do not fit, in the key's unit.
+    `sizes`: place → key → typical deviation of a parameter from nominal, in its SI unit, where
+    this arm's is known and the effect's own would not do.
     """
 
     joint_compliance: Many[NonNegative] | None = keyed(
@@ -319,6 +321,11 @@ class Nominal:
     settings: dict[str, dict[str, AnyFloat]] = keyed(
         "a table per place, as in settings.joint2 = { jump_time_s = 720.0 }",
         form=dict[str, dict[str, float]],
+        default_factory=dict,
+    )
+    sizes: dict[str, dict[str, Positive]] = keyed(
+        "a table per place, as in sizes.joint2 = { move_lag = 0.002 }",
+        form=dict[str, dict[str, Positive]],
         default_factory=dict,
     )
 

@@ -382,7 +382,10 @@ class SumAnswer:
             reduction, ci90, ci95 = self._reduction(members)
             probability = max(self._probability(k) for k in members)
             parameters = tuple(p for k in members for p in self._parameters(k))
-            yield FoundEffect(name, where, probability, reduction, ci90, ci95, parameters, settings)
+            yield FoundEffect(
+                name, where, probability, reduction, ci90, ci95, parameters, settings,
+                {key: size for k in members for key, size in self._parameter_sizes(k)},
+            )  # fmt: skip
 
     @cached_property
     def _present(self) -> Array:
@@ -440,6 +443,16 @@ class SumAnswer:
         given, size = dict(c.settings), float(np.exp(self.found.sizes.size[k])) * c.unit
         numbers = range(1, len(given) // 2 + 1)
         return [(given[f"order_{n}"], given[f"order_sd_{n}"], size / n) for n in numbers]
+
+    def _parameter_sizes(self, k: int) -> Iterator[tuple[str, float]]:
+        """Prior size of each parameter of a component that no setting states: key and SI value."""
+        c = self.found.components[k]
+        if c.hypothesis is not None and not c.effect.sized_by:
+            size = float(np.exp(self.found.sizes.size[k]))
+            typical = self.dataset.sizes[c.hypothesis.key].tolist()
+            for p, s in zip(c.hypothesis.parameters, typical, strict=True):
+                if s > 0:
+                    yield p.key, size * s
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
         """Estimates of a component's parameters, where they are few and not shrunk."""

@@ -94,7 +94,8 @@ class FoundEffect:
 
     `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
     the 3-D error of noise-free new poses falls when the effect joins the model, with 90 and 95 %
-    intervals.  `settings` are its searched constants (orders, times) by their keys.
+    intervals.  `settings` are its searched constants (orders, times) by their keys, `sizes` the
+    typical deviations of its parameters from nominal by theirs, where those were estimated.
     """
 
     effect: str
@@ -105,6 +106,7 @@ class FoundEffect:
     gap_reduction_ci95: Interval
     parameters: tuple[FittedParameter, ...]
     settings: dict[str, float]
+    sizes: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

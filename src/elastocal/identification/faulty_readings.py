@@ -453,7 +453,7 @@ def report_faulty(
     """
     problem, columns = whole.problem, clean.fit.columns
     if residual is not None:
-        columns = columns[~problem.model.shrunk[columns]]
+        columns = columns[~np.isin(columns, clean.reduction.with_prior)]
     if problem.large:
         return None
     observed, table = problem.observations, problem.observations.table

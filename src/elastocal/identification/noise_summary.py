@@ -307,7 +307,7 @@ def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
         bool(found.noise.fit.common.any()) or found.noise.lasting is not None
     )
     if common and found.noise is not None:
-        few = fit.columns[~problem.model.shrunk[fit.columns]]
+        few = fit.columns[~np.isin(fit.columns, solution.reduction.with_prior)]
         readings = linearised(problem.model, problem.observations, fit.x, few)
         own = block_diagonal(own_noise(found.noise.fit, readings)[0])
         weights = Weights("own", whitener(own), True, "")

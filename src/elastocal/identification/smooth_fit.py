@@ -54,6 +54,7 @@ from elastocal.identification.solve import (
     Reduction,
     Solution,
     choose,
+    is_placed,
 )
 from elastocal.identification.weighted_problem import (
     Part,
@@ -112,9 +113,14 @@ class SmoothFit(NamedTuple):
 
 @dataclass(frozen=True)
 class Functions:
-    """The smooth functions that are fitted: their columns (shrunk,), in groups (shrunk,)."""
+    """What has a prior: columns (shrunk,), in groups (shrunk,) of one scale each.
+
+    First the smooth functions `groups`, then the `sized` parameters, those of an effect at a place
+    that have one unit together.
+    """
 
     groups: tuple[SmoothGroup, ...]
+    sized: IntArray
     columns: IntArray
     group: IntArray
     std: Array
@@ -125,10 +131,33 @@ class Functions:
         """Those of the parameters `free`."""
         own = [g for g in smooth_groups(model) if np.isin(g.columns, free).any()]
         columns = [c[np.isin(c, free)] for c in (g.columns.ravel() for g in own)]
-        group = np.repeat(np.arange(len(own)), [len(c) for c in columns])
+        alike: dict[tuple[str, str, str], list[int]] = {}
+        for c in (sized := sized_of(model, free)).tolist():
+            p = model.parameters[c]
+            alike.setdefault((p.effect, p.where, p.unit), []).append(c)
+        columns += [np.array(same) for same in alike.values()]
+        group = np.repeat(np.arange(len(columns)), [len(c) for c in columns])
         every = np.concatenate(columns)
         std = np.array([model.parameters[c].typical for c in every], dtype=float)
-        return cls(tuple(own), every, group, std, model.nominal[every])
+        return cls(tuple(own), sized, every, group, std, model.nominal[every])
+
+
+def sized_of(model: Model, free: IntArray) -> IntArray:
+    """Those of the parameters `free` that deviate from nominal by a size that is known, to either
+    side.
+
+    Beside smooth functions these are random as well.  A minimal complete set, the rest held at
+    nominal, fits the poses measured as well, but far from them it goes anywhere: each that is kept
+    stands for all that are not, where these poses cannot tell them apart.  None are where nothing
+    would be left without a prior.
+    """
+    placed, found = is_placed(model), []
+    for c in free[~model.shrunk[free] & ~placed[free]].tolist():
+        p = model.parameters[c]
+        if p.typical is not None and np.isinf([p.lower, p.upper]).all():
+            found.append(c)
+    left = np.setdiff1d(free[~model.shrunk[free]], found)
+    return np.array(found if len(left) else [], dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -461,6 +490,21 @@ def _followed(observed: Observations, group: SmoothGroup) -> Array:
     return np.asarray(table.q[observed.lead, group.joint])
 
 
+def _without(solution: Solution, sized: IntArray) -> Solution:
+    """The solution with these parameters neither free nor chosen among."""
+    problem, r = solution.problem, solution.reduction
+    kept, dropped = ~np.isin(r.kept, sized), ~np.isin(r.dropped, sized)
+    return replace(
+        solution,
+        problem=replace(problem, free=np.setdiff1d(problem.free, sized)),
+        reduction=replace(
+            r, kept=r.kept[kept], dropped=r.dropped[dropped], mixing=r.mixing[kept][:, dropped],
+            invisible=np.setdiff1d(r.invisible, sized),
+            at_bound=np.setdiff1d(r.at_bound, sized),
+        ),
+    )  # fmt: skip
+
+
 class _Course:
     """The fits of one identification, and what they have in common."""
 
@@ -468,7 +512,8 @@ class _Course:
         self, every: Solution, sound: Solution, functions: Functions, options: Options,
         progress: Progress,
     ) -> None:  # fmt: skip
-        self.every, self.sound, self.options = every, sound, options
+        self.every, self.options = every, options
+        self.sound = _without(sound, functions.sized)
         self.functions, self.progress = functions, progress
         self.model, self.observed = every.problem.model, every.problem.observations
         self.harmful: list[str] = []
@@ -642,25 +687,29 @@ class _Course:
         return fit, cross
 
     def without_those_that_harm(self, fit: JointFit, cross: Crossed) -> tuple[JointFit, Crossed]:
-        """Without the functions that the readings do not show, or that predict held-out
-        configurations worse than none; the least supported is tried first."""
-        size, alive = self.observed.size, fit.scales.scale > 0
-        for g in np.argsort(fit.scales.gain):
-            if not alive[g] or fit.scales.gain[g] > CERTAIN:
+        """Without the functions and sized parameters that the readings do not show, or that
+        predict held-out configurations worse than none; the least supported is tried first."""
+        size, gain = self.observed.size, fit.scales.gain
+
+        def left(gone: BoolArray) -> JointFit:
+            scale = np.where(gone, 0.0, fit.scales.scale)
+            return replace(fit, scales=replace(fit.scales, scale=scale))
+
+        gone = (fit.scales.scale <= 0) | (gain <= LEAST_GAIN)
+        if gone.any():
+            cross = crossed(*fit.linear(left(gone).scales, fit.reduction))
+        for g in np.argsort(gain):
+            if gone[g] or gain[g] > CERTAIN:
                 continue
-            scale = np.where(alive, fit.scales.scale, 0.0)
-            scale[g] = 0.0
-            trial, step = fit.linear(replace(fit.scales, scale=scale), fit.reduction)
-            there = crossed(trial, step)
-            shown = fit.scales.gain[g] > LEAST_GAIN
-            if shown and rms_3d(there.held_out, size) > rms_3d(cross.held_out, size):
+            trial = gone.copy()
+            trial[g] = True
+            there = crossed(*fit.linear(left(trial).scales, fit.reduction))
+            if rms_3d(there.held_out, size) > rms_3d(cross.held_out, size):
                 continue
-            if shown:
+            gone, cross = trial, there
+            if g < len(self.functions.groups):
                 self.harmful.append(self.functions.groups[g].name)
-            alive[g], cross = False, there
-            fit = replace(
-                fit, scales=replace(fit.scales, scale=np.where(alive, fit.scales.scale, 0.0))
-            )
+        fit = left(gone)
         if (fit.scales.scale > 0).all():
             return fit, cross
         fit = joint_fit(
@@ -687,7 +736,9 @@ class _Course:
         mixing[:k] = r.mixing
         solution = replace(
             self.sound, problem=fit.problem, fit=found, heldout=cross.held_out,
-            reduction=replace(r, kept=columns, mixing=mixing),
+            reduction=replace(
+                r, kept=columns, mixing=mixing, with_prior=fit.functions.columns
+            ),
             nominal_rms=self.every.nominal_rms,
         )  # fmt: skip
         rows = len(whitened)
@@ -735,9 +786,8 @@ class _Course:
 
     def _warnings(self, fit: JointFit) -> tuple[str, ...]:
         told = []
-        gone = [
-            g.name for g, s in zip(self.functions.groups, fit.scales.scale, strict=True) if s == 0
-        ]
+        scales = fit.scales.scale[: len(self.functions.groups)]
+        gone = [g.name for g, s in zip(self.functions.groups, scales, strict=True) if s == 0]
         unseen = [name for name in gone if name not in self.harmful]
         if unseen:
             told.append(

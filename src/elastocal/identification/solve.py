@@ -55,7 +55,8 @@ class Reduction:
 
     The data determine β_k = X_k + Σ_d mixing[k, d] X_d, the kept parameter with what it stands
     for.  `invisible` are dropped parameters that move no reading at all,
-    `at_bound` those that a bounded fit holds at their bound.
+    `at_bound` those that a bounded fit holds at their bound, `with_prior` those that were no part
+    of this choice: a prior makes up for what the readings do not say of them.
     """
 
     kept: NDArray[np.int64]
@@ -63,6 +64,7 @@ class Reduction:
     mixing: Array
     invisible: NDArray[np.int64]
     at_bound: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    with_prior: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def seen(self, free: IntArray, R: Array, sizes: Array) -> Reduction:
         """Without the kept parameters that move nothing any more, R (…, free) being that of the

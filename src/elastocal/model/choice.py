@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
 
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError
+from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect
@@ -69,23 +72,56 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
 
 
 def check_settings(chain: Chain, cell: Cell) -> None:
-    """InputError where the cell sets what no effect of the catalogue has on this arm."""
-    given = cell.model.nominal.settings
-    if not given:
-        return
+    """InputError where the cell sets, or states the size of, what no effect of the catalogue has
+    on this arm."""
+    nominal = cell.model.nominal
+    if nominal.settings:
+        _check_keys("settings", "setting", nominal.settings, _keys_of_settings, chain, cell)
+    if nominal.sizes:
+        _check_keys("sizes", "parameter", nominal.sizes, _keys_of_sizes, chain, cell)
+
+
+def _keys_of_settings(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
+    return [setting.key for setting in effect.settings(place, chain, cell)]
+
+
+def _keys_of_sizes(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
+    """Shrunk parameters have their size from a setting; an effect that this arm cannot have (masses
+    that nobody stated) has none."""
+    try:
+        return [p.key for p in effect.parameters(place, chain, cell) if not p.shrunk]
+    except InputError:
+        return []
+
+
+def _check_keys(
+    table: str, what: str, given: Mapping[str, Mapping[str, float]],
+    keys_of: Callable[[Effect, str, Chain, Cell], list[str]], chain: Chain, cell: Cell,
+) -> None:  # fmt: skip
+    """InputError where a key of [model.nominal.`table`] is not one that some effect has there."""
     known: dict[str, list[str]] = {}
     for effect in CATALOGUE.values():
         for place in effect.places(chain, cell):
-            keys = [setting.key for setting in effect.settings(place, chain, cell)]
-            if keys:
+            if keys := keys_of(effect, place, chain, cell):
                 known.setdefault(place, []).extend(keys)
     for place, values in given.items():
         if place not in known:
-            raise InputError(_unknown("nominal.settings", "place", place, list(known), cell))
+            raise InputError(_unknown(f"nominal.{table}", "place", place, list(known), cell))
         for key in values:
             if key not in known[place]:
-                what = f"setting of {place}"
-                raise InputError(_unknown("nominal.settings", what, key, known[place], cell))
+                kind = f"{what} of {place}"
+                raise InputError(_unknown(f"nominal.{table}", kind, key, known[place], cell))
+
+
+def sized_parameters(
+    effect: Effect, place: str, chain: Chain, cell: Cell
+) -> tuple[ParameterSpec, ...]:
+    """The effect's parameters at a place, of the typical sizes that the cell states."""
+    stated = cell.model.nominal.sizes.get(place, {})
+    return tuple(
+        replace(p, typical=stated[p.key]) if p.key in stated and not p.shrunk else p
+        for p in effect.parameters(place, chain, cell)
+    )
 
 
 def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[str, ca.SX]:

@@ -16,7 +16,7 @@ from elastocal.measurements import Measurements
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, Parameter, row_inputs
 from elastocal.model.chain import Chain
-from elastocal.model.choice import choose_effects, set_constants
+from elastocal.model.choice import choose_effects, set_constants, sized_parameters
 from elastocal.model.effects.base import Effect
 from elastocal.model.evaluate import BackendReport, BatchFunction, row_blocks
 from elastocal.model.observations import observe
@@ -170,7 +170,7 @@ class SymbolicArm:
         bound = []
         for effect, place in chosen:
             own = set_constants(effect, place, chain, cell)
-            for spec in effect.parameters(place, chain, cell):
+            for spec in sized_parameters(effect, place, chain, cell):
                 own[spec.key] = ca.SX.sym(f"{place}.{spec.key}")
                 symbols.append(own[spec.key])
                 parameters.append(
