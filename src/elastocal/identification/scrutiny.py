@@ -369,7 +369,8 @@ def uncertainty_budget(
         B = fit.model.regressor(table, fit.x, fit.columns).B
         own, at = _spread(B, fit.covariance, size), table.source
     roots = np.sqrt([own, parts.get("visits", 0.0), parts.get("readings", 0.0), lack])
-    return UncertaintyBudget(*(float(v) for v in roots), at)
+    parameters, repeatability, instrument, lack_of_fit = (float(v) for v in roots)
+    return UncertaintyBudget(parameters, repeatability, instrument, lack_of_fit, at)
 
 
 def _spread(B: Array, covariance: Array, size: int) -> float:

@@ -227,7 +227,7 @@ def set_up(
     R = None
     if A is not None:
         weighted = np.sqrt(targets.weight)[:, None, None] * A[0]
-        R = np.linalg.qr(weighted.reshape(-1, len(kept)), mode="r")
+        R = np.asarray(np.linalg.qr(weighted.reshape(-1, len(kept)), mode="r"))
     return Setup(information, found, criterion, prior, warnings, R)
 
 

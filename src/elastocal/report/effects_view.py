@@ -17,7 +17,6 @@ from elastocal.report.effect_names import STAGES, places
 from elastocal.report.formatting import display
 
 
-
 def effect_entries(cell: Cell | str | Path | None = None) -> list[dict[str, Any]]:
     """Per effect, in the catalogue's order: name, stage, what it is, places, parameters.
 
