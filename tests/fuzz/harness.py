@@ -40,7 +40,9 @@ DIRECTIONS = "\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069
 # Folders that a run which fails may leave: tasks that were done, an example half copied.
 KEPT = {"study": ("results", "results.md"), "demo": ("demo_out",)}
 # What a message may name: an option, a parameter or its place, a key.
-NAMED = re.compile(r"argument|--?\w|\bjoint\d|\bmarker\b|\[\w+\]|`\w+`|\bkey\b|\bcolumn\b|'[^']+'")
+NAMED = re.compile(
+    r"argument|--?\w|\bjoint\d|\bmarker\b|\[[\w.]+\]|`\w+`|\bkey\b|\bcolumn\b|'[^']+'"
+)
 
 
 @dataclass
@@ -269,7 +271,8 @@ def _message_complaints(case: Case) -> Iterator[str]:
     message = case.stderr[case.stderr.index(messages[0]) + len(messages[0]) :]
     words = (*case.words, *case.command.line.split(), *case.command.named)
     names = {Path(word).name or "." for word in words}
-    if not (any(repr(name)[1:-1] in message for name in names) or NAMED.search(message)):
+    shown = {name for name in names if name.isprintable()} | {repr(name)[1:-1] for name in names}
+    if not (any(name in message for name in shown) or NAMED.search(message)):
         yield "names no culprit"
 
 
