@@ -7,6 +7,7 @@ between two of them is met, which takes microseconds), or at a byte that is writ
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import resource
@@ -17,6 +18,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from itertools import chain, product
 from pathlib import Path
 from random import Random
 
@@ -34,7 +36,7 @@ def writes(event: str, arguments: tuple[object, ...]) -> bool:
     """Is this event of `sys.audit` an operation on files that writes or moves?"""
     if event != "open":
         return event in OPERATIONS
-    return isinstance(arguments[2], int) and bool(arguments[2] & os.O_WRONLY)
+    return isinstance(arguments[2], int) and bool(arguments[2] & (os.O_WRONLY | os.O_RDWR))
 
 
 def signal_at_operation(number: int, which: int, counted: int | None = None) -> None:
@@ -276,30 +278,38 @@ def _broken(name: str, content: bytes, size: int) -> str | None:
 
 
 def run_kills(
-    base: Path, folder: Path, seed: int, times: dict[str, int], part: slice = slice(None)
-) -> tuple[int, Counter]:
+    base: Path, folder: Path, seed: int, times: dict[str, int], part: slice = slice(None),
+    until: float = math.inf,
+) -> tuple[int, Counter]:  # fmt: skip
     """Do to each verb what `times` says so many times, as HARMS has it; findings are printed.
 
-    A few times are of the verb's first command alone, many are of all.  `part` of them is run.
+    A few times are of the verb's first command alone, many are of all.  `part` of them is run,
+    those that begin before `until` on the monotonic clock.
     """
     broken, tried = 0, Counter[tuple[str, str]]()
-    harms = [(harm, k) for harm, number in times.items() for k in range(number)]
-    for verb in KILLED:
-        commands = [c for c in COMMANDS if c.verb == verb][: 1 + len(harms) // 20]
-        victims = [Victim(c, base, folder / f"kill-{verb}{i}") for i, c in enumerate(commands)]
-        for i, (harm, k) in list(enumerate(harms))[part]:
-            rng, victim = Random(f"{seed} {verb} {harm} {k}"), victims[i % len(victims)]
-            for _ in range(20):  # one that ends before it is killed does not count
-                where, found = HARMS[harm](victim, rng)
-                if found:
-                    broken += 1
-                    told = f"--- {victim.command.line}\n    {where}: {'; '.join(found)}\n"
-                    print(told, flush=True)
-                if harm != "killed" or victim.code < 0:
-                    tried[verb, harm] += 1
-                    break
-        for victim in victims:
-            victim.standing.close()
+    harms = [(k / number, harm, k) for harm, number in times.items() for k in range(number)]
+    victims = {
+        verb: [
+            Victim(c, base, folder / f"kill-{verb}{i}")
+            for i, c in enumerate([c for c in COMMANDS if c.verb == verb][: 1 + len(harms) // 20])
+        ]
+        for verb in KILLED
+    }
+    for (i, (_, harm, k)), verb in product(list(enumerate(sorted(harms)))[part], KILLED):
+        if time.monotonic() > until:
+            break
+        rng, victim = Random(f"{seed} {verb} {harm} {k}"), victims[verb][i % len(victims[verb])]
+        for _ in range(20):  # one that ends before it is killed does not count
+            where, found = HARMS[harm](victim, rng)
+            if found:
+                broken += 1
+                told = f"--- {victim.command.line}\n    {where}: {'; '.join(found)}\n"
+                print(told, flush=True)
+            if harm != "killed" or victim.code < 0:
+                tried[verb, harm] += 1
+                break
+    for victim in chain(*victims.values()):
+        victim.standing.close()
     return broken, tried
 
 
