@@ -88,7 +88,7 @@ def test_what_is_left_out_is_said(campaign, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ([], "needs files"),
+        ([], "the argument FILES is missing"),
         (["points.txt", *PRESETS[:2]], "needs -o data.csv"),
         (["points.txt", "-o", "d.csv"], "needs --map mapping.toml, or --preset"),
         (["points.txt", "-o", "points.txt", *PRESETS[:2]], "read and would be written over"),

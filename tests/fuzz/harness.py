@@ -40,7 +40,9 @@ DIRECTIONS = "\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069
 # Folders that a run which fails may leave: tasks that were done, an example half copied.
 KEPT = {"study": ("results", "results.md"), "demo": ("demo_out",)}
 # What a message may name: an option, a parameter or its place, a key.
-NAMED = re.compile(r"argument|--?\w|\bjoint\d|\bmarker\b|\[\w+\]|`\w+`|\bkey\b|\bcolumn\b|'[^']+'")
+NAMED = re.compile(
+    r"argument|--?\w|\bjoint\d|\bmarker\b|\[[\w.]+\]|`\w+`|\bkey\b|\bcolumn\b|'[^']+'"
+)
 
 
 @dataclass
@@ -135,10 +137,10 @@ def execute(
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # until the command begins
     child = os.fork()
     if child == 0:
-        _child(case, out, err, prepare)
+        be_child(case, out, err, prepare)
     signal.signal(signal.SIGINT, before)
     pressed = None if interrupt is None else begun + interrupt
-    status, usage = _waited(child, begun + longest, pressed)
+    status, usage = waited(child, begun + longest, pressed)
     case.took = time.monotonic() - begun
     case.seconds = usage.ru_utime + usage.ru_stime
     case.resident = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
@@ -148,14 +150,12 @@ def execute(
     return case
 
 
-def _child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) -> None:
+def be_child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) -> None:
     """In the child: the command as a shell would start it; never returns."""
     code = 1
     try:
-        os.setsid()
         os.chdir(case.folder)
-        for number, path in ((1, out), (2, err)):
-            os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+        apart(out, err)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
         sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
@@ -185,8 +185,15 @@ def _child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) -> N
             os._exit(code)
 
 
-def _waited(
-    child: int, deadline: float, interrupt: float | None
+def apart(out: Path, err: Path) -> None:
+    """In a child: a group of processes of its own, and what it tells in files of its own."""
+    os.setsid()
+    for number, path in ((1, out), (2, err)):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+
+
+def waited(
+    child: int, deadline: float, interrupt: float | None = None
 ) -> tuple[int, resource.struct_rusage]:
     pause = 0.002
     while True:
@@ -269,7 +276,8 @@ def _message_complaints(case: Case) -> Iterator[str]:
     message = case.stderr[case.stderr.index(messages[0]) + len(messages[0]) :]
     words = (*case.words, *case.command.line.split(), *case.command.named)
     names = {Path(word).name or "." for word in words}
-    if not (any(repr(name)[1:-1] in message for name in names) or NAMED.search(message)):
+    shown = {name for name in names if name.isprintable()} | {repr(name)[1:-1] for name in names}
+    if not (any(name in message for name in shown) or NAMED.search(message)):
         yield "names no culprit"
 
 

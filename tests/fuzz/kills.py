@@ -6,6 +6,8 @@ between two of them is met, which takes microseconds), or at a byte that is writ
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import re
 import resource
@@ -13,13 +15,15 @@ import shlex
 import shutil
 import signal
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from itertools import chain, product
 from pathlib import Path
 from random import Random
 
 from fuzz.campaign import COMMANDS, Command
-from fuzz.harness import OLD, Case, execute, malformed, seen
+from fuzz.harness import OLD, WALL, Case, apart, be_child, execute, malformed, seen, waited
 
 OPERATIONS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "shutil.rmtree")
 # What a killed run may leave for the next one to go on from, or to sweep up.
@@ -28,24 +32,37 @@ INTERRUPTED = 128 + signal.SIGINT
 KILLED = ("identify", "design", "diagnose", "simulate", "export", "study")
 
 
-def kill_at_operation(
-    number: int, counted: Path | None = None, by: signal.Signals = signal.SIGKILL
-) -> None:
-    """A signal before the `number`-th operation on files of this process that writes or moves."""
-    left = [number]
+def writes(event: str, arguments: tuple[object, ...]) -> bool:
+    """Is this event of `sys.audit` an operation on files that writes or moves?"""
+    if event != "open":
+        return event in OPERATIONS
+    return isinstance(arguments[2], int) and bool(arguments[2] & (os.O_WRONLY | os.O_RDWR))
+
+
+def signal_at_operation(number: int, which: int, counted: int | None = None) -> None:
+    """A signal to this process before the `number`-th operation on files from now on; those that
+    were are counted in the file of the descriptor `counted`."""
+    done = [0]
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:
-        if event not in OPERATIONS:
-            return
-        if event == "open" and not (isinstance(arguments[2], int) and arguments[2] & os.O_WRONLY):
-            return
-        left[0] -= 1
-        if left[0] == 0:
-            os.kill(os.getpid(), by)
-        if counted is not None:
-            counted.write_text(str(number - left[0])) if event != "open" else None
+        if writes(event, arguments):
+            done[0] += 1
+            if done[0] == number:
+                os.kill(os.getpid(), which)
+            if counted is not None:
+                os.pwrite(counted, b"%d" % done[0], 0)
 
     sys.addaudithook(hook)
+
+
+def draw_nothing() -> None:
+    """Pictures are most of what a report costs, and nothing of it is about files."""
+    from elastocal.report import figures
+
+    drawn = figures.drawn
+    for module in list(sys.modules.values()):
+        if getattr(module, "drawn", None) is drawn:
+            module.drawn = lambda *_, **__: "<svg/>"
 
 
 def full_disk(number: int, kill: bool = False) -> None:
@@ -55,6 +72,67 @@ def full_disk(number: int, kill: bool = False) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (number, number))
 
 
+class Standing:
+    """A run of a command that stands before its first operation on files.
+
+    What stands there is forked for each kill, so that the computation is done once for all of
+    them.  Requests and answers go through pipes, as JSON.
+    """
+
+    def __init__(self, case: Case) -> None:
+        asked, self._ask = os.pipe()
+        self._answered, answers = os.pipe()
+        self._out, self._err = (case.folder.parent / name for name in ("stdout2", "stderr2"))
+        sys.stdout.flush(), sys.stderr.flush()
+        self._child = os.fork()
+        if self._child == 0:
+            os.close(self._ask)
+            be_child(case, self._out, self._err, lambda: self._stand(asked, answers))
+        os.close(asked), os.close(answers)
+
+    def _stand(self, asked: int, answers: int) -> None:
+        draw_nothing()
+        stood: list[bool] = []
+
+        def hook(event: str, arguments: tuple[object, ...]) -> None:
+            if not stood and writes(event, arguments):
+                stood.append(True)
+                self._serve(asked, answers)
+
+        sys.addaudithook(hook)
+
+    def _serve(self, asked: int, answers: int) -> None:
+        """Fork for every request; returns in the forks alone."""
+        while request := os.read(asked, 4096):
+            how, number, which = json.loads(request)
+            child = os.fork()
+            if child == 0:
+                apart(self._out, self._err)
+                if how == "byte":
+                    full_disk(number, bool(which))
+                elif number == 1:
+                    os.kill(os.getpid(), which)
+                else:
+                    signal_at_operation(number - 1, which)
+                return
+            status, _ = waited(child, time.monotonic() + WALL)
+            os.write(answers, json.dumps(status).encode())
+        os._exit(0)
+
+    def go_on(self, case: Case, how: str, number: int, which: int) -> Case:
+        """A fork of the run with a signal `which` before an operation on files, or, with `how`
+        "byte", a disk that is full at it; it dies of that where `which` is not 0."""
+        os.write(self._ask, json.dumps([how, number, which]).encode())
+        case.code = os.waitstatus_to_exitcode(json.loads(os.read(self._answered, 4096)))
+        case.stderr = self._err.read_text(encoding="utf-8", errors="surrogateescape")
+        return case
+
+    def close(self) -> None:
+        os.close(self._ask), os.close(self._answered)
+        os.kill(self._child, signal.SIGKILL)
+        os.waitpid(self._child, 0)
+
+
 class Victim:
     """A command with a campaign of its own, and what it does where nobody kills it."""
 
@@ -62,19 +140,26 @@ class Victim:
         self.command, self.folder = command, folder / "a"
         shutil.copytree(base, self.folder)
         self.inputs = seen(self.folder)
-        counter = folder / "count"
-        whole = self.run(lambda: kill_at_operation(10**9, counter))
+        counter = os.open(folder / "count", os.O_RDWR | os.O_CREAT)
+        whole = self.run(lambda: signal_at_operation(0, 0, counter))
         if whole.code:
             raise RuntimeError(f"the command itself fails: {whole.told()}")
         after = seen(self.folder)
-        self.took = whole.took
+        self.took, self.code = whole.took, 0
         self.sizes = {name: len(after[name] or b"") for name in command.outputs if name in after}
-        self.operations = int(counter.read_text())
+        self.operations = int(os.pread(counter, 99, 0))
+        os.close(counter)
         self.restore()
+        self.standing = Standing(self.case())
+
+    def case(self) -> Case:
+        return Case(0, self.command, shlex.split(self.command.line), "", self.folder)
 
     def run(self, prepare: Callable[[], object] = lambda: None, **when: float) -> Case:
-        case = Case(0, self.command, shlex.split(self.command.line), "", self.folder)
-        return execute(case, prepare, **when)
+        return execute(self.case(), lambda: (draw_nothing(), prepare()), **when)
+
+    def go_on(self, how: str, number: int, which: int) -> Case:
+        return self.standing.go_on(self.case(), how, number, which)
 
     def restore(self) -> None:
         """The inputs as they were, and an old file under every output's name."""
@@ -106,15 +191,16 @@ class Victim:
         how = rng.randrange(3)
         if how == 0:
             where = f"after {(longest := rng.uniform(0, self.took)):.3f} s"
-            self.run(longest=longest)
+            case = self.run(longest=longest)
         elif how == 1:
             number = rng.randint(1, self.operations)
             where = f"at operation {number} of {self.operations} on files"
-            self.run(lambda: kill_at_operation(number))
+            case = self.go_on("operation", number, signal.SIGKILL)
         else:
             number = rng.randrange(max(self.sizes.values(), default=3000))
             where = f"at byte {number} of a file"
-            self.run(lambda: full_disk(number, kill=True))
+            case = self.go_on("byte", number, signal.SIGXFSZ)
+        self.code = case.code
         found = list(self.wrong())
         if rng.random() < 0.1:
             again = self.run()
@@ -134,7 +220,7 @@ class Victim:
         else:
             number = rng.randint(1, self.operations)
             where = f"Ctrl-C at operation {number} of {self.operations} on files"
-            case = self.run(lambda: kill_at_operation(number, by=signal.SIGINT))
+            case = self.go_on("operation", number, signal.SIGINT)
         found, there = list(self.wrong()), seen(self.folder)
         new = [n for n in self.command.outputs if there.get(n) != OLD]
         messages = [line for line in case.stderr.splitlines() if line.startswith("elastocal: ")]
@@ -159,7 +245,7 @@ class Victim:
         """One run on a disk that is full at a byte of `rng`: a message, and nothing has changed."""
         # Room for the message at least, which goes to a file here.
         number = rng.randrange(2000, max([6000, *self.sizes.values()]))
-        case = self.run(lambda: full_disk(number))
+        case = self.go_on("byte", number, 0)
         found = list(self.wrong())
         there = seen(self.folder)
         new = [n for n in self.command.outputs if there.get(n) != OLD]
@@ -192,24 +278,38 @@ def _broken(name: str, content: bytes, size: int) -> str | None:
 
 
 def run_kills(
-    base: Path, folder: Path, seed: int, times: dict[str, int], part: slice = slice(None)
-) -> tuple[int, Counter]:
+    base: Path, folder: Path, seed: int, times: dict[str, int], part: slice = slice(None),
+    until: float = math.inf,
+) -> tuple[int, Counter]:  # fmt: skip
     """Do to each verb what `times` says so many times, as HARMS has it; findings are printed.
 
-    A few times are of the verb's first command alone, many are of all.  `part` of them is run.
+    A few times are of the verb's first command alone, many are of all.  `part` of them is run,
+    those that begin before `until` on the monotonic clock.
     """
     broken, tried = 0, Counter[tuple[str, str]]()
-    harms = [(harm, k) for harm, number in times.items() for k in range(number)]
-    for verb in KILLED:
-        commands = [c for c in COMMANDS if c.verb == verb][: 1 + len(harms) // 20]
-        victims = [Victim(c, base, folder / f"kill-{verb}{i}") for i, c in enumerate(commands)]
-        for i, (harm, k) in list(enumerate(harms))[part]:
-            rng, victim = Random(f"{seed} {verb} {harm} {k}"), victims[i % len(victims)]
+    harms = [(k / number, harm, k) for harm, number in times.items() for k in range(number)]
+    victims = {
+        verb: [
+            Victim(c, base, folder / f"kill-{verb}{i}")
+            for i, c in enumerate([c for c in COMMANDS if c.verb == verb][: 1 + len(harms) // 20])
+        ]
+        for verb in KILLED
+    }
+    for (i, (_, harm, k)), verb in product(list(enumerate(sorted(harms)))[part], KILLED):
+        if time.monotonic() > until:
+            break
+        rng, victim = Random(f"{seed} {verb} {harm} {k}"), victims[verb][i % len(victims[verb])]
+        for _ in range(20):  # one that ends before it is killed does not count
             where, found = HARMS[harm](victim, rng)
-            tried[verb, harm] += 1
             if found:
                 broken += 1
-                print(f"--- {victim.command.line}\n    {where}: {'; '.join(found)}\n", flush=True)
+                told = f"--- {victim.command.line}\n    {where}: {'; '.join(found)}\n"
+                print(told, flush=True)
+            if harm != "killed" or victim.code < 0:
+                tried[verb, harm] += 1
+                break
+    for victim in chain(*victims.values()):
+        victim.standing.close()
     return broken, tried
 
 

@@ -38,6 +38,10 @@ def main() -> int:
     parser.add_argument("--interrupts", type=int, default=0, help="Ctrl-C in each so many times")
     parser.add_argument("--jobs", type=int, default=1, help="processes that share the work")
     parser.add_argument("--write", type=Path, help="page whose table this run replaces")
+    parser.add_argument("--record", type=Path, help="keep what was tried in this file")
+    parser.add_argument(
+        "--add", type=Path, action="append", default=[], help="add such a file; repeatable"
+    )
     parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-"))
@@ -61,14 +65,19 @@ def main() -> int:
         if part is not None:
             tally.add(pickle.loads((folder / f"part{part}").read_bytes()))
     shutil.rmtree(folder, ignore_errors=True)
-    print(tally.table())
-    print(tally.sentence(asked.seed, time.monotonic() - begun))
+    if tally.count:
+        tally.close(asked.seed, time.monotonic() - begun)
+    if asked.record is not None:
+        asked.record.write_bytes(pickle.dumps(tally))
+    for path in asked.add:
+        tally.add(pickle.loads(path.read_bytes()))
+    told = "\n\n".join((tally.table(), *tally.runs))
+    print(told)
     if asked.write is not None:
-        told = f"{tally.table()}\n\n{tally.sentence(asked.seed, time.monotonic() - begun)}\n"
         page = asked.write.read_text(encoding="utf-8")
         before, rest = page.split(f"{BEGIN}\n")
         _, after = rest.split(END)
-        asked.write.write_text(f"{before}{BEGIN}\n\n{told}\n{END}{after}", encoding="utf-8")
+        asked.write.write_text(f"{before}{BEGIN}\n\n{told}\n\n{END}{after}", encoding="utf-8")
     return int(bool(tally.broken))
 
 
@@ -90,7 +99,7 @@ def fork(asked: argparse.Namespace, base: Path, folder: Path, part: int) -> int:
         }  # fmt: skip
         if any(times.values()):
             own, share = folder / f"kills{part}", slice(part, None, asked.jobs)
-            found, tried = kills.run_kills(base, own, asked.seed, times, share)
+            found, tried = kills.run_kills(base, own, asked.seed, times, share, until)
             tally.count.update(tried)
             tally.broken += found
         (folder / f"part{part}").write_bytes(pickle.dumps(tally))
@@ -108,6 +117,7 @@ class Tally:
     def __init__(self) -> None:
         self.count: Counter[tuple[str, str]] = Counter()
         self.broken, self.slowest, self.largest = 0, 0.0, 0
+        self.runs: list[str] = []
 
     def take(self, case: harness.Case) -> None:
         self.count[case.command.verb, f"exit {case.code}"] += 1
@@ -118,8 +128,9 @@ class Tally:
             print(case.told(), flush=True)
 
     def add(self, other: Tally) -> None:
-        """What another process has tried."""
+        """What another process or run has tried."""
         self.count += other.count
+        self.runs += other.runs
         self.broken += other.broken
         self.slowest = max(self.slowest, other.slowest)
         self.largest = max(self.largest, other.largest)
@@ -133,15 +144,18 @@ class Tally:
             rows.append(f"| `{verb}` | " + " | ".join(str(n or "") for n in numbers) + " |")
         return "\n".join(rows)
 
-    def sentence(self, seed: int, seconds: float) -> str:
+    def close(self, seed: int, seconds: float) -> None:
+        """Say what this run was."""
         cases = sum(n for (_, how), n in self.count.items() if how.startswith("exit"))
         others = self.count.total() - cases
-        return (
-            f"{cases} cases from {seed} on, {others} kills, interrupts and full disks, with Python "
-            f"{platform.python_version()}: {self.broken} with a finding. Slowest case "
-            f"{self.slowest:.1f} s of processor time, largest {self.largest / 1e6:.0f} MB; "
-            f"{seconds:.0f} s in all."
-        )
+        told = [f"{cases} cases from {seed} on"] * bool(cases)
+        told += [f"{others} kills, interrupts and full disks (seed {seed})"] * bool(others)
+        found = f"{', '.join(told)}, with Python {platform.python_version()}: {self.broken} with a "
+        found += f"finding; {seconds:.0f} s in all."
+        if cases:
+            found += f" Slowest case {self.slowest:.1f} s of processor time, "
+            found += f"largest {self.largest / 1e6:.0f} MB."
+        self.runs.append(found)
 
 
 if __name__ == "__main__":

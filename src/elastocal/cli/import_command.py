@@ -71,7 +71,9 @@ def import_(
         say(preset_text(show_preset), end="")
         return
     paths = list(files or ())
-    require(bool(paths), "import needs files: the tracker's export, and the log of the joints")
+    require(
+        bool(paths), "the argument FILES is missing: the tracker's export, and the log of the joints"
+    )
     require(
         output is not None or preview or as_json,
         "import needs -o data.csv to write to, or --preview to only look",

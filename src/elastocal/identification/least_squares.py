@@ -294,7 +294,10 @@ def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
     start = np.clip(np.zeros(len(problem.columns)), lower, upper)
     if not np.isfinite(residual(start)).all():
         regression_at(start)  # names the row
-        raise ElastocalError("the model has no finite prediction at the start values")
+        raise ElastocalError(
+            f"{observed.table.source}: the model predicts no finite numbers at the start "
+            "values; look in the cell for a length, force or compliance far too large"
+        )
     found = least_squares(
         residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
         ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
