@@ -51,7 +51,7 @@ NUMBERED = re.compile(r"(q|torque_|approach_)([1-9][0-9]{0,3})(_[a-zA-Z]+)?", re
 PLANS = ("plan", "targets")
 PLAN_ONLY = ("level", "order")
 # What `compensate` writes beside its commands, which are a plan too.
-BESIDE_COMMANDS = ("correction_", "error_", "std_", "status")
+BESIDE_COMMANDS = ("correction_", "error_", "std_", "within95_", "status")
 # In the order in which they are written.
 NUMBERS = (
     "repeat", "q", "force", "position", "rotation", "distance", "torque", "sigma", "time",

@@ -234,10 +234,11 @@ def _uncertainty(
 ) -> Uncertainty:
     n = len(q)
     covariance, unknown = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
+    total = covariance.copy()
     good = np.flatnonzero(reached)
     found = uncertainty_at(tool, [values[good] for values in rows], q[good], rows, seed)
-    covariance[good], unknown[good] = found.covariance, found.unknown
-    return Uncertainty(covariance, unknown, found.blamed)
+    covariance[good], total[good], unknown[good] = found.covariance, found.total, found.unknown
+    return Uncertainty(covariance, total, unknown, found.blamed)
 
 
 # Sentences about commands that are right but that somebody should look at.
@@ -447,7 +448,8 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
     if result.goals.rotation is not None:
         heads = ["error_rotation_before_urad", "error_rotation_after_urad"]
         blocks.append((heads, result.turn * 1e6, ".4g"))
-    blocks.append((["std_um"], result.uncertainty.std[:, None] * 1e6, ".4g"))
+    sure = np.column_stack([result.uncertainty.std, result.uncertainty.within]) * 1e6
+    blocks.append((["std_um", "within95_um"], sure, ".4g"))
     header = ["configuration", *(h for heads, _, _ in blocks for h in heads), "status"]
     rows = []
     for i in range(len(table)):
@@ -475,6 +477,7 @@ def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[
         "error_before_um": spread(result.before[good]),
         "error_after_um": spread(result.after[good]),
         "std_um": spread(result.uncertainty.std[good]),
+        "within95_um": spread(result.uncertainty.within[good]),
         "largest_correction": dict(
             zip(names, plain(np.abs(change[good]).max(axis=0, initial=-np.inf)), strict=True)
         ),

@@ -48,7 +48,8 @@ SENSITIVITIES = 5000  # rows at a time, which bounds the memory
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """`covariance` (n, 3, 3) m² of the position in the data's frame.
+    """`covariance` (n, 3, 3) m² of the position in the data's frame; `total` (n, 3, 3) with
+    parameters left open and lack of fit.
 
     `unknown` (n,) m: what typical deviations of the parameters that the data do not determine
     would move the tool by, which the covariance does not hold; `blamed` names those parameters,
@@ -56,8 +57,14 @@ class Uncertainty:
     """
 
     covariance: Array
+    total: Array
     unknown: Array
     blamed: tuple[str, ...]
+
+    @property
+    def within(self) -> Array:
+        """(n,) m: longest half axis of the ellipsoid that holds the tool with 95 % probability."""
+        return half_axes(self.total)[:, 0]
 
     @property
     def std(self) -> Array:
@@ -83,12 +90,14 @@ def uncertainty_at(
         known.append(at[0] @ arm.covariance @ at[0].transpose(0, 2, 1))
         off.append(at[1])
     if not off:
-        return Uncertainty(np.zeros((0, 3, 3)), np.zeros(0), ())
+        return Uncertainty(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0), ())
     covariance, move = np.concatenate(known), np.concatenate(off)
     if not arm.determined:  # nothing known is no certainty
         covariance = np.full((len(q), 3, 3), np.nan)
+    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     return Uncertainty(
-        (covariance + covariance.transpose(0, 2, 1)) / 2,
+        covariance,
+        covariance + move @ move.transpose(0, 2, 1) + arm.lacking**2 / 3 * np.eye(3),
         np.sqrt((move**2).sum(axis=(1, 2))),
         _blamed(left, (move**2).sum(axis=1).mean(axis=0)),
     )
@@ -230,9 +239,7 @@ class Position:
     def half_axes(self, level: float = 0.95, visit: bool = False) -> Array:
         """Half axes (n, 3), the longest first, of the ellipsoid that holds the tool with
         probability `level`: √(χ²₃(level) λ) of the eigenvalues λ; with `visit` at one visit."""
-        total = self.covariance + (self.visit if visit else 0.0)
-        size = np.maximum(np.linalg.eigvalsh(total)[:, ::-1], 0.0)
-        return np.asarray(np.sqrt(stats.chi2.ppf(level, 3) * size))
+        return half_axes(self.covariance + (self.visit if visit else 0.0), level)
 
     def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
         """Whether the regions of that `level` hold the places (n, 3)."""
@@ -242,24 +249,25 @@ class Position:
         return np.asarray(distance <= stats.chi2.ppf(level, 3))
 
 
-def position_at(
-    tool: CalibratedTool, table: Measurements, q: Array, lacking: float, scatter: Scatter
-) -> Position:
+def half_axes(covariance: Array, level: float = 0.95) -> Array:
+    """(n, 3) m, the longest first: √(χ²₃(level) λ) of the eigenvalues λ; NaN where unknown."""
+    size = np.full(covariance.shape[:2], np.nan)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    size[known] = np.maximum(np.linalg.eigvalsh(covariance[known])[:, ::-1], 0.0)
+    return np.asarray(np.sqrt(stats.chi2.ppf(level, 3) * size))
+
+
+def position_at(tool: CalibratedTool, table: Measurements, q: Array, scatter: Scatter) -> Position:
     """The tool's position at joints q (n, joints) in the circumstances of the table (n,).
 
-    `lacking` (m): 3-D rms of what the model lacks.  NaN where there is no static equilibrium.
+    NaN where there is no static equilibrium.
     """
     rows = tool.rows(table)
     found = uncertainty_at(tool, rows, q, rows)
     place = tool.poses(rows, q)[0]
-    left = tool.calibrated.left
-    covariance = found.covariance + lacking**2 / 3 * np.eye(3)
-    if left is not None:
-        off = _moves(tool.calibrated, left, tool.sensitivity(rows, q))[1]
-        covariance = covariance + off @ off.transpose(0, 2, 1)
     J = tool.errors(rows, q, place, None)[1]
     visit = (J * scatter.joints**2) @ J.transpose(0, 2, 1) + scatter.common**2 * np.eye(3)
-    return Position(place, covariance, visit)
+    return Position(place, found.total, visit)
 
 
 @dataclass(frozen=True)

@@ -436,6 +436,7 @@ class Calibration(Result):
             self.observations.table.source,
             tuple(_estimate_json(e) for e in self.estimates),
             self.left,
+            0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean())),
         )
 
     @cached_property
@@ -472,9 +473,8 @@ class Calibration(Result):
         model = self.model
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
         table = model.table(q, load)
-        lacking = 0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean()))
         scatter = scatter_of(self.noise, model.chain.n_joints)
-        return position_at(tool, table, table.q, lacking, scatter)
+        return position_at(tool, table, table.q, scatter)
 
     def combination(self, first: str) -> Combination:
         """The combination whose first member is `first`; UnknownNameError where there is none."""

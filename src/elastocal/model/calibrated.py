@@ -69,6 +69,7 @@ class CalibratedArm(Saved):
         source: What it came from: the result file, or the table it was identified with.
         entries: What identify says of each parameter, as in its JSON, in the model's order.
         left: The parameters that the data left open; None in results that do not say.
+        lacking: 3-D rms in m of what the model may lack, as far as the readings told.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -85,6 +86,7 @@ class CalibratedArm(Saved):
     source: str
     entries: tuple[Mapping[str, Any], ...] = ()
     left: OpenParameters | None = None
+    lacking: float = 0.0
 
     def __repr__(self) -> str:
         return (
@@ -141,6 +143,7 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
         arm.source,
         tuple(entries[name] for name in rest.names if name in entries),
         None if arm.left is None else replace(arm.left, mixing=arm.left.mixing[kept]),
+        arm.lacking,
     ), tuple(gone)  # fmt: skip
 
 
@@ -184,6 +187,7 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
         str(result_path),
         tuple(entries[name] for name in model.names),
         _left_open(result.get("open"), held, determined, result_path),
+        _lacking(result.get("predicted_new_poses_um")),
     )
 
 
@@ -292,6 +296,12 @@ def _left_open(
             "open; write the result anew with identify"
         )
     return OpenParameters(names, mixing, typical, tuple(map(str, stated.get("redundant", []))))
+
+
+def _lacking(predicted: Any) -> float:
+    """What the result says that the model may lack, in m; 0 where it says nothing."""
+    found = predicted.get("lack_of_fit") if isinstance(predicted, dict) else None
+    return found * 1e-6 if isinstance(found, int | float) and np.isfinite(found) else 0.0
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:

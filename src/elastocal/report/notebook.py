@@ -356,6 +356,7 @@ def _compensation_html(c: Compensation) -> str:
             ("nominal command", "error_before_um"),
             ("new command", "error_after_um"),
             ("standard uncertainty", "std_um"),
+            ("within, at 95 %", "within95_um"),
         )
     ]
     frame = _commands(c)

@@ -329,6 +329,7 @@ def print_compensation(console: Console, content: dict[str, Any]) -> None:
             "nominal command": commands["error_before_um"],
             "new command": commands["error_after_um"],
             "standard uncertainty": commands["std_um"],
+            "within, at 95 %": commands["within95_um"],
         }
         _print_spreads(console, "Position of the tool, predicted", rows)
         for k, command in enumerate(commands.get("commands", ())):
