@@ -318,7 +318,8 @@ class Calibration(Result):
         too large to look again.
 
         Examples:
-            >>> strongest = max(ec.identify("cell.toml", "data.csv").influence(), key=lambda c: c.cook)
+            >>> found = ec.identify("cell.toml", "data.csv").influence()
+            >>> strongest = max(found, key=lambda c: c.cook)
             >>> strongest.configuration, strongest.leverage, strongest.moved
             ('...', 1..., 'joint...')
         """
