@@ -402,8 +402,8 @@ class Calibration(Result):
         too large to look again.
 
         Examples:
-            >>> fit = ec.identify("cell.toml", "data.csv")
-            >>> strongest = max(fit.influence(), key=lambda c: c.cook)
+            >>> found = ec.identify("cell.toml", "data.csv").influence()
+            >>> strongest = max(found, key=lambda c: c.cook)
             >>> strongest.configuration, strongest.leverage, strongest.moved
             ('...', 1..., 'joint...')
         """
