@@ -35,9 +35,7 @@ def test_both_files_loaded_in_mujoco_differ_by_the_calibration(robot, tmp_path):
     q = poses_of(calibrated, 20, seed=3)
     assert np.abs(flanges(arm.chain, q) - flanges(expected, q)).max() < 1e-9
     # And by MuJoCo alone, where it was wrong by millimetres before.
-    model, data = (lambda m: (m, mujoco.MjData(m)))(
-        mujoco.MjModel.from_xml_string(done.text)
-    )
+    model, data = (lambda m: (m, mujoco.MjData(m)))(mujoco.MjModel.from_xml_string(done.text))
     data.qpos[[model.jnt_qposadr[j] for j in arm.joints]] = q[0]
     mujoco.mj_kinematics(model, data)
     T = np.eye(4) if arm.base == 0 else arm.placed(arm.base)

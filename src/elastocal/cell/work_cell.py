@@ -69,7 +69,9 @@ class Cell:
     name: str = keyed("a text", form=Text)
     path: File | None = None
     robot: Robot = keyed(
-        'a table with urdf = "arm.urdf", mjcf = "arm.xml" or dh = "dh.csv"', required=True, default_factory=Robot
+        'a table with urdf = "arm.urdf", mjcf = "arm.xml" or dh = "dh.csv"',
+        required=True,
+        default_factory=Robot,
     )
     tool: Tool = keyed("a table", default_factory=Tool)
     tracker: Tracker = keyed("a table", default_factory=Tracker)

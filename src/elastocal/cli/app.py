@@ -212,7 +212,13 @@ def files_of(cell: Cell) -> list[Path]:
 
     robot, targets = cell.robot, cell.design.test_path
     solids = [*cell.workspace.obstacles, *(body.solid for body in cell.workspace.bodies)]
-    named = [robot.urdf, robot.mjcf, robot.dh, robot.masses, None if targets is None else targets.file]
+    named = [
+        robot.urdf,
+        robot.mjcf,
+        robot.dh,
+        robot.masses,
+        None if targets is None else targets.file,
+    ]
     named += [solid.mesh for solid in solids]
     named += [Path(name) for name in cell.plugins if is_plugin_file(name)]
     return [path for path in named if path is not None]

@@ -277,7 +277,9 @@ def check_rest(
 ) -> float:
     """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
 
-    `T_world_base` (4, 4) in the MJCF; `names` of the sites of `pieces.points`.  Raises InputError where MuJoCo is not installed, ElastocalError where they differ.
+    `T_world_base` (4, 4) in the MJCF; `names` of the sites of `pieces.points`.
+
+    Raises InputError where MuJoCo is not installed, ElastocalError where they differ.
     """
     arm = MujocoRest(mjcf)
     part, force = kept.exported, kept.conditions.force
@@ -452,9 +454,7 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     return text, distance, "MuJoCo, at rest under the load", warnings, None
 
 
-def _corrected(
-    calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
-) -> Written:
+def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
     """The user's own MJCF; raises NotInPlace where it cannot take the corrections."""
     cell = calibrated.model.cell
     if wish.frames.base:

@@ -171,9 +171,7 @@ def _check_located(arm: MjcfArm, text: MjcfText) -> None:
             raise NotInPlace(f"joints of body '{names[body]}' stand in a <frame>")
 
 
-def _correct_joint(
-    arm: MjcfArm, text: MjcfText, pieces: ExportNumbers, i: int, j: int
-) -> None:
+def _correct_joint(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers, i: int, j: int) -> None:
     correction = pieces.offset_motion(i)
     if i > 0:
         correction = error_of_link(pieces, i - 1) @ correction
@@ -389,7 +387,9 @@ def held_arm(text: str, robot: Robot, pieces: ExportNumbers) -> tuple[Any, Array
             spec.delete(joint)
     flange = next(body for body in spec.bodies if body.id == arm.flange)
     names = [f"{HELD}{k}" for k in range(len(pieces.points))]
-    for name, point in zip([*names, f"{HELD}load"], [*pieces.points, pieces.load_point], strict=True):
+    for name, point in zip(
+        [*names, f"{HELD}load"], [*pieces.points, pieces.load_point], strict=True
+    ):
         site = flange.add_site(name=name, pos=(arm.flange_in_body @ [*point, 1.0])[:3])
         site.material = ""  # which the file's defaults may give it
     spec.option.gravity = model.opt.gravity if pieces.masses else np.zeros(3)
