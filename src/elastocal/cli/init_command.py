@@ -46,7 +46,8 @@ def init(
         say(f"The flange is '{cell.robot.flange}'; --flange names another.")
     say("Replace what is marked as a guess. It runs as it is:")
     say(f"  elastocal design {output} -o plan.csv --effort quick")
-    load = " ".join(f"{v:g}" for v in cell.design.loads[-1])
+    loads = cell.design.loads
+    load = " ".join(f"{v:g}" for v in loads[-1]) if loads is not None else "0 0 -100"
     say(f"  elastocal simulate {output} plan.csv -o data.csv --draw 1 --load {load}")
 
 
