@@ -25,7 +25,7 @@ from scipy import stats
 
 from elastocal.above import Result
 from elastocal.cell.arm_description import Tool
-from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.errors import InputError, InsufficientDataError, computing, option, require
 from elastocal.export.exportable import Conditions, Valued, keep, random_table
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
@@ -36,6 +36,7 @@ from elastocal.units import Array
 SCHEMA = "elastocal/comparison/1"
 LEVEL = 0.05  # chance that anything is called changed where nothing is
 SAME_SPACE = 1e-6  # of a column of B that others should hold
+RANK = 1e-9
 CENTRAL = 0.95
 POINT = "tool"
 
@@ -71,7 +72,11 @@ class Comparison(Result):
         place: (poses, 3) m: where the point is, in the data's frame of the old campaign.
         force: (3,) N that acts at these poses.
         first_order: Whether the new parameters were told in those of the old.
-        left_out: Parameters of the arm that one campaign alone determines.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv")
+        >>> ec.compare(fit, fit)
+        <Comparison kuka_kr270_2: 0 of 9 parameters changed, p = 1>
     """
 
     old: CalibratedArm
@@ -84,7 +89,6 @@ class Comparison(Result):
     place: Array
     force: Array
     first_order: bool
-    left_out: tuple[str, ...]
 
     @property
     def changed(self) -> list[Change]:
@@ -123,7 +127,6 @@ class Comparison(Result):
             "family": "Holm over the parameters",
             "changed": [c.name for c in self.changed],
             "parameters": [vars(c) for c in self.changes],
-            "left_out": list(self.left_out),
             "first_order": self.first_order,
             "tool": {
                 "poses": len(far),
@@ -168,11 +171,12 @@ def compare(
             "both with the same effects, from poses that show them"
         )
     tool = _tool_model(before.model)
+    at_tool = replace(table, marker=np.zeros_like(table.marker), marker_names=(POINT,))
     x = _values(tool, before.values)
-    here = _positions(tool, table, x)
+    here = _positions(tool, at_tool, x)
     # The set-up of the old campaign for both.
     set_up = {name: value for name, value in before.values.items() if name not in own}
-    there = _positions(tool, table, _values(tool, after.values | set_up))
+    there = _positions(tool, at_tool, _values(tool, after.values | set_up))
     settled = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
     if not settled.any():
         raise InsufficientDataError(
@@ -180,14 +184,13 @@ def compare(
             f"{option('load')}"
         )
     columns = np.array([tool.names.index(name) for name in names])
-    rows = table.take(np.flatnonzero(settled))
+    rows = at_tool.take(np.flatnonzero(settled))
     B = tool.regressor(_measured(rows), x, columns).B.reshape(len(rows.q), 3, len(names))
     chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V, B))
     changes, p = _tested(old, new, names, z, V, level, np.sqrt((B**2).sum(axis=1).mean(axis=0)))
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
         conditions.force, first_order,
-        tuple(sorted(set(determined[0]).symmetric_difference(determined[1]) - set(names))),
     )  # fmt: skip
 
 
@@ -258,24 +261,40 @@ def _difference(
         tables = [replace(t, marker_names=marked) for t in tables]
     B = np.vstack([before.model.regressor(_measured(t), x).B for t in tables])
     index = {name: k for k, name in enumerate(before.model.names)}
-    chosen = B[:, [index[n] for n in known]]
-    scale = np.linalg.norm(chosen, axis=0)
-    scale[scale == 0] = 1.0
-    onto = np.linalg.pinv(chosen / scale, rcond=1e-9) / scale[:, None] @ B
-    rest = np.linalg.norm(B - chosen @ onto, axis=0) / np.maximum(np.linalg.norm(B, axis=0), 1e-300)
-    hidden = [n for n in before.model.names if n in new.determined and rest[index[n]] > SAME_SPACE]
-    if hidden:
-        raise InputError(
-            f"{old.source} does not determine what {new.source} does: {', '.join(hidden[:4])}"
-            f"{' …' if len(hidden) > 4 else ''}; identify both with the same parameters held "
-            f"({option('fixed')}), or measure the poses of one in the other too"
-        )
-    d = after.x - before.x
+    onto = _spanned(B, before.model.names, known, old, new)
     fitted = [n for n in before.model.names if n in new.determined]
+    _spanned(B, before.model.names, fitted, new, old)
+    d = after.x - before.x
     M = onto[:, [index[n] for n in fitted]]
     V = _covariance(old, known) + M @ _covariance(new, fitted) @ M.T
     arms = [k for k, n in enumerate(known) if n in own]
     return [known[k] for k in arms], (onto @ d)[arms], V[np.ix_(arms, arms)], True
+
+
+def _spanned(
+    B: Array, names: Sequence[str], basis: list[str], by: CalibratedArm, other: CalibratedArm
+) -> Array:
+    """M (basis, parameters) with B = B[:, basis] M for what the `other` campaign determined.
+
+    `names` are those of B's columns, `basis` those of them that the campaign `by` determined.
+
+    Raises InputError where `by` has not determined all of that.
+    """
+    place = {name: k for k, name in enumerate(names)}
+    chosen = B[:, [place[name] for name in basis]]
+    scale = np.linalg.norm(chosen, axis=0)
+    scale[scale == 0] = 1.0
+    onto = np.linalg.pinv(chosen / scale, rcond=RANK) / scale[:, None] @ B
+    whole = np.maximum(np.linalg.norm(B, axis=0), np.finfo(float).tiny)
+    rest = np.linalg.norm(B - chosen @ onto, axis=0) / whole
+    wanted = [n for n in names if n in other.determined and n not in by.determined]
+    if hidden := [n for n in wanted if rest[place[n]] > SAME_SPACE]:
+        raise InputError(
+            f"{by.source} does not determine what {other.source} does: {', '.join(hidden[:4])}"
+            f"{' …' if len(hidden) > 4 else ''}; identify both with these held "
+            f"({option('fixed')}), or from poses and loads that show them in both"
+        )
+    return np.asarray(onto)
 
 
 def _tested(
@@ -288,7 +307,12 @@ def _tested(
     slope: Array,
 ) -> tuple[tuple[Change, ...], float]:
     """Each parameter by Holm's rule, and p of all together."""
-    std = np.sqrt(np.diag(V))
+    variance = np.diag(V)
+    require(
+        bool((variance > 0).all()),
+        f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
+    )
+    std = np.sqrt(variance)
     dofs = [_dof(arm, names) for arm in (old, new)]
     shares = [np.maximum(_own_variance(arm, names), 0.0) for arm in (old, new)]
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
@@ -298,13 +322,14 @@ def _tested(
     family = np.empty(len(p))
     family[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
     scaled = V / np.outer(std, std)
-    together = float((z / std) @ np.linalg.solve(scaled, z / std)) / len(z)
+    with computing(f"{old.source} and {new.source}", "write both anew with identify"):
+        together = float((z / std) @ np.linalg.solve(scaled, z / std)) / len(z)
     smallest = float(min(d.min() for d in dofs))
-    a, b = old.values, new.values
+    a = old.values
     units = {q.name: q.unit for q in old.model.parameters}
     changes = tuple(
-        Change(n, units[n], a[n], b[n], float(z[k]), float(std[k]), float(p[k]), float(family[k]),
-               bool(family[k] < level), float(abs(z[k]) * slope[k]))
+        Change(n, units[n], a[n], a[n] + float(z[k]), float(z[k]), float(std[k]), float(p[k]),
+               float(family[k]), bool(family[k] < level), float(abs(z[k]) * slope[k]))
         for k, n in enumerate(names)
     )  # fmt: skip
     return changes, float(stats.f.sf(together, len(z), smallest))

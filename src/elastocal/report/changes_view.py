@@ -8,7 +8,7 @@ import numpy as np
 
 from elastocal.export.changes import Comparison
 from elastocal.report.effect_names import p_value, size_of
-from elastocal.report.formatting import ShownTable, display, estimate, length, plain
+from elastocal.report.formatting import ShownTable, estimate, length
 from elastocal.text import printable
 
 if TYPE_CHECKING:
@@ -39,7 +39,8 @@ def changes_lines(c: Comparison) -> list[tuple[str, str]]:
             "Tool",
             f"Commanded alike it stands {length(float(np.sqrt(np.mean(far**2))))} rms away from "
             f"where it stood, {length(float(far.max()))} at most, at {len(far)} random poses "
-            f"within the joint limits under ({force}) N; noise alone gives {length(float(chance))} rms.",
+            f"within the joint limits under ({force}) N; noise alone gives "
+            f"{length(float(chance))} rms.",
         ),
         (
             "Chance",
@@ -61,8 +62,6 @@ def changes_lines(c: Comparison) -> list[tuple[str, str]]:
                 "old, to first order.",
             )
         )
-    if c.left_out:
-        lines.append(("Not compared", f"{', '.join(map(printable, c.left_out))}: in one only."))
     return [*lines, *(("Next", step) for step in steps(c))]
 
 
@@ -83,7 +82,7 @@ def change_rows(c: Comparison) -> ShownTable:
     rows = []
     for one in sorted(c.changes, key=lambda x: (not x.changed, -x.moves)):
         value, half, unit = estimate(one.change, one.std, one.unit)
-        old, new = (plain(display(v, one.unit)[0]) for v in (one.old, one.new))
+        old, new = (estimate(v, one.std, one.unit)[0] for v in (one.old, one.new))
         told = "changed" if one.changed else ""
         rows.append(
             (printable(one.name), old, new, value, half, unit, p_value(one.p_family),
