@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
+    from elastocal.export.changes import Comparison
     from elastocal.identification.knowledge import Knowledge
     from elastocal.identification.result import Calibration
     from elastocal.measurements import Measurements
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from elastocal.model.manipulator import Model
     from elastocal.planning.plan import Plan
     from elastocal.plugins import register_criterion, register_effect, register_noise_model
-    from elastocal.verbs import compensate, design, diagnose, identify, init, simulate
+    from elastocal.verbs import compare, compensate, design, diagnose, identify, init, simulate
 
 __version__ = "0.1.0"
 
@@ -64,6 +65,7 @@ ROOMS = {
     "cell.workspace_rules": "Workspace",
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
+    "export.changes": "Comparison",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
@@ -74,13 +76,14 @@ ROOMS = {
     "model.manipulator": "Model",
     "planning.plan": "Plan",
     "plugins": "register_criterion register_effect register_noise_model",
-    "verbs": "compensate design diagnose identify init simulate",
+    "verbs": "compare compensate design diagnose identify init simulate",
 }
 
 __all__ = [
     "CalibratedArm",
     "Calibration",
     "Cell",
+    "Comparison",
     "Compensation",
     "Diagnosis",
     "Effect",
@@ -97,6 +100,7 @@ __all__ = [
     "Tracker",
     "UnknownNameError",
     "Workspace",
+    "compare",
     "compensate",
     "design",
     "diagnose",

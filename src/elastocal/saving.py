@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.export.changes import Comparison
     from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
     from elastocal.measurements import Measurements
@@ -180,7 +181,13 @@ def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str])
     write_plan(path, rows, kinds)
 
 
+def save_comparison(found: Comparison, path: Path) -> None:
+    """The comparison as JSON (schema elastocal/comparison/1)."""
+    write_json(path, found.to_json())
+
+
 WRITERS: dict[str, Callable[..., Any]] = {
+    "Comparison": save_comparison,
     "Calibration": save_calibration,
     "Plan": save_plan,
     "Diagnosis": save_diagnosis,

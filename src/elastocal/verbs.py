@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.compensation.targets import Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.export.changes import Comparison
     from elastocal.identification.intervals import IntervalKind
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, Method
@@ -670,6 +671,54 @@ def compensate(
     where = _tool_point(arm.model.cell, point)
     wanted = _targets(targets, chain.kinds, frame, force)
     return run(arm, wanted, where, start, _whole("seed", seed, 0), progress or _silent)
+
+
+def compare(
+    old: CalibratedArm | Calibration,
+    new: CalibratedArm | Calibration,
+    *,
+    load: ArrayLike | None = None,
+    level: float = 0.05,
+    poses: int = 300,
+    seed: int = 0,
+) -> Comparison:
+    """What has changed since the last calibration?
+
+    The parameters of the arm itself, one by one by Holm's rule and all together, and how far the
+    tool has moved over the workspace where it is commanded and set up alike.
+
+    Args:
+        old: The earlier calibration, or its arm (`fit.arm`, `read_calibrated`).
+        new: The later one, of the same cell.
+        load: Force (3,) in N at the load point under which the tool is compared; default none.
+        level: Chance that any parameter is called changed where none is.
+        poses: Random poses within the joint limits.
+        seed: Of these poses.
+
+    Returns:
+        The `Comparison`: changes with their uncertainty, displacements, the verdict.
+
+    Raises:
+        InputError: The two are of different models, or an option is wrong.
+        InsufficientDataError: They have no parameter in common, or no pose settles under the load.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv")
+        >>> ec.compare(fit, fit).verdict
+        'no_change_shown'
+    """
+    from elastocal.export.changes import compare as run
+    from elastocal.identification.result import Calibration
+
+    arms = [arm.arm if isinstance(arm, Calibration) else arm for arm in (old, new)]
+    for name, arm in zip(("old", "new"), arms, strict=True):
+        if not isinstance(arm, CalibratedArm):
+            raise InputError(
+                f"{option(name)} takes a calibrated arm, as fit.arm or what read_calibrated gives; "
+                f"found {type(arm).__name__}"
+            )
+    count, drawn = _whole("poses", poses, 2), _whole("seed", seed, 0)
+    return run(arms[0], arms[1], given_force(load), float(level), count, drawn)
 
 
 def check_frame(frame: str) -> None:

@@ -304,6 +304,11 @@ COMMANDS = (
           ("deflecting.toml result.json", ".yaml", "--temperature-c 21", ("arm.csv", "links.csv")),
           ("deflecting.toml result.json", ".json", "--json", ("arm.csv", "links.csv")),
       )),
+    Command("init", "arm.urdf -o out.toml", ("out.toml",)),
+    Command("init", "arm.csv -o out.toml --convention modified", ("out.toml",)),
+    Command("effects", "placed.toml --json", (), ("arm.urdf",)),
+    Command("compare", "placed.json placed.json --cell placed.toml -o out.json --poses 20 -q "
+            "--load 0 0 -98", ("out.json",), ("arm.urdf",)),
     Command("study", "study -o results --set replicates=3 -q --jobs 1", (),
             ("study/study.toml", "study/study.py")),
     Command("study", "study -o results --set scale=2.5 -q --jobs 1 --only 2 --seed 5", (),

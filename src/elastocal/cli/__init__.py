@@ -10,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Importing a command registers it.
 from elastocal.cli import (  # noqa: F401
+    compare_command,
     compensate_command,
     design_command,
     diagnose_command,

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # The order of the work, in which --help lists the verbs.
 VERBS = (
     "init", "effects", "design", "simulate", "import", "identify", "diagnose", "compensate",
-    "export", "study", "demo",
+    "export", "compare", "study", "demo",
 )  # fmt: skip
 
 
@@ -41,7 +41,7 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 # Arguments and options that name what a command reads.
 READ = (
     "cell", "data", "result", "targets", "files", "folder", "test", "covariance", "knowledge",
-    "augment", "mapping", "robot",
+    "augment", "mapping", "robot", "old", "new",
 )  # fmt: skip
 
 

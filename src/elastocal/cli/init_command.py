@@ -45,8 +45,10 @@ def init(
     if cell.robot.flange is not None:
         say(f"The flange is '{cell.robot.flange}'; --flange names another.")
     say("Replace what is marked as a guess. It runs as it is:")
-    say(f"  elastocal design {output} -o plan.csv")
-    say(f"  elastocal simulate {output} plan.csv -o data.csv --draw 1")
+    say(f"  elastocal design {output} -o plan.csv --effort quick")
+    loads = cell.design.loads
+    load = " ".join(f"{v:g}" for v in loads[-1]) if loads is not None else "0 0 -100"
+    say(f"  elastocal simulate {output} plan.csv -o data.csv --draw 1 --load {load}")
 
 
 @command(short_help="What can be fitted?")
@@ -62,9 +64,10 @@ def effects(
     """
     from rich.padding import Padding
 
+    from elastocal import demo
     from elastocal.report.effects_view import effect_entries, effect_lines
 
-    entries = effect_entries(cell)
+    entries = effect_entries(cell or Path(demo.__file__).parent / "cell.toml")
     if as_json:
         say(json_text({"schema": "elastocal/effects/1", "effects": entries}))
         return

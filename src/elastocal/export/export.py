@@ -277,8 +277,9 @@ def check_rest(
 ) -> float:
     """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
 
-    `T_world_base` (4, 4) in the MJCF; `names` of the sites of `pieces.points`.  Raises
-    InputError where MuJoCo is not installed, ElastocalError where they differ.
+    `T_world_base` (4, 4) in the MJCF; `names` of the sites of `pieces.points`.
+
+    Raises InputError where MuJoCo is not installed, ElastocalError where they differ.
     """
     arm = MujocoRest(mjcf)
     part, force = kept.exported, kept.conditions.force

@@ -19,6 +19,9 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.model.chain import Chain, Joint
 from elastocal.model.choice import load_chain
+from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.gears import JointOffset
+from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flange
 from elastocal.model.urdf import check_urdf
@@ -176,7 +179,7 @@ def _tool(reach: float, sites: dict[str, Array]) -> Iterator[str]:
         yield "[tool.markers_m]                       # the model's sites; keep the reflectors"
         stub = usable
     else:
-        yield "[tool.markers_m]                       # guess; marker_position below fits them"
+        yield "[tool.markers_m]                       # guess; fitted below"
     for name, place in stub.items():
         yield f"{_key(name)} = {_vector(place)}"
     yield ""
@@ -200,10 +203,10 @@ def _model(chain: Chain) -> Iterator[str]:
     yield 'observe = "position"'.ljust(38) + " # or deflection, pose, distance"
     yield "# What is fitted; elastocal effects lists all that can be."
     yield "effects = ["
-    for pair in (("base_frame", "marker_position"), ("joint_offset", "link_geometry")):
-        yield "    " + " ".join(f'"{name}",' for name in pair)
+    for pair in ((BaseFrame, MarkerPosition), (JointOffset, LinkGeometry)):
+        yield "    " + " ".join(f'"{effect.name}",' for effect in pair)
     # What hangs does not turn an upright first joint.
-    sprung = [f'"joint_compliance:joint{i}",' for i in range(2, chain.n_joints + 1)]
+    sprung = [f'"{JointCompliance.name}:joint{i}",' for i in range(2, chain.n_joints + 1)]
     for k in range(0, len(sprung), 2):
         yield "    " + " ".join(sprung[k : k + 2])
     yield "]"

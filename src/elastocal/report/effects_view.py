@@ -6,8 +6,8 @@ import inspect
 from pathlib import Path
 from typing import Any
 
-from elastocal import demo
 from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError
 from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
 from elastocal.model.choice import cell_of, load_chain
@@ -17,15 +17,15 @@ from elastocal.report.effect_names import STAGES, places
 from elastocal.report.formatting import display
 
 
-def effect_entries(cell: Cell | str | Path | None = None) -> list[dict[str, Any]]:
+def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
     """Per effect, in the catalogue's order: name, stage, what it is, places, parameters.
 
-    Places and sizes are those of the cell's arm, by default the demo's KR 270.  An effect that
-    the cell fits is `on`.  A parameter's typical size is null where only the readings say it.
+    Places and sizes are those of the cell's arm.  An effect that the cell fits is `on`.  A
+    parameter's typical size is null where only the readings say it.
     """
-    given = cell_of(Path(demo.__file__).parent / "cell.toml" if cell is None else cell)
+    given = cell_of(cell)
     chain = load_chain(given)
-    on = {choice.name for choice in given.model.effects} if cell is not None else set()
+    on = {choice.name for choice in given.model.effects}
     return [_entry(effect, chain, given, effect.name in on) for effect in CATALOGUE.values()]
 
 
@@ -50,8 +50,6 @@ def _parameters(
     effect: Effect, where: tuple[str, ...], chain: Chain, cell: Cell
 ) -> tuple[ParameterSpec, ...]:
     """Those at its first place; none where settings of the cell make them."""
-    from elastocal.errors import InputError
-
     try:
         return effect.parameters(where[0], chain, cell) if where else ()
     except InputError:  # link weights without masses

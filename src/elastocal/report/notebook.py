@@ -21,10 +21,12 @@ from elastocal.compensation.compensate import (
 )
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import InputError
+from elastocal.export.changes import Comparison
 from elastocal.identification.result import Calibration
 from elastocal.model.effects import effect_of
 from elastocal.planning.plan import Plan
 from elastocal.report.causes_view import cause_rows, causes, field_rows, place_rows
+from elastocal.report.changes_view import change_rows, changes_frame, changes_lines, draw_map
 from elastocal.report.diagnosis_view import (
     diagnosis_lines,
     diagnosis_steps,
@@ -44,6 +46,7 @@ from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
 from elastocal.report.plan_view import first_stops, plan_lines
 from elastocal.report.residual_view import residuals_of
 from elastocal.report.terminal import (
+    comparison_text,
     compensation_text,
     diagnosis_text,
     identification_text,
@@ -479,7 +482,31 @@ def _commands(c: Compensation) -> pd.DataFrame:
     return frame
 
 
+def _comparison_html(c: Comparison) -> str:
+    shown = change_rows(c)
+    return _lines(changes_lines(c)) + _table("Parameter by parameter", shown.heads, shown.rows)
+
+
+def moved(c: Comparison, interactive: bool) -> Any:
+    """How far the tool has moved over the workspace, from above and from the side."""
+    from matplotlib.figure import Figure
+
+    if interactive:
+        import plotly.graph_objects as go
+
+        x, y, z = c.place.T
+        marks = go.Scatter3d(
+            x=x, y=y, z=z, mode="markers", hovertext=[length(float(v)) for v in c.distance],
+            marker={"color": c.distance * 1e6, "size": 4, "colorbar": {"title": "µm"}},
+        )  # fmt: skip
+        return go.Figure(marks)
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    draw_map(figure, c, "C0", "0.4")
+    return figure
+
+
 VIEWS: dict[type, View] = {
+    Comparison: View(comparison_text, _comparison_html, changes_frame, {"moved": moved}),
     Calibration: View(
         identification_text,
         _identification_html,

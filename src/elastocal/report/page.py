@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from elastocal import __version__
 from elastocal.compensation.compensate import Compensation
 from elastocal.diagnosis.diagnosis import Diagnosis
+from elastocal.export.changes import Comparison
 from elastocal.files import atomic_write_text, open_input
 from elastocal.identification.findings import gap_budget
 from elastocal.identification.result import Calibration
@@ -35,10 +36,14 @@ from elastocal.report.arm_view import (
     time_caption,
     view_caption,
 )
+from elastocal.report.changes_view import changes_contents, draw_map
 from elastocal.report.diagnosis_view import diagnosis_contents
 from elastocal.report.figures import (
+    INK,
+    SERIES,
     candidate_bars,
     diagnosis_waterfall,
+    drawn,
     plan_curve,
     plan_intervals,
     plan_removed,
@@ -163,7 +168,9 @@ def _digest(text: str) -> str:
 
 def sources(result: Any) -> list[Path]:
     """The cell and the tables that a result came from, as far as they are files."""
-    if isinstance(result, Compensation):
+    if isinstance(result, Comparison):
+        named = [result.old.model.cell.path, result.old.source, result.new.source]
+    elif isinstance(result, Compensation):
         named = [result.targets.table.source]
     else:
         named = [result.model.cell.path]
@@ -299,8 +306,17 @@ def _thinning(result: Calibration, residuals: Residuals) -> dict[str, str]:
     }
 
 
+def _comparison(c: Comparison) -> dict[str, Any]:
+    def draw(figure: Any) -> None:
+        draw_map(figure, c, SERIES[0], INK)
+
+    figures = {"map": drawn(draw, 8.0, 3.6, "How far the tool has moved")}
+    return {**_of(c.old.model, figures), **changes_contents(c)}
+
+
 PAGES: dict[type, tuple[str, Callable[..., dict[str, Any]]]] = {
     Calibration: ("identification.html.j2", _calibration),
+    Comparison: ("changes.html.j2", _comparison),
     Plan: ("plan.html.j2", _plan),
     Diagnosis: ("diagnosis.html.j2", _diagnosis),
     Compensation: ("compensation.html.j2", _compensation),

@@ -13,10 +13,12 @@ from rich.text import Text
 
 from elastocal.compensation.compensate import Compensation, summary
 from elastocal.diagnosis.diagnosis import Diagnosis
+from elastocal.export.changes import Comparison
 from elastocal.identification.findings import ALONE
 from elastocal.identification.result import Calibration
 from elastocal.planning.plan import Plan
 from elastocal.report.causes_view import cause_rows, field_rows, place_rows
+from elastocal.report.changes_view import change_rows, changes_lines
 from elastocal.report.diagnosis_view import (
     added_parameter_rows,
     alike,
@@ -79,6 +81,16 @@ def _plain_text(printed: Callable[[Console], None]) -> str:
     with console.capture() as capture:
         printed(console)
     return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
+
+
+def comparison_text(c: Comparison) -> str:
+    """What `print` shows of a comparison: the verdict, and every parameter."""
+
+    def printed(console: Console) -> None:
+        print_told(console, changes_lines(c))
+        console.print(table_of("Parameter by parameter", change_rows(c)))
+
+    return _plain_text(printed)
 
 
 def titled(title: str | None) -> Table:
@@ -261,7 +273,7 @@ NARROW_FOR_SETTINGS = 100  # columns; below, a candidate is told without its set
 
 def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> None:
     """The whole answer for an engineer; `kinds` of the joints ("revolute" or "prismatic")."""
-    _print_told(console, diagnosis_lines(d))
+    print_told(console, diagnosis_lines(d))
     console.print()
     for told in _tables_of_causes(console, d):
         console.print(told)
@@ -289,7 +301,7 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> Non
     lines = [("Alike here", f"{text}: these data cannot tell them apart.") for text in alike(d)]
     lines += [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
-    _print_told(console, [*lines, *(("Warning", printable(text)) for text in d.warnings)])
+    print_told(console, [*lines, *(("Warning", printable(text)) for text in d.warnings)])
 
 
 def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
@@ -314,7 +326,7 @@ def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
         yield table_of("Corrections without a name", fields)
 
 
-def _print_told(console: Console, lines: Iterable[tuple[str, str]]) -> None:
+def print_told(console: Console, lines: Iterable[tuple[str, str]]) -> None:
     _print_lines(console, ((label, capital(text)) for label, text in lines))
 
 

@@ -1,0 +1,346 @@
+"""What has changed between two calibrations of one arm, and whether chance could have done it.
+
+With x₁, x₂ the parameters of the arm itself in two campaigns (base, markers and instrument are set
+up anew each time and count for neither) and V₁, V₂ their covariances,
+
+    z = x₂ − x₁,    Cov z = V₁ + V₂,
+
+since two campaigns err independently.  All of z together: zᵀ (V₁ + V₂)⁻¹ z / p against F(p, ν), ν
+the smaller of the campaigns' degrees of freedom.  Each alone: |z_k| / s_k against Student's t with
+Welch and Satterthwaite's degrees of freedom, and by Holm's rule, so that with probability 1 − level
+no parameter is called changed that is not.  Where the campaigns determined other parameters, the
+new ones are told in those of the old: to first order, by the columns of B over random poses,
+z ← B₁⁺ B z, whose column spaces must be the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from elastocal.above import Result
+from elastocal.cell.arm_description import Tool
+from elastocal.errors import InputError, InsufficientDataError, computing, option, require
+from elastocal.export.exportable import Conditions, Valued, keep, random_table
+from elastocal.measurements import Measurements
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.manipulator import Model
+from elastocal.units import Array
+
+SCHEMA = "elastocal/comparison/1"
+LEVEL = 0.05  # chance that anything is called changed where nothing is
+SAME_SPACE = 1e-6  # of a column of B that others should hold
+RANK = 1e-9
+CENTRAL = 0.95
+POINT = "tool"
+
+
+@dataclass(frozen=True)
+class Change:
+    """One parameter: values and their difference in SI units, its standard deviation, p alone and
+    by Holm's rule, whether that is below the level, and `moves`: rms in m at the tool."""
+
+    name: str
+    unit: str
+    old: float
+    new: float
+    change: float
+    std: float
+    p: float
+    p_family: float
+    changed: bool
+    moves: float
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison(Result):
+    """What has changed between two calibrations of one arm.
+
+    Attributes:
+        old, new: The two arms.
+        changes: One for each parameter of the arm that both campaigns determine.
+        p: Chance of differences as large as all of these together where nothing has changed.
+        level: Chance that any parameter is called changed where none is.
+        moved: (poses, 3) m: how the tool's point moves, commanded alike, set up alike.
+        chance: (poses,) m: the standard deviation of that by the campaigns' noise alone.
+        place: (poses, 3) m: where the point is, in the data's frame of the old campaign.
+        force: (3,) N that acts at these poses.
+        first_order: Whether the new parameters were told in those of the old.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv")
+        >>> ec.compare(fit, fit)
+        <Comparison kuka_kr270_2: 0 of 9 parameters changed, p = 1>
+    """
+
+    old: CalibratedArm
+    new: CalibratedArm
+    changes: tuple[Change, ...]
+    p: float
+    level: float
+    moved: Array
+    chance: Array
+    place: Array
+    force: Array
+    first_order: bool
+
+    @property
+    def changed(self) -> list[Change]:
+        """Those that exceed their joint uncertainty, the largest at the tool first."""
+        return sorted((c for c in self.changes if c.changed), key=lambda c: -c.moves)
+
+    @property
+    def verdict(self) -> str:
+        """ "changed" (some parameters are named), "changed_somewhere" or "no_change_shown"."""
+        if self.changed:
+            return "changed"
+        return "changed_somewhere" if self.p < self.level else "no_change_shown"
+
+    @property
+    def distance(self) -> NDArray:
+        """How far the point moves (poses,) in m."""
+        return np.asarray(np.linalg.norm(self.moved, axis=1))
+
+    def __repr__(self) -> str:
+        return (
+            f"<Comparison {self.old.model.chain.name}: {len(self.changed)} of "
+            f"{len(self.changes)} parameters changed, p = {self.p:.2g}>"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The comparison as a JSON-ready dictionary; parameters in SI units, lengths in µm."""
+        far = self.distance * 1e6
+        return {
+            "schema": SCHEMA,
+            "robot": self.old.model.chain.name,
+            "old": self.old.source,
+            "new": self.new.source,
+            "verdict": self.verdict,
+            "p": self.p,
+            "level": self.level,
+            "family": "Holm over the parameters",
+            "changed": [c.name for c in self.changed],
+            "parameters": [vars(c) for c in self.changes],
+            "first_order": self.first_order,
+            "tool": {
+                "poses": len(far),
+                "force_N": self.force,
+                "rms_um": float(np.sqrt(np.mean(far**2))),
+                "p95_um": float(np.quantile(far, CENTRAL)),
+                "max_um": float(far.max()),
+                "by_chance_rms_um": float(np.sqrt(np.mean(self.chance**2))) * 1e6,
+            },
+        }
+
+
+def compare(
+    old: CalibratedArm,
+    new: CalibratedArm,
+    force: Array | None = None,
+    level: float = LEVEL,
+    poses: int = 300,
+    seed: int = 0,
+) -> Comparison:
+    """What has changed from `old` to `new`, over random poses within the joint limits.
+
+    Raises InputError for arms of two models, and InsufficientDataError where the campaigns have no
+    parameter of the arm in common, or no pose has an equilibrium under the force.
+    """
+    require(0 < level < 1, f"{option('level')} takes a number between 0 and 1; found {level}")
+    require(
+        old.model.names == new.model.names,
+        f"{old.source} and {new.source} are of two models: their parameters differ; identify both "
+        "with the same cell",
+    )
+    conditions = Conditions(np.zeros(3) if force is None else force)
+    before = keep(old, elastic=True, conditions=conditions).full
+    after = keep(new, elastic=True, conditions=conditions).full
+    own = _own(before.model)
+    determined = [[n for n in arm.determined if n in own] for arm in (old, new)]
+    table = random_table(before.model, conditions, poses, seed)
+    names, z, V, first_order = _difference(old, new, before, after, determined, table)
+    if not names:
+        raise InsufficientDataError(
+            f"{old.source} and {new.source} determine no parameter of the arm in common; identify "
+            "both with the same effects, from poses that show them"
+        )
+    tool = _tool_model(before.model)
+    at_tool = replace(table, marker=np.zeros_like(table.marker), marker_names=(POINT,))
+    x = _values(tool, before.values)
+    here = _positions(tool, at_tool, x)
+    # The set-up of the old campaign for both.
+    set_up = {name: value for name, value in before.values.items() if name not in own}
+    there = _positions(tool, at_tool, _values(tool, after.values | set_up))
+    settled = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
+    if not settled.any():
+        raise InsufficientDataError(
+            f"none of {poses} random poses has a static equilibrium under the load; check "
+            f"{option('load')}"
+        )
+    columns = np.array([tool.names.index(name) for name in names])
+    rows = at_tool.take(np.flatnonzero(settled))
+    B = tool.regressor(_measured(rows), x, columns).B.reshape(len(rows.q), 3, len(names))
+    chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V, B))
+    changes, p = _tested(old, new, names, z, V, level, np.sqrt((B**2).sum(axis=1).mean(axis=0)))
+    return Comparison(
+        old, new, changes, p, level, (there - here)[settled], chance, here[settled],
+        conditions.force, first_order,
+    )  # fmt: skip
+
+
+def _own(model: Model) -> set[str]:
+    """Parameters of the arm itself; base and markers are set up anew in each campaign."""
+    return {p.name for p in model.parameters if not CATALOGUE[p.effect].registered}
+
+
+def _values(model: Model, values: dict[str, float]) -> Array:
+    return np.array([values[name] for name in model.names])
+
+
+def _measured(table: Measurements) -> Measurements:
+    return replace(table, position=np.zeros((len(table.q), 3)))
+
+
+def _tool_model(model: Model) -> Model:
+    """The model with one known point of the tool as its marker: the load point, or a marker."""
+    cell = model.cell
+    load = cell.tool.load_point
+    point = load if load.any() else next(iter(cell.tool.markers.values()), load)
+    kept = tuple(c for c in cell.model.effects if CATALOGUE[c.name].stage != POINT)
+    spec = replace(cell.model, effects=kept)
+    return Model.assembled(
+        model.chain, replace(cell, tool=Tool(load_point=load, markers={POINT: point}), model=spec)
+    )
+
+
+def _positions(model: Model, table: Measurements, x: Array) -> Array:
+    """Where the tool's point is (n, 3) in m, NaN without an equilibrium."""
+    T = model.flange_poses(table, x)
+    return np.asarray(T[:, :3, :3] @ model.cell.tool.markers[POINT]) + T[:, :3, 3]
+
+
+def _covariance(arm: CalibratedArm, names: Sequence[str]) -> Array:
+    at = [arm.determined.index(name) for name in names]
+    V = arm.covariance[np.ix_(at, at)]
+    require(
+        bool(np.isfinite(V).all()),
+        f"{arm.source}: its covariance has no numbers for {', '.join(names[:3])} …; identify anew",
+    )
+    return np.asarray(V)
+
+
+def _difference(
+    old: CalibratedArm,
+    new: CalibratedArm,
+    before: Valued,
+    after: Valued,
+    determined: list[list[str]],
+    table: Measurements,
+) -> tuple[list[str], Array, Array, bool]:
+    """Names, z (p,), Cov z (p, p), and whether z was told to first order."""
+    first, second = determined
+    own = _own(before.model)
+    a, b = before.values, after.values
+    held = [n for n in own if n not in first and n not in second]
+    if set(first) == set(second) and all(np.isclose(a[n], b[n], rtol=1e-9) for n in held):
+        z = np.array([b[n] - a[n] for n in first])
+        return first, z, _covariance(old, first) + _covariance(new, first), False
+    # All that both fitted, set-up included, which the new campaign's choice may have moved.
+    x = before.x
+    known = [n for n in before.model.names if n in old.determined]
+    markers = len(before.model.cell.tool.markers) or 1
+    tables = [replace(table, marker=np.full(len(table.q), m)) for m in range(markers)]
+    if before.model.cell.tool.markers:
+        marked = tuple(before.model.cell.tool.markers)
+        tables = [replace(t, marker_names=marked) for t in tables]
+    B = np.vstack([before.model.regressor(_measured(t), x).B for t in tables])
+    index = {name: k for k, name in enumerate(before.model.names)}
+    onto = _spanned(B, before.model.names, known, old, new)
+    fitted = [n for n in before.model.names if n in new.determined]
+    _spanned(B, before.model.names, fitted, new, old)
+    d = after.x - before.x
+    M = onto[:, [index[n] for n in fitted]]
+    V = _covariance(old, known) + M @ _covariance(new, fitted) @ M.T
+    arms = [k for k, n in enumerate(known) if n in own]
+    return [known[k] for k in arms], (onto @ d)[arms], V[np.ix_(arms, arms)], True
+
+
+def _spanned(
+    B: Array, names: Sequence[str], basis: list[str], by: CalibratedArm, other: CalibratedArm
+) -> Array:
+    """M (basis, parameters) with B = B[:, basis] M for what the `other` campaign determined.
+
+    `names` are those of B's columns, `basis` those of them that the campaign `by` determined.
+
+    Raises InputError where `by` has not determined all of that.
+    """
+    place = {name: k for k, name in enumerate(names)}
+    chosen = B[:, [place[name] for name in basis]]
+    scale = np.linalg.norm(chosen, axis=0)
+    scale[scale == 0] = 1.0
+    onto = np.linalg.pinv(chosen / scale, rcond=RANK) / scale[:, None] @ B
+    whole = np.maximum(np.linalg.norm(B, axis=0), np.finfo(float).tiny)
+    rest = np.linalg.norm(B - chosen @ onto, axis=0) / whole
+    wanted = [n for n in names if n in other.determined and n not in by.determined]
+    if hidden := [n for n in wanted if rest[place[n]] > SAME_SPACE]:
+        raise InputError(
+            f"{by.source} does not determine what {other.source} does: {', '.join(hidden[:4])}"
+            f"{' …' if len(hidden) > 4 else ''}; identify both with these held "
+            f"({option('fixed')}), or from poses and loads that show them in both"
+        )
+    return np.asarray(onto)
+
+
+def _tested(
+    old: CalibratedArm,
+    new: CalibratedArm,
+    names: list[str],
+    z: Array,
+    V: Array,
+    level: float,
+    slope: Array,
+) -> tuple[tuple[Change, ...], float]:
+    """Each parameter by Holm's rule, and p of all together."""
+    variance = np.diag(V)
+    require(
+        bool((variance > 0).all()),
+        f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
+    )
+    std = np.sqrt(variance)
+    dofs = [_dof(arm, names) for arm in (old, new)]
+    shares = [np.maximum(_own_variance(arm, names), 0.0) for arm in (old, new)]
+    both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
+    nu = np.divide(sum(shares) ** 2, both, out=np.full(len(z), np.inf), where=both > 0)
+    p = 2 * stats.t.sf(np.abs(z) / std, np.maximum(nu, 1.0))
+    order = np.argsort(p)
+    family = np.empty(len(p))
+    family[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
+    scaled = V / np.outer(std, std)
+    with computing(f"{old.source} and {new.source}", "write both anew with identify"):
+        together = float((z / std) @ np.linalg.solve(scaled, z / std)) / len(z)
+    smallest = float(min(d.min() for d in dofs))
+    a = old.values
+    units = {q.name: q.unit for q in old.model.parameters}
+    changes = tuple(
+        Change(n, units[n], a[n], a[n] + float(z[k]), float(z[k]), float(std[k]), float(p[k]),
+               float(family[k]), bool(family[k] < level), float(abs(z[k]) * slope[k]))
+        for k, n in enumerate(names)
+    )  # fmt: skip
+    return changes, float(stats.f.sf(together, len(z), smallest))
+
+
+def _own_variance(arm: CalibratedArm, names: list[str]) -> Array:
+    variance = dict(zip(arm.determined, np.diag(arm.covariance), strict=True))
+    return np.array([variance.get(name, 0.0) for name in names])
+
+
+def _dof(arm: CalibratedArm, names: list[str]) -> Array:
+    """Degrees of freedom of each parameter; an older result states none: normal."""
+    stated = {str(entry["name"]): entry.get("dof") for entry in arm.entries}
+    return np.array([float(stated.get(name) or np.inf) for name in names])

@@ -1,0 +1,126 @@
+"""What a comparison of two calibrations says: words, rows, and a map over the workspace."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from elastocal.export.changes import Comparison
+from elastocal.report.effect_names import p_value, size_of
+from elastocal.report.formatting import ShownTable, estimate, length
+from elastocal.text import printable
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+NAMED = 3  # parameters in a headline
+
+
+def headline(c: Comparison) -> str:
+    """The verdict in a sentence."""
+    if c.changed:
+        names = ", ".join(printable(change.name) for change in c.changed[:NAMED])
+        more = f" and {len(c.changed) - NAMED} more" if len(c.changed) > NAMED else ""
+        return f"The arm has changed: {names}{more}."
+    if c.verdict == "no_change_shown":
+        return "No change is shown: the differences are as large as the noise makes them."
+    return "The arm has changed, but no single parameter can be named."
+
+
+def changes_lines(c: Comparison) -> list[tuple[str, str]]:
+    """Verdict, displacement, chance, what was compared, what to do."""
+    far, chance = c.distance, np.sqrt(np.mean(c.chance**2))
+    force = ", ".join(f"{v:g}" for v in c.force)
+    lines = [
+        ("Verdict", headline(c)),
+        (
+            "Tool",
+            f"Commanded alike it stands {length(float(np.sqrt(np.mean(far**2))))} rms away from "
+            f"where it stood, {length(float(far.max()))} at most, at {len(far)} random poses "
+            f"within the joint limits under ({force}) N; noise alone gives "
+            f"{length(float(chance))} rms.",
+        ),
+        (
+            "Chance",
+            f"All {len(c.changes)} parameters together: {size_of(c.p)}. Each alone by Holm's rule: "
+            f"where nothing has changed, any is called changed with probability {c.level:g} at "
+            "most.",
+        ),
+        (
+            "Compared",
+            "The arm itself. Base and markers are set up anew in each campaign: a change that a "
+            "motion of the base or of the markers would also make is not seen.",
+        ),
+    ]
+    if c.first_order:
+        lines.append(
+            (
+                "Compared",
+                "The campaigns determined other parameters; the new ones are told in those of the "
+                "old, to first order.",
+            )
+        )
+    return [*lines, *(("Next", step) for step in steps(c))]
+
+
+def steps(c: Comparison) -> list[str]:
+    """What to do."""
+    if c.verdict == "no_change_shown":
+        return ["Nothing: the old calibration still holds to within the noise of these campaigns."]
+    return [
+        "Use the new calibration (elastocal compensate, elastocal export).",
+        "Look for the cause at the joints and links named; what the model lacks can look like a "
+        "change where poses or loads differ (elastocal diagnose with the new data).",
+    ]
+
+
+def change_rows(c: Comparison) -> ShownTable:
+    """A row for each parameter, the changed first, then by their effect at the tool."""
+    heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
+    rows = []
+    for one in sorted(c.changes, key=lambda x: (not x.changed, -x.moves)):
+        value, half, unit = estimate(one.change, one.std, one.unit)
+        old, new = (estimate(v, one.std, one.unit)[0] for v in (one.old, one.new))
+        told = "changed" if one.changed else ""
+        rows.append(
+            (printable(one.name), old, new, value, half, unit, p_value(one.p_family),
+             length(one.moves), told)
+        )  # fmt: skip
+    return ShownTable(heads, rows, (0, 5, 8))
+
+
+def changes_frame(c: Comparison) -> pd.DataFrame:
+    """One row per parameter, SI units."""
+    import pandas as pd
+
+    return pd.DataFrame([vars(change) for change in c.changes])
+
+
+def draw_map(figure: Figure, c: Comparison, colour: str, faint: str) -> None:
+    """The poses from above and from the side, each a disc as large as the tool moves there."""
+    far = c.distance
+    area = 120.0 * far / max(float(far.max()), 1e-12)
+    for k, (i, j, title) in enumerate(((0, 1, "from above"), (0, 2, "from the side"))):
+        axes = figure.add_subplot(1, 2, k + 1)
+        axes.scatter(c.place[:, i], c.place[:, j], s=area, color=colour, alpha=0.6, linewidths=0)
+        axes.scatter(c.place[:, i], c.place[:, j], s=2, color=faint)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_title(f"{title}; the largest disc is {length(float(far.max()))}")
+        axes.set_xlabel(f"{'xyz'[i]} in m")
+        axes.set_ylabel(f"{'xyz'[j]} in m")
+
+
+def changes_contents(c: Comparison) -> dict[str, Any]:
+    """Words and tables of the page, by the names that its template has for them."""
+    lines = changes_lines(c)
+    return {
+        "headline": headline(c),
+        "tone": "good" if c.verdict == "no_change_shown" else "warn",
+        "verdict": [line for line in lines if line[0] not in ("Verdict", "Next")],
+        "steps": steps(c),
+        "warnings": [],
+        "lead": f"{printable(c.old.source)} → {printable(c.new.source)}",
+        "changes": change_rows(c),
+    }

@@ -1,0 +1,118 @@
+"""elastocal compare: an arm before and after a collision, and one that nothing happened to."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import elastocal as ec
+from elastocal.cli.app import app
+
+TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
+CELL = """\
+[robot]
+dh = "arm.csv"
+[tool]
+load_point_m = [0.25, 0.0, 0.10]
+[tool.markers_m]
+M1 = [0.25, 0.0, 0.05]
+M2 = [-0.10, 0.20, 0.05]
+M3 = [-0.10, -0.20, 0.10]
+[tracker]
+sigma_um = 10
+[model]
+effects = ["base_frame", "joint_offset", "link_geometry", "marker_position"]
+"""
+BENT, BY = "link2.dx", 0.3e-3  # m: what the collision did
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """old.json; bent.json after a collision; same.json without; each with its own set-up."""
+    made = tmp_path_factory.mktemp("compare")
+    shutil.copyfile(TUTORIAL / "arm.csv", made / "arm.csv")
+    (made / "cell.toml").write_text(CELL)
+    model = ec.Model(made / "cell.toml")
+    rng = np.random.default_rng(5)
+    truth = {p.name: p.nominal + p.typical * rng.normal() for p in model.parameters}
+    for name, change in (("old", 0.0), ("bent", BY), ("same", 0.0)):
+        values = truth | {BENT: truth[BENT] + change}
+        values |= {f"base.{k}": 1.0 + 0.2 * rng.normal() for k in ("x", "y", "z", "rz")}
+        values |= {n: v + 1e-3 * rng.normal() for n, v in values.items() if n.startswith("marker")}
+        q = rng.uniform(-1.4, 1.0, (24, 6))
+        data = ec.simulate(model, q, values=values, seed=int(rng.integers(1000)))
+        ec.identify(model, data).save(made / f"{name}.json")
+    return made
+
+
+@pytest.fixture(autouse=True)
+def in_folder(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+
+
+def run(*words):
+    done = CliRunner().invoke(app, ["compare", *words])
+    return done.exit_code, done.stdout, done.stderr
+
+
+def test_after_a_collision_the_bent_link_is_named(folder):
+    code, out, err = run("old.json", "bent.json", "-o", "c.json", "--report", "c.html")
+    assert code == 0, err
+    flat = " ".join(out.split())
+    assert f"Verdict: The arm has changed: {BENT}." in flat
+    assert "any is called changed with probability 0.05 at most" in flat
+    found = json.loads(Path("c.json").read_text())
+    assert (found["verdict"], found["changed"]) == ("changed", [BENT])
+    (one,) = (p for p in found["parameters"] if p["changed"])
+    assert abs(one["change"] - BY) < 4 * one["std"] and one["std"] < 1e-4
+    # The link's end moves by 0.3 mm, and with it the tool, wherever it is.
+    assert 200 < found["tool"]["rms_um"] < 450 and found["tool"]["by_chance_rms_um"] < 60
+    page = Path("c.html").read_text()
+    assert "The arm has changed" in page and "Parameter by parameter" in page and "<svg" in page
+    assert page.count("SHA-256") == 3
+
+
+def test_where_nothing_happened_nothing_is_named_though_base_and_markers_moved():
+    code, out, err = run("old.json", "same.json", "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert found["verdict"] == "no_change_shown" and found["changed"] == []
+    assert not any(p["name"].startswith(("base", "marker")) for p in found["parameters"])
+    # The tool seems to move by no more than what the noise gives.
+    assert found["tool"]["rms_um"] < 2 * found["tool"]["by_chance_rms_um"]
+
+
+def test_in_python_it_is_a_result_like_the_others():
+    arms = [ec.read_calibrated("cell.toml", f"{name}.json") for name in ("old", "bent")]
+    found = ec.compare(*arms)
+    assert [c.name for c in found.changed] == [BENT] and "link2.dx" in str(found)
+    assert len(found.to_dataframe()) == len(found.changes) and found.plot().axes
+    assert ec.compare(arms[0], arms[0]).p == 1.0
+    with pytest.raises(ec.InputError, match="`level` takes a number between 0 and 1"):
+        ec.compare(*arms, level=2)
+    with pytest.raises(ec.InputError, match="`old` takes a calibrated arm"):
+        ec.compare("old.json", arms[1])
+
+
+def test_what_another_choice_of_parameters_determined_is_told_in_that_of_the_old(folder):
+    """The same arm identified with another complete set: nothing but the names differs."""
+    model = ec.Model("cell.toml")
+    data = ec.simulate(model, np.random.default_rng(1).uniform(-1.4, 1.0, (24, 6)), seed=3)
+    free = ec.identify(model, data)
+    chosen = next(n for n in free.determined if n.startswith("link") and free[n].combined_with)
+    other = next(n for n in free[chosen].combined_with if n.startswith("link"))
+    held = ec.identify(model, data, fixed=[chosen])
+    assert set(held.determined) != set(free.determined), other
+    found = ec.compare(free, held)
+    assert found.first_order and not found.changed
+    assert found.distance.max() < 1e-6
+
+
+def test_the_cell_is_that_of_both():
+    code, _, err = run("old.json", "bent.json", "--cell", "none.toml")
+    assert code == 2 and "none.toml" in err
+    code, _, err = run("old.json", "bent.json", "-o", "old.json")
+    assert code == 2 and "would be written over" in err

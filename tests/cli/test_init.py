@@ -1,0 +1,109 @@
+"""elastocal init writes a cell that plans and simulates at once; effects lists the catalogue."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.mjcf_text import write_arm
+from support.robots import KR270
+from typer.testing import CliRunner
+
+import elastocal as ec
+from elastocal.cli.app import app
+from elastocal.model import Model
+from elastocal.model.effects import CATALOGUE
+
+TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
+
+
+@pytest.fixture
+def arms(tmp_path, monkeypatch):
+    (tmp_path / "arms").mkdir()
+    shutil.copyfile(KR270, tmp_path / "arms" / "arm.urdf")
+    shutil.copyfile(TUTORIAL / "arm.csv", tmp_path / "arms" / "arm.csv")
+    write_arm(tmp_path / "arms")
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*words):
+    done = CliRunner().invoke(app, list(map(str, words)))
+    return done.exit_code, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("name", ["arm.urdf", "arm.csv", "arm.xml"])
+def test_the_cell_it_writes_plans_and_simulates_as_it_is(name, arms):
+    code, out, err = run("init", f"arms/{name}")
+    assert code == 0, err
+    assert "elastocal design cell.toml -o plan.csv --effort quick" in out
+    cell = ec.read_cell("cell.toml")
+    model = Model(cell)
+    assert f"{model.chain.n_joints} joints (" in out
+    assert set(cell.limits) == {f"joint{i + 1}" for i in range(model.chain.n_joints)}
+    assert cell.workspace.keep_out[0].name == "mounting plane" and cell.tool.markers
+    assert cell.model.link_gravity == bool(model.chain.masses)
+    code, _, err = run("design", "cell.toml", "-o", "plan.csv", "--effort", "quick", "--poses",
+                       "12", "--candidates", "60", "-q")  # fmt: skip
+    assert code == 0, err
+    code, out, err = run(*out.splitlines()[-1].split()[1:], "--truth", "t.json")  # as init says it
+    assert code == 0, err
+    truth = json.loads(Path("t.json").read_text())
+    drawn = [v for name, v in truth.items() if name.endswith("compliance")]
+    assert max(drawn) > 1e-8 and min(drawn) >= 0  # --draw 1 draws compliances too
+    assert len(model.read("data.csv")) >= 12
+
+
+def test_joints_and_limits_are_those_of_the_file(arms):
+    text = ec.init("arms/arm.urdf")
+    assert "joint2_deg = [-146, 0]                 # joint_a2, revolute" in text
+    assert 'base = "base_link"\nflange = "flange"' in text
+    text = ec.init("arms/arm.xml", "sites.toml", base="foot")
+    assert 'flange = "attachment_site"' in text and "joint3_mm = [0, 300]" in text
+    cell = ec.read_cell("sites.toml")
+    # The site's place in the flange's frame: 60 mm below it, 50 mm aside.
+    assert np.linalg.norm(cell.tool.markers["reflector"]) == pytest.approx(np.hypot(0.05, 0.06))
+    (Path("arms") / "free.csv").write_text(
+        "theta0_deg,d_mm,a_mm,alpha_deg\n0,400,0,90\n0,0,500,0\n0,0,0,90\n0,400,0,0\n"
+    )
+    assert "the file has no limit: guess" in ec.init("arms/free.csv", convention="modified")
+
+
+def test_a_file_that_is_there_is_kept_unless_forced(arms):
+    Path("cell.toml").write_text("mine")
+    code, _, err = run("init", "arms/arm.csv")
+    assert code == 2 and "give --force" in err and Path("cell.toml").read_text() == "mine"
+    assert run("init", "arms/arm.csv", "--force")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("arms/arm.obj",), "tells no robot; give a URDF"),
+        (("arms/none.urdf",), "none.urdf"),
+        (("arms/arm.csv", "--flange", "a"), "--flange has no meaning for a DH table"),
+        (("arms/arm.urdf", "--flange", "flunge"), "did you mean 'flange'"),
+        (("arms/arm.urdf", "--convention", "modified"), "--convention is for DH tables"),
+    ],
+)
+def test_what_is_wrong_is_said_and_nothing_is_written(words, told, arms):
+    code, _, err = run("init", *words)
+    assert code == 2 and told in err, err
+    assert not Path("cell.toml").exists()
+
+
+def test_effects_lists_every_effect_with_unit_size_and_words(arms):
+    code, out, err = run("effects")
+    assert code == 0, err
+    flat = " ".join(out.split())
+    for name in CATALOGUE:
+        assert name in out
+    assert "joint_offset: joints 1 to 6; 1 mrad δq = a: the joint's zero differs" in flat
+    ec.init("arms/arm.xml", "cell.toml")
+    code, out, err = run("effects", "cell.toml", "--json")
+    assert code == 0, err
+    found = {entry["name"]: entry for entry in json.loads(out)["effects"]}
+    assert found["joint_offset"]["on"] and not found["backlash"]["on"]
+    assert found["joint_offset"]["places"] == [f"joint{i}" for i in range(1, 6)]
+    (offset,) = found["joint_offset"]["parameters"]
+    assert (offset["unit"], offset["typical"]) == ("rad", 1e-3)
