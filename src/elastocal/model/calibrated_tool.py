@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,7 +17,7 @@ from elastocal.model.arm import row_inputs
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.inverse_kinematics import ARM_LENGTH
-from elastocal.model.symbolic import SymbolicArm
+from elastocal.model.symbolic import SymbolicArm, Total
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
@@ -96,49 +95,6 @@ def share_of_levels(angle: Array, levels: Array) -> Array:
     share[rows, order[low]] += 1 - (place - low)
     share[rows, order[high]] += place - low
     return share
-
-
-class Total:
-    """y(inputs, X, extra; θ) and dy/dz at the static equilibrium F(inputs, X; θ) = 0.
-
-    dy/dz = ∂y/∂z − ∂y/∂θ F_θ⁻¹ ∂F/∂z, by the adjoint λ = F_θ⁻ᵀ (∂y/∂θ)ᵀ as the partial
-    derivative of y − λᵀF.  `y` (m, 1) and `z` (k, 1) are expressions of `arm`, compiled for
-    its backend; `extra` are further symbols in y.  Where the model is linear (eq. 3) or rigid,
-    y is explicit and nothing is solved.
-    """
-
-    def __init__(self, arm: SymbolicArm, y: ca.SX, z: ca.SX, extra: Sequence[ca.SX] = ()) -> None:
-        self._arm = arm
-        theta = arm.arm.theta
-        inputs = [*arm.arm.inputs.values(), *extra, arm.p, theta]
-        if not arm.implicit:
-            y = arm.explicit(y, 0)
-            self._slopes = None
-            self._function = BatchFunction(inputs, [y, ca.jacobian(y, z)], arm.backend)
-            return
-        adjoint = ca.SX.sym("adjoint", y.shape[0], theta.shape[0])
-        lagrangian = y - adjoint @ arm.residual
-        self._slopes = BatchFunction(inputs, [ca.jacobian(y, theta)], arm.backend)
-        self._function = BatchFunction(
-            [*inputs, ca.vec(adjoint.T)], [y, ca.jacobian(lagrangian, z)], arm.backend
-        )
-
-    def __call__(
-        self, inputs: list[NDArray], x: Array, extra: Sequence[NDArray] = ()
-    ) -> tuple[Array, Array]:
-        """y (n, m) and dy/dz (n, m, k) of every row; y is NaN where there is no equilibrium."""
-        springs = self._arm.arm.theta.shape[0]
-        if self._slopes is None:
-            y, slope = self._function(*inputs, *extra, x, np.zeros((len(inputs[0]), springs)))
-            return y[..., 0], slope
-        theta, F_theta = self._arm.equilibrium.solve(inputs, x)
-        y_theta = self._slopes(*inputs, *extra, x, theta)[0]
-        y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
-        adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
-        adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
-        y, slope = self._function(*inputs, *extra, x, theta, adjoint)
-        y[~np.isfinite(theta).all(axis=1)] = np.nan
-        return y[..., 0], slope
 
 
 LEVEL = "level:"

@@ -266,7 +266,7 @@ class Model:
 
     def backend_report(self) -> str:
         """What evaluates this model, for reports: engine, compiler, cached or not, threads."""
-        return summary(self._symbolic.backend_reports.values())
+        return summary(self._symbolic.backend_reports)
 
     @property
     def nominal(self) -> Array:
@@ -328,21 +328,6 @@ class Model:
         if not self._symbolic.implicit:
             return np.zeros((len(inputs[0]), len(self._symbolic.arm.springs)), dtype=x.dtype)
         return self._symbolic.equilibrium.solve(inputs, x)[0]
-
-    def _rows(
-        self, table: Measurements, x: NDArray, columns: tuple[int, ...]
-    ) -> tuple[NDArray, NDArray]:
-        """Reading (n_rows, size) and B (n_rows, size, columns) of every table row."""
-        inputs = row_inputs(self._symbolic.arm, table)
-        if not self._symbolic.implicit:
-            h, B = self._symbolic.function("B", columns)(*inputs, x, self._settle(inputs, x))
-            return h[..., 0], B
-        theta, F_theta = self._symbolic.equilibrium.solve(inputs, x)
-        h_theta = self._symbolic.function("slopes")(*inputs, x, theta)[0]
-        adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), h_theta.transpose(0, 2, 1))
-        adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
-        h, B = self._symbolic.function("B", columns)(*inputs, x, theta, adjoint)
-        return h[..., 0], B
 
     def predict(
         self,
@@ -407,7 +392,7 @@ class Model:
         x = self.nominal if x is None else np.asarray(x)
         chosen = tuple(range(len(x))) if columns is None else tuple(int(c) for c in columns)
         observed = observations or observe(table, self.observe)
-        h, B = self._rows(table, x, chosen)
+        h, B = self._symbolic.regressor(row_inputs(self._symbolic.arm, table), x, columns=chosen)
         check_equilibrium(table, h)
         prediction = observed.apply(h).ravel()
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)

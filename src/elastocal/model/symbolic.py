@@ -20,6 +20,7 @@ from elastocal.model.choice import choose_effects, set_constants, sized_paramete
 from elastocal.model.effects.base import Effect
 from elastocal.model.evaluate import BackendReport, BatchFunction, row_blocks
 from elastocal.model.observations import observe
+from elastocal.units import Array
 
 # The static equilibrium of all poses at once, and the exact derivative through it.
 
@@ -72,9 +73,9 @@ class Equilibrium:
         return BatchFunction([*self._symbols, direction], [slope], self._backend)
 
     @property
-    def report(self) -> BackendReport:
+    def reports(self) -> list[BackendReport]:
         """What evaluated F and F_θ last."""
-        return self._last.report
+        return [self._last.report]
 
     def _residual(
         self, inputs: Sequence[NDArray], p: NDArray, theta: NDArray
@@ -192,7 +193,7 @@ class SymbolicArm:
         self.p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
         self._reading = self._expression(cell.model.observe)
         self._linear_model = cell.model.deflection_model == "linear"
-        self._functions: dict[tuple[str, tuple[int, ...]], BatchFunction] = {}
+        self._functions: dict[str, BatchFunction] = {}
 
     def _expression(self, observe: str) -> ca.SX:
         """The reading of one row (3, 6 or 1 components) as an expression."""
@@ -258,56 +259,101 @@ class SymbolicArm:
         return Equilibrium(inputs, self.p, self.arm.theta, self.residual, self.backend)
 
     @property
-    def backend_reports(self) -> dict[str, BackendReport]:
-        """What evaluated each function last, by its name and number of columns."""
-        reports = {
-            f"{name}[{len(columns)}]" if columns else name: function.report
-            for (name, columns), function in self._functions.items()
-        }
-        if "equilibrium" in self.__dict__:  # built: a cached property
-            reports["equilibrium"] = self.equilibrium.report
-        return reports
+    def backend_reports(self) -> list[BackendReport]:
+        """What evaluated each function last."""
+        built = [self.__dict__[k] for k in ("regressor", "equilibrium") if k in self.__dict__]
+        own = [function.report for function in self._functions.values()]
+        return own + [report for one in built for report in one.reports]
 
-    def function(self, name: str, columns: tuple[int, ...] = ()) -> BatchFunction:
-        """Built on first use: "reading", "slopes", "B" (of `columns`), "frames"."""
-        if (name, columns) not in self._functions:
-            self._functions[name, columns] = self._build(name, list(columns))
-        return self._functions[name, columns]
-
-    def _build(self, name: str, columns: list[int]) -> BatchFunction:
-        arm, p, theta = self.arm, self.p, self.arm.theta
-        inputs = [*arm.inputs.values(), p, theta]
-        if name == "frames":
+    def function(self, name: str) -> BatchFunction:
+        """Built on first use: "reading", and "frames" of flange, marker and target."""
+        if name not in self._functions:
+            arm = self.arm
             frames = [arm.T_tracker_flange, arm.reading["position"], arm.reading["rotation"]]
-            if self._linear:
-                frames = [ca.reshape(self._linearised(ca.vec(f)), *f.shape) for f in frames]
-            return BatchFunction(inputs, frames, self.backend)
-        h = self._settled_reading
-        if name == "reading":
-            return BatchFunction(inputs, [h], self.backend)
-        if name == "slopes":
-            return BatchFunction(inputs, [ca.jacobian(h, theta)], self.backend)
-        wider = self._functions.get(("B", tuple(range(len(self.parameters)))))
-        adjoint, B = self._derivative
-        more = [ca.vec(adjoint.T)] if self.implicit else []
-        return BatchFunction([*inputs, *more], [h, B[:, columns]], self.backend, wider, columns)
+            outputs = [self.settled(y) for y in ([self._reading] if name == "reading" else frames)]
+            inputs = [*arm.inputs.values(), self.p, arm.theta]
+            self._functions[name] = BatchFunction(inputs, outputs, self.backend)
+        return self._functions[name]
 
     @cached_property
-    def _settled_reading(self) -> ca.SX:
-        """The reading, by eq. (3) where the model is linear, else in X and θ."""
-        return self._linearised(self._reading) if self._linear else self._reading
+    def regressor(self) -> Total:
+        """The reading h of every row and B = dh/dX."""
+        return Total(self, self._reading, self.p)
+
+    def settled(self, y: ca.SX) -> ca.SX:
+        """y by eq. (3) where the model is linear, else in X and θ."""
+        return y if self.implicit else self.explicit(y, 0)
+
+
+class Total:
+    """y(inputs, X, extra; θ) and dy/dz at the static equilibrium F(inputs, X; θ) = 0.
+
+    dy/dz = ∂y/∂z − ∂y/∂θ F_θ⁻¹ ∂F/∂z, by the adjoint λ = F_θ⁻ᵀ (∂y/∂θ)ᵀ as the partial derivative
+    of y − λᵀF: a few reverse sweeps instead of all of ∂F/∂z.  `y` (m, 1) and `z` (k, 1) are
+    expressions of `arm`, evaluated by its backend; `extra` are further symbols in y.  Where the
+    model is linear (eq. 3) or rigid, y is explicit and nothing is solved.
+    """
+
+    def __init__(self, arm: SymbolicArm, y: ca.SX, z: ca.SX, extra: Sequence[ca.SX] = ()) -> None:
+        self._arm, self._y, self._z = arm, arm.settled(y), z
+        self._inputs = [*arm.arm.inputs.values(), *extra, arm.p, arm.arm.theta]
+        self._functions: dict[tuple[int, ...], BatchFunction] = {}
 
     @cached_property
     def _derivative(self) -> tuple[ca.SX, ca.SX]:
-        """Symbols λ (components, springs), none without an equilibrium, and B of every column.
+        """Symbols λ (m, springs), none without an equilibrium, and dy/dz."""
+        arm = self._arm
+        adjoint = ca.SX.sym("adjoint", self._y.shape[0], arm.arm.theta.shape[0])
+        lagrangian = self._y - adjoint @ arm.residual if arm.implicit else self._y
+        return adjoint, ca.jacobian(lagrangian, self._z)
 
-        Adjoint of the equilibrium: with λ = F_θ⁻ᵀ h_θᵀ the total derivative of component c is the
-        partial one of h_c − λ_cᵀ F, a few reverse sweeps instead of all of ∂F/∂X.
+    @cached_property
+    def _slopes(self) -> BatchFunction:
+        """∂y/∂θ."""
+        outputs = [ca.jacobian(self._y, self._arm.arm.theta)]
+        return BatchFunction(self._inputs, outputs, self._arm.backend)
+
+    @property
+    def reports(self) -> list[BackendReport]:
+        """What evaluated each function last."""
+        slopes = [self._slopes] if "_slopes" in self.__dict__ else []
+        return [function.report for function in (*self._functions.values(), *slopes)]
+
+    def _function(self, columns: tuple[int, ...]) -> BatchFunction:
+        """y and the `columns` of dy/dz."""
+        if columns not in self._functions:
+            wider = self._functions.get(tuple(range(self._z.shape[0])))
+            adjoint, slope = self._derivative
+            inputs = [*self._inputs, *([ca.vec(adjoint.T)] if self._arm.implicit else [])]
+            outputs = [self._y, slope[:, list(columns)]]
+            backend = self._arm.backend
+            self._functions[columns] = BatchFunction(inputs, outputs, backend, wider, columns)
+        return self._functions[columns]
+
+    def __call__(
+        self,
+        inputs: list[NDArray],
+        x: Array,
+        extra: Sequence[NDArray] = (),
+        columns: tuple[int, ...] | None = None,
+    ) -> tuple[Array, Array]:
+        """y (n, m) and dy/dz (n, m, columns) of every row; y is NaN where there is no equilibrium.
+
+        `columns` are those of z, by default all.
         """
-        h = self._settled_reading
-        adjoint = ca.SX.sym("adjoint", h.shape[0], self.arm.theta.shape[0] if self.implicit else 0)
-        lagrangian = h - adjoint @ self.residual if self.implicit else h
-        return adjoint, ca.jacobian(lagrangian, self.p)
+        arm, given = self._arm, [*inputs, *extra, x]
+        function = self._function(tuple(range(self._z.shape[0])) if columns is None else columns)
+        if not arm.implicit:
+            y, slope = function(*given, np.zeros((len(inputs[0]), arm.arm.theta.shape[0])))
+            return y[..., 0], slope
+        theta, F_theta = arm.equilibrium.solve(inputs, x)
+        y_theta = self._slopes(*given, theta)[0]
+        y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
+        adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
+        adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
+        y, slope = function(*given, theta, adjoint)
+        y[~np.isfinite(theta).all(axis=1)] = np.nan
+        return y[..., 0], slope
 
 
 def _check_names(parameters: Sequence[Parameter], cell: Cell) -> None:

@@ -92,6 +92,11 @@ class Effect:
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
+    # Where it acts, unless `places` says more: at all "joints", "turning joints", "links" or
+    # "markers", or at the one place of this name.
+    at: ClassVar[str] = ""
+    # Its settings, unless `settings` says more.
+    constants: ClassVar[tuple[Setting, ...]] = ()
     # What the table must say for the effect to show, of NEEDS.
     needs: ClassVar[tuple[str, ...]] = ()
 
@@ -118,7 +123,11 @@ class Effect:
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         """Every place where this effect makes sense on this arm, e.g. ("joint1", …)."""
-        raise NotImplementedError
+        known = {
+            "joints": joints, "turning joints": turning_joints, "links": links,
+            "markers": lambda _: tuple(f"marker:{name}" for name in cell.tool.markers),
+        }  # fmt: skip
+        return known[self.at](chain) if self.at in known else (self.at,)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         """The parameters at one place; loads may have none."""
@@ -142,7 +151,7 @@ class Effect:
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         """Constants of the expression at one place that are set or searched, not fitted."""
-        return ()
+        return self.constants
 
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
         """The smooth functions that its shrunk parameters at one place make up, if they do."""
@@ -198,7 +207,7 @@ def check(effect: object) -> None:
         if need not in NEEDS:
             raise InputError(f"{kind.__name__}.needs takes {listed(NEEDS)}; found {need!r}")
     hooks = ("shape", "load", "read")
-    lacking = [] if kind.places is not Effect.places else ["places"]
+    lacking = [] if kind.places is not Effect.places or kind.at else ["places"]
     lacking += [] if any(getattr(kind, h) is not getattr(Effect, h) for h in hooks) else ["a hook"]
     if lacking:
         raise InputError(

@@ -59,15 +59,13 @@ class JointDrift(DrivenEffect):
 
     name = "joint_drift"
     stage = "transmission"
+    constants = (TIME_CONSTANT,)
     formats = ("rigid", "elastic")
     needs = ("time",)
     entry = JointMotion()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (ParameterSpec("drift", motion_unit(place, chain), 0.0, 1e-4),)
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (TIME_CONSTANT,)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         return p["drift"] * warm_up(arm, p)
@@ -82,15 +80,13 @@ class EncoderJump(DrivenEffect):
 
     name = "encoder_jump"
     stage = "transmission"
+    constants = (change_time("jump_time_s"),)
     formats = ("rigid", "elastic")
     needs = ("time",)
     entry = JointMotion()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (ParameterSpec("jump", motion_unit(place, chain), 0.0, 1e-4),)
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (change_time("jump_time_s"),)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         return p["jump"] * after(arm, p["jump_time_s"])
@@ -106,15 +102,13 @@ class BaseDrift(DrivenEffect):
 
     name = "base_drift"
     stage = "tracker"
+    constants = (TIME_CONSTANT,)
     remedy = MEASURE_MONUMENTS
     needs = ("time",)
     entry = BaseMotion()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return pose_change("drift", 5e-5, 5e-5)
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (TIME_CONSTANT,)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         return ca.vertcat(*[p[f"drift_{k}"] for k in KEYS]) * warm_up(arm, p)
@@ -130,18 +124,14 @@ class FrameJump(DrivenEffect):
 
     name = "frame_jump"
     stage = "tracker"
+    at = "tracker"
+    constants = (change_time("jump_time_s"),)
     remedy = MEASURE_MONUMENTS
     needs = ("time",)
     entry = BaseMotion()
 
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return ("tracker",)
-
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return pose_change("jump", 1e-4, 5e-5)
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (change_time("jump_time_s"),)
 
     def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
         return ("base",)
@@ -159,6 +149,7 @@ class MarkerSlip(DrivenEffect):
 
     name = "marker_slip"
     stage = "tool"
+    constants = (change_time("slip_time_s"),)
     needs = ("time",)
     entry = MarkerMotion()
 
@@ -168,9 +159,6 @@ class MarkerSlip(DrivenEffect):
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return tuple(ParameterSpec(f"slip_{k}", "m", 0.0, 1.5e-4) for k in "xyz")
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (change_time("slip_time_s"),)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         slip = ca.vertcat(*[p[f"slip_{k}"] for k in "xyz"])

@@ -16,9 +16,6 @@ from elastocal.model.effects.base import (
     Effect,
     Symbols,
     index,
-    joints,
-    links,
-    turning_joints,
 )
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import SHORTEST, link_ends
@@ -77,13 +74,11 @@ class JointCompliance(TorqueEffect):
 
     name = "joint_compliance"
     stage = "compliance"
+    at = "joints"
     elastic = True
     sized_by_value = True
     rank = STIFFNESS
     formats = ("elastic",)
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         i = index(place)
@@ -172,9 +167,7 @@ class JointHardening(TorqueEffect):
 
     name = "joint_hardening"
     stage = "compliance"
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return turning_joints(chain)
+    at = "turning joints"
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         given = nominal_compliance(chain, cell)
@@ -207,13 +200,11 @@ class OffAxisCompliance(LoadedEffect):
 
     name = "off_axis_compliance"
     stage = "compliance"
+    at = "joints"
     elastic = True
     sized_by_value = True
     rank = STIFFNESS
     formats = ("elastic",)
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         given = nominal_compliance(chain, cell)
@@ -256,11 +247,9 @@ class LinkBending(LoadedEffect):
 
     name = "link_bending"
     stage = "compliance"
+    at = "links"
     elastic = True
     formats = ("elastic",)
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return links(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         given = nominal_compliance(chain, cell)
@@ -288,13 +277,11 @@ class BaseCompliance(LoadedEffect):
 
     name = "base_compliance"
     stage = "compliance"
+    at = "base"
     elastic = True
     sized_by_value = True
     rank = STIFFNESS
     formats = ("elastic",)
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return ("base",)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         given = nominal_compliance(chain, cell)

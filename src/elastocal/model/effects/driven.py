@@ -11,7 +11,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.model import rigid
 from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import Effect, Stage, Symbols, index, joints, links
+from elastocal.model.effects.base import Effect, Stage, Symbols, index
 
 if TYPE_CHECKING:
     from elastocal.model.arm import Arm
@@ -49,10 +49,8 @@ class JointMotion(Entry):
 
     name = "joint_motion"
     stage: ClassVar[Stage] = "transmission"
+    at = "joints"
     units = ("rad",)
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return joints(chain)
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         arm.q[index(place)] += u[0]
@@ -63,10 +61,8 @@ class LinkLength(Entry):
 
     name = "link_length"
     stage: ClassVar[Stage] = "geometry"
+    at = "links"
     units = ("1",)
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return links(chain)
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         i = index(place)
@@ -80,10 +76,8 @@ class LinkFrame(Entry):
 
     name = "link_frame"
     stage: ClassVar[Stage] = "geometry"
+    at = "links"
     units = ("m", "m", "m", "rad", "rad", "rad")
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return links(chain)
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         i = index(place)
@@ -98,10 +92,8 @@ class BaseMotion(Entry):
 
     name = "base_motion"
     stage: ClassVar[Stage] = "tracker"
+    at = "base"
     units = ("m", "m", "m", "rad", "rad", "rad")
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return ("base",)
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         T = arm.T_tracker_base
@@ -114,10 +106,8 @@ class MarkerMotion(Entry):
 
     name = "marker_motion"
     stage: ClassVar[Stage] = "tool"
+    at = "markers"
     units = ("m", "m", "m")
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return tuple(f"marker:{name}" for name in cell.tool.markers)
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         arm.markers[place.removeprefix("marker:")] += u
@@ -134,7 +124,7 @@ class DrivenEffect(Effect):
     entry: ClassVar[Entry]
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return self.entry.places(chain, cell)
+        return super().places(chain, cell) if self.at else self.entry.places(chain, cell)
 
     @abstractmethod
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:

@@ -17,7 +17,6 @@ from elastocal.model.effects.base import (
     index,
     joints,
     motion_unit,
-    turning_joints,
 )
 from elastocal.model.effects.driven import DrivenEffect, JointMotion
 
@@ -27,11 +26,9 @@ class JointOffset(Effect):
 
     name = "joint_offset"
     stage = "transmission"
+    at = "joints"
     rank = OFFSET
     formats = ("rigid", "elastic")
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (ParameterSpec("offset", motion_unit(place, chain), 0.0, 1e-3),)
@@ -61,12 +58,10 @@ class GearHarmonic(DrivenEffect):
     """
 
     stage = "transmission"
+    at = "turning joints"
     entry = JointMotion()
     prefix: ClassVar[str]
     typical: ClassVar[float]
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return turning_joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return tuple(
@@ -162,13 +157,11 @@ class GearSpectrum(DrivenEffect):
 
     name = "gear_spectrum"
     stage = "transmission"
+    at = "turning joints"
     together = True
     family = "angle"
     sized_by = "spectrum_size_rad"
     entry = JointMotion()
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return turning_joints(chain)
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         stated = cell.model.nominal.settings.get(place, {})

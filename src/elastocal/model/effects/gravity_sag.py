@@ -40,7 +40,6 @@ from elastocal.model.effects.base import (
     Symbols,
     index,
     links,
-    turning_joints,
 )
 from elastocal.model.effects.compliances import transverse_axes
 from elastocal.model.effects.driven import DrivenEffect, JointMotion
@@ -114,16 +113,12 @@ class GravitySag(DrivenEffect):
 
     name = "gravity_sag"
     stage = "transmission"
+    at = "turning joints"
+    constants = (Setting("sag_size_rad", "range", 2e-4, 1e-12, 1.0),)
     together = True
     family = "gravity"
     sized_by = "sag_size_rad"
     entry = JointMotion()
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return turning_joints(chain)
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (Setting("sag_size_rad", "range", 2e-4, 1e-12, 1.0),)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         size = cell.model.nominal.settings.get(place, {}).get("sag_size_rad", 2e-4)
@@ -169,12 +164,10 @@ class LinkWeights(Effect):
 
     name = "link_weights"
     stage = "load"
+    at = "arm"
     together = True
     family = "gravity"
     sized_by = "weights_kg_per_m"
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return ("arm",)
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         density = WEIGHT * float(lengths_carried(chain)[0])

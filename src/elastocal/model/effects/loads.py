@@ -36,6 +36,7 @@ class Payload(Effect):
 
     name = "payload"
     stage = "load"
+    at = "load"
     formats = ("elastic",)
 
     def acts_unasked(self, cell: Cell) -> bool:
@@ -43,9 +44,6 @@ class Payload(Effect):
 
     def may_be_missing(self, cell: Cell) -> bool:
         return False
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return ("load",)
 
     def load(self, arm: Arm, place: str, p: Symbols) -> None:
         point = rigid.point(arm.T_tracker_flange, rigid.constant(arm.cell.tool.load_point))
@@ -61,12 +59,10 @@ class PayloadError(Effect):
 
     name = "payload_error"
     stage = "load"
+    at = "load"
     formats = ("elastic",)
     remedy = WEIGH_LOAD
     needs = ("load",)
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return ("load",)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (
@@ -93,6 +89,7 @@ class LinkGravity(Effect):
 
     name = "link_gravity"
     stage = "load"
+    at = "links"
     formats = ("elastic",)
 
     def acts_unasked(self, cell: Cell) -> bool:
@@ -100,9 +97,6 @@ class LinkGravity(Effect):
 
     def may_be_missing(self, cell: Cell) -> bool:
         return False
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return links(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         require(

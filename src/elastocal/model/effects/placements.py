@@ -10,7 +10,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import LINK, MARKER, STATION, Effect, Symbols, index, links
+from elastocal.model.effects.base import LINK, MARKER, STATION, Effect, Symbols, index
 from elastocal.units import Array
 
 KEYS = ("x", "y", "z", "rx", "ry", "rz")
@@ -25,6 +25,7 @@ class BaseFrame(Effect):
 
     name = "base_frame"
     stage = "tracker"
+    at = "base"
     registered = True
     rank = STATION
     formats = ("rigid", "elastic")
@@ -32,9 +33,6 @@ class BaseFrame(Effect):
     @property
     def of_the_measurement(self) -> bool:
         return False  # where the base stands is the arm's
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return ("base",)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         nominal = cell.model.nominal
@@ -77,11 +75,9 @@ class LinkGeometry(Effect):
 
     name = "link_geometry"
     stage = "geometry"
+    at = "links"
     rank = LINK
     formats = ("rigid", "elastic")
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return links(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         lengths = [ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")]
@@ -103,12 +99,10 @@ class MarkerPosition(Effect):
 
     name = "marker_position"
     stage = "tool"
+    at = "markers"
     registered = True
     rank = MARKER
     formats = ("rigid", "elastic")
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return tuple(f"marker:{name}" for name in cell.tool.markers)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         nominal = cell.tool.markers[place.removeprefix("marker:")]
@@ -125,15 +119,13 @@ class MarkerOrientation(Effect):
 
     name = "marker_orientation"
     stage = "tool"
+    at = "markers"
     registered = True
     rank = MARKER
     formats = ("rigid", "elastic")
 
     def may_be_missing(self, cell: Cell) -> bool:
         return cell.model.observe == "pose"
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return tuple(f"marker:{name}" for name in cell.tool.markers)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return tuple(ParameterSpec(k, "rad", 0.0, 3e-3) for k in ("rx", "ry", "rz"))
@@ -153,14 +145,12 @@ class DistanceSensor(Effect):
 
     name = "distance_sensor"
     stage = "tracker"
+    at = "tracker"
     registered = True
     rank = STATION
 
     def may_be_missing(self, cell: Cell) -> bool:
         return cell.model.observe == "distance"
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return ("tracker",)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         nominal = cell.tracker.anchor if cell.tracker.anchor is not None else np.zeros(3)

@@ -12,7 +12,7 @@ import casadi as ca
 from elastocal.cell.work_cell import Cell
 from elastocal.model.arm import Arm, ParameterSpec
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import Effect, Symbols, index, turning_joints
+from elastocal.model.effects.base import Effect, Symbols, index
 from elastocal.model.effects.compliances import (
     TorqueEffect,
     add_deflection,
@@ -44,13 +44,11 @@ class Backlash(TorqueEffect):
 
     name = "backlash"
     stage = "transmission"
+    at = "turning joints"
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
         sided = cell.model.play_side == "load_and_approach" and cell.model.approach != BY_ORDER
         return (*super().needed(cell), "approach") if sided else super().needed(cell)
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return turning_joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (ParameterSpec("backlash", "rad", 0.0, 2e-4, lower=0.0),)
@@ -79,13 +77,11 @@ class Hysteresis(Effect):
 
     name = "hysteresis"
     stage = "transmission"
+    at = "turning joints"
     needs = ("approach",)
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
         return () if cell.model.approach == BY_ORDER else self.needs
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return turning_joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         size = 5e-5
@@ -124,12 +120,10 @@ class MoveLag(DrivenEffect):
 
     name = "move_lag"
     stage = "transmission"
+    at = "turning joints"
     together = True
     family = "move"
     entry = JointMotion()
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return turning_joints(chain)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (

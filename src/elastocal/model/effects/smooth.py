@@ -148,13 +148,11 @@ class JointCurve(DrivenEffect):
 
     name = "joint_curve"
     stage = "transmission"
+    at = "turning joints"
     together = True
     family = "angle"
     sized_by = "curve_size_rad"
     entry = JointMotion()
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return turning_joints(chain)
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         return (

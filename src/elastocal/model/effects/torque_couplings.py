@@ -15,7 +15,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import Symbols, index, joints, links, motion_unit, turning_joints
+from elastocal.model.effects.base import Symbols, index, links, motion_unit, turning_joints
 from elastocal.model.effects.compliances import transverse_axes
 from elastocal.model.effects.driven import DrivenEffect, JointMotion, LinkFrame
 from elastocal.model.effects.placements import link_ends
@@ -39,17 +39,13 @@ class TorqueCoupling(DrivenEffect):
 
     name = "torque_coupling"
     stage = "transmission"
+    at = "joints"
+    constants = (COUPLING,)
     together = True
     family = "torque"
     sized_by = "coupling_rad_per_Nm"
     needs = ("torque",)
     entry = JointMotion()
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return joints(chain)
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (COUPLING,)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         size, unit = _size(COUPLING, place, cell), motion_unit(place, chain)
@@ -87,6 +83,7 @@ class TorqueTilt(DrivenEffect):
 
     name = "torque_tilt"
     stage = "geometry"
+    constants = (TILT,)
     together = True
     family = "torque"
     sized_by = "tilt_rad_per_Nm"
@@ -95,9 +92,6 @@ class TorqueTilt(DrivenEffect):
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return tuple(link for link in links(chain) if tilt_axes(chain, index(link)))
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (TILT,)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         size = _size(TILT, place, cell)
