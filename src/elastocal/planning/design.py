@@ -28,7 +28,12 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.drift import Alias
-from elastocal.planning.exact_plan import exact_plan, random_plans, size_curve
+from elastocal.planning.exact_plan import (
+    exact_plan,
+    random_information,
+    random_plans,
+    size_curve,
+)
 from elastocal.planning.execution import Execution, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Done, load_states, measured, next_number, readings_each
@@ -37,6 +42,7 @@ from elastocal.planning.plan import (
     CandidateCounts,
     Certificate,
     Chance,
+    Everywhere,
     Plan,
     PlanSize,
     predicted,
@@ -44,7 +50,7 @@ from elastocal.planning.plan import (
 )
 from elastocal.planning.polish import Continuum, Searches, estimate, polish
 from elastocal.planning.relaxation import Relaxed, relax
-from elastocal.planning.selection import efficiency, values_without
+from elastocal.planning.selection import DesignProblem, efficiency, values_without
 from elastocal.planning.setup import (
     FeasiblePool,
     Known,
@@ -54,7 +60,7 @@ from elastocal.planning.setup import (
     set_up,
     shares_of,
 )
-from elastocal.planning.test_poses import check_cell, test_poses
+from elastocal.planning.test_poses import check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
@@ -517,6 +523,9 @@ class _Design:
         workspace = replace(self.cell.workspace, visibility=None, load=None)
         at_work = Feasibility(replace(self.cell, workspace=workspace), self.chain)
         targets = test_poses(self.cell, self.chain, at_work, options.seed)
+        region = None
+        if "test_poses" in CRITERIA[self.cell.design.criterion].needs:
+            region = everywhere(self.cell, self.chain, at_work, options.seed)
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
@@ -528,7 +537,15 @@ class _Design:
         known = Known(options.fixed, options.prior, done)
         progress("information of the candidates")
         setup = set_up(
-            self.model, self.states, q, load, int(shares.sum()), targets, known, options.seed
+            self.model,
+            self.states,
+            q,
+            load,
+            int(shares.sum()),
+            targets,
+            known,
+            options.seed,
+            region,
         )
         self.warnings += setup.warnings
         pool = setup.pool(q, load, group)
@@ -673,7 +690,16 @@ class _Design:
             warnings=tuple(self.warnings),
             first=next_number(self.options.done),
             chance=Chance.of(drawn, found.value, setup.criterion),
+            everywhere=self._everywhere(setup, problem, M),
         )  # fmt: skip
+
+    def _everywhere(self, setup: Setup, problem: DesignProblem, M: Array) -> Everywhere | None:
+        """The error of the plan of information M (p, p) at the test poses and elsewhere."""
+        own, elsewhere = setup.target_rows, setup.elsewhere_rows
+        if own is None or elsewhere is None:
+            return None
+        random = random_information(problem, self.options.seed)[:, 0]
+        return Everywhere.of(own, elsewhere, M, random)
 
 
 def _check_criterion(model: Model) -> None:
