@@ -174,8 +174,8 @@ def plan_tone(plan: Plan) -> Tone:
 
 def plan_steps(plan: Plan) -> list[str]:
     steps = [
-        "Measure the poses in the order given: it keeps drift apart from what is sought, and every "
-        "move was checked. Record the time of each reading."
+        "Measure the poses in the order given, which keeps a drift apart from what is sought, and "
+        "record the time of each reading."
     ]
     if plan.criterion == "test_pose":
         steps.append(
@@ -289,7 +289,8 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
         (
             "Certificate",
             f"certified on the pool: efficiency {c.efficiency_pool:.4f} against the best plan "
-            f"of these shares from {c.pool} candidates{told.replace(' )', ')')}.",
+            f"of these shares from {c.pool} candidates, each in it once"
+            f"{told.replace(' )', ')')}.",
         )
     ]
     if c.efficiency_continuum is not None:
@@ -318,7 +319,15 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
     if via:
         text += f", {via} points in between to get around obstacles"
-    return "Execution", f"{text}, {e.total / 60:.0f} min in all; every move checked."
+    space = plan.model.cell.workspace
+    bodies = len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0
+    checked = (
+        "every move checked"
+        if bodies
+        else "no move was checked, as [workspace] states no bodies, and poses may reach below the "
+        "mounting plane"
+    )
+    return "Execution", f"{text}, {e.total / 60:.0f} min in all; {checked}."
 
 
 def _drift_lines(plan: Plan) -> list[tuple[str, str]]:
