@@ -126,6 +126,7 @@ def design(
     test_poses: ArrayLike | Sequence[TargetPose] | None = None,
     test_path: str | Path | TargetPath | None = None,
     test_box: tuple[ArrayLike, ArrayLike] | TargetBox | None = None,
+    elsewhere: float | None = None,
     motion: Motion | None = None,
     load_changes: int | None = None,
     reference_every: int | None = None,
@@ -169,6 +170,8 @@ def design(
         test_poses: Joints (k, joints) in rad or m where the position must be right.
         test_path: A table (CSV) of such places.
         test_box: Lower and upper corner (3,) in m of a box of such places, in the data's frame.
+        elsewhere: Share of the criterion's weight, 0 to below 1, that poses all over the joint
+            ranges have beside the test poses.
         motion: How the arm moves between poses, which decides their order.
         load_changes: How often the load may be hung, exchanged or taken off; default as rarely as
             can be. More of them keep a drift further apart from what the loads show.
@@ -282,6 +285,10 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
         chosen["levels"] = {k: tuple(map(float, v)) for k, v in chosen["levels"].items()}
         chosen.setdefault("per_level", ())
+    if "elsewhere" in chosen:
+        share = float(chosen["elsewhere"])
+        require(0 <= share < 1, f"{option('elsewhere')} takes a share from 0 to below 1")
+        chosen["elsewhere"] = share
     motion = {
         key: _whole(key, chosen.pop(key), 1)
         for key in ("load_changes", "reference_every")

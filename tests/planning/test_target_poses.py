@@ -19,6 +19,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.planning import TargetPoses
 from elastocal.planning import test_poses as target_poses
+from elastocal.planning.test_poses import DEFAULT_COUNT
 
 CHAIN = kr270_chain()
 LOADS = np.array([[0.0, 0, 0], [0, 0, -2600], [0, 900, -2600]])
@@ -326,12 +327,12 @@ def test_places_without_an_allowed_posture_are_told() -> None:
 def test_without_any_source_poses_are_drawn_over_the_limits_and_it_is_said() -> None:
     cell = replace(cell_of(loads=LOADS[:2]), limits={"joint1": (-0.5, 0.5)})
     found = poses_of(cell)
-    assert len(found.q) == 20
+    assert len(found.q) == DEFAULT_COUNT
     assert np.abs(found.q[:, 0]).max() <= 0.5
     assert found.q[:, 0].min() < -0.3
     assert found.q[:, 0].max() > 0.3
-    np.testing.assert_array_equal(found.force, np.tile(LOADS[1], (20, 1)))
-    assert "20 drawn over the joint limits (the cell states none)" in found.source
+    np.testing.assert_array_equal(found.force, np.tile(LOADS[1], (DEFAULT_COUNT, 1)))
+    assert f"{DEFAULT_COUNT} drawn over the joint limits (the cell states none)" in found.source
     np.testing.assert_array_equal(poses_of(cell).q, found.q)
     assert (poses_of(cell, seed=1).q != found.q).any()
 
@@ -339,7 +340,7 @@ def test_without_any_source_poses_are_drawn_over_the_limits_and_it_is_said() -> 
 def test_drawn_poses_keep_to_the_rules() -> None:
     found = poses_of(cell_of(loads=LOADS[:2]), Elbow(2.0))
     assert (found.q[:, 2] > 2.0).all()
-    assert len(found.q) == 20
+    assert len(found.q) == DEFAULT_COUNT
     with pytest.raises(InsufficientDataError, match=r"allow none of .* postures"):
         poses_of(cell_of(), Elbow(100.0))
 

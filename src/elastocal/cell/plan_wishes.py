@@ -177,7 +177,9 @@ class DesignSpec:
     them chosen per pose where `load_choice`; `repeats` readings each.  `repeatability` m: standard
     deviation of a deviation common to a configuration's readings, per direction; `marker_sigma`
     m per marker instead of the tracker's noise; `interest`: parameters, places or effects that
-    D, A, E and O count (default all but base and markers); `combination` name → factor for c."""
+    D, A, E and O count (default all but base and markers); `elsewhere`: the share of the weight
+    that poses all over the joint ranges have beside the test poses; `combination` name → factor
+    for c."""
 
     poses: Count | None = keyed("a whole number >= 1", default=None)
     criterion: Text = keyed(
@@ -206,6 +208,9 @@ class DesignSpec:
         default_factory=dict,
     )
     prior: Literal["none", "typical"] = keyed(default="none")
+    elsewhere: Annotated[float, Field(ge=0, lt=1)] = keyed(
+        "a number from 0 to below 1", default=0.0
+    )
     robust: Literal["none", "average", "worst"] = keyed(default="none")
     robust_samples: Count = keyed("a whole number >= 1", default=8)
     candidates: Count = keyed("a whole number >= 1", default=20_000)

@@ -91,6 +91,12 @@ def design(
         int | None, typer.Option(min=1, help="Feasible candidates to choose from, over all levels.")
     ] = None,
     effort: Annotated[str, typer.Option(help="quick, normal or thorough.")] = "normal",
+    elsewhere: Annotated[
+        float | None,
+        typer.Option(
+            min=0, max=0.99, help="Share of the weight for poses beside the test poses, as in 0.2."
+        ),
+    ] = None,
     load_changes: Annotated[
         int | None,
         typer.Option(
@@ -139,6 +145,7 @@ def design(
         "criterion": criterion,
         "target": _target(target, poses),
         "candidates": candidates,
+        "elsewhere": elsewhere,
         "load_changes": load_changes,
         "reference_every": reference_every,
     }

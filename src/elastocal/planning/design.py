@@ -24,11 +24,17 @@ from elastocal.files import atomic_write_bytes, open_input
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_limits
+from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.drift import Alias
-from elastocal.planning.exact_plan import exact_plan, random_plans, size_curve
+from elastocal.planning.exact_plan import (
+    exact_plan,
+    random_information,
+    random_plans,
+    size_curve,
+)
 from elastocal.planning.execution import Execution, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Done, load_states, measured, next_number, readings_each
@@ -37,6 +43,7 @@ from elastocal.planning.plan import (
     CandidateCounts,
     Certificate,
     Chance,
+    Everywhere,
     Plan,
     PlanSize,
     predicted,
@@ -44,7 +51,7 @@ from elastocal.planning.plan import (
 )
 from elastocal.planning.polish import Continuum, Searches, estimate, polish
 from elastocal.planning.relaxation import Relaxed, relax
-from elastocal.planning.selection import efficiency, values_without
+from elastocal.planning.selection import DesignProblem, efficiency, values_without
 from elastocal.planning.setup import (
     FeasiblePool,
     Known,
@@ -54,7 +61,7 @@ from elastocal.planning.setup import (
     set_up,
     shares_of,
 )
-from elastocal.planning.test_poses import check_cell, test_poses
+from elastocal.planning.test_poses import check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
@@ -232,25 +239,29 @@ class Selection:
         """Poses of the plan that are not candidates of the first pool."""
         return int((self.chosen >= self.first).sum())
 
-    def without(self, lost: IntArray, setup: Setup, shares: IntArray) -> Selection:
-        """The best plan found without the candidates `lost`, from what is left of this one.
+    def without(self, lost: IntArray, setup: Setup, shares: IntArray, stage: Stage) -> Selection:
+        """The best plan found without the candidates `lost`, from what is left of this one; what
+        `stage` has finished is taken from there.
 
         The bounds hold: those of a pool are those of every part of it.
         """
         kept = np.setdiff1d(np.arange(len(self.pool)), lost)
         pool = self.pool.take(kept)
         left = np.searchsorted(kept, np.setdiff1d(self.chosen, lost))
-        found = exact_plan(setup.problem(pool, shares), warm=left, starts=1)
+        problem = setup.problem(pool, shares)
+        state = stage.finished(lambda: {"chosen": exact_plan(problem, warm=left, starts=1).chosen})
+        chosen = state["chosen"]
+        value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
         c = self.certificate
         of_pool, of_continuum = (
-            None if share is None else share * (self.value / found.value)
+            None if share is None else share * (self.value / value)
             for share in (c.efficiency_pool, c.efficiency_continuum)
         )
         certificate = replace(
             c, pool=len(pool), efficiency_pool=of_pool, efficiency_continuum=of_continuum
         )
         first = self.first - int((lost < self.first).sum())
-        return Selection(pool, found.chosen, found.value, certificate, first)
+        return Selection(pool, chosen, value, certificate, first)
 
 
 def select(
@@ -311,7 +322,8 @@ class _Rounds:
             relaxed_weights=None if relaxed is None else relaxed.weights,
             tangent=None if relaxed is None else relaxed.tangent,
             warm=warm,
-            starts=EFFORTS[self.options.effort].starts,
+            # A plan that the comparison of sizes found has had as many starts.
+            starts=1 if k == 0 and warm is not None else EFFORTS[self.options.effort].starts,
             seed=self.options.seed,
             jobs=self.options.jobs,
             checkpoint=self.checkpoint.stage(f"exchange{k}"),
@@ -391,6 +403,7 @@ def ordered(
     feasibility: Feasibility,
     seed: int,
     progress: Progress,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Selection, Execution, list[str]]:
     """The selection in the order of its levels, its execution, and warnings.
 
@@ -407,7 +420,9 @@ def ordered(
             if lost >= MOST_REPLACED:
                 raise
             lost += len(error.poses)
-            found = found.without(np.unique(chosen[error.poses]), setup, shares)
+            progress(f"{lost} poses that no free move reaches are replaced by the best others")
+            stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
+            found = found.without(np.unique(chosen[error.poses]), setup, shares, stage)
             continue
         return replace(found, chosen=chosen), execution, _warnings(lost, execution)
 
@@ -485,7 +500,7 @@ class _Design:
         self.model = Model(cell, options.done.marker_names if options.done else ())
         if self.model.shrunk.any():
             self.model, options = self._without_functions(options)
-        self.options = options
+        self.model, self.options = self._without_conditions(options)
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
@@ -493,6 +508,7 @@ class _Design:
         self.states = load_states(self.cell)
         self.space = joint_space(self.cell, self.chain)
         self.feasibility = Feasibility(self.cell, self.chain)
+        _check_home(self.cell, self.feasibility)
 
     def _without_functions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
         """The model without its smooth functions, which no plan is made for."""
@@ -503,10 +519,28 @@ class _Design:
             "the other parameters; to show functions too, measure many poses all over the joints' "
             "ranges"
         )
-        rest = tuple(c for c in whole.cell.model.effects if c.name not in functions)
-        held = [n for n in options.fixed if whole.shrunk[whole.meant_by(n)].all()]
-        fixed = tuple(n for n in options.fixed if n not in held or not whole.meant_by(n))
-        return whole.with_effects(rest), replace(options, fixed=fixed)
+        return _without(whole, tuple(functions), options)
+
+    def _without_conditions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
+        """The model without effects of time, temperature or the approach, none of which a pose
+        has before it stands in an order."""
+        whole = self.model
+        names = tuple(
+            dict.fromkeys(
+                c.name
+                for c in whole.cell.model.effects
+                if not OPEN.isdisjoint(effect_of(c.name).needed(whole.cell))
+            )
+        )
+        if not names:
+            return whole, options
+        self.warnings.append(
+            f"the plan is made for the other parameters and holds {listed(names)} at nominal: when "
+            "and from where a pose is visited follows from the order alone; record times, and ask "
+            f"for reference poses ({option('reference_every', '10')}), so that identification can "
+            "tell them"
+        )
+        return _without(whole, names, options)
 
     def run(self) -> Plan:
         progress, options = self.progress, self.options
@@ -517,6 +551,9 @@ class _Design:
         workspace = replace(self.cell.workspace, visibility=None, load=None)
         at_work = Feasibility(replace(self.cell, workspace=workspace), self.chain)
         targets = test_poses(self.cell, self.chain, at_work, options.seed)
+        region = None
+        if "test_poses" in CRITERIA[self.cell.design.criterion].needs:
+            region = everywhere(self.cell, self.chain, at_work, options.seed)
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
@@ -528,7 +565,15 @@ class _Design:
         known = Known(options.fixed, options.prior, done)
         progress("information of the candidates")
         setup = set_up(
-            self.model, self.states, q, load, int(shares.sum()), targets, known, options.seed
+            self.model,
+            self.states,
+            q,
+            load,
+            int(shares.sum()),
+            targets,
+            known,
+            options.seed,
+            region,
         )
         self.warnings += setup.warnings
         pool = setup.pool(q, load, group)
@@ -571,7 +616,7 @@ class _Design:
         if target is None and not numbers:
             return (), shares, None
         state = self.checkpoint.stage("sizes").finished(
-            lambda: self._size_curve(setup, pool, target, numbers)
+            lambda: self._size_curve(setup, pool, target, numbers, shares)
         )
         reported = setup.criterion.reported
         points = tuple(
@@ -579,7 +624,7 @@ class _Design:
             for n, value, b in zip(state["n"], state["value"], state["bound"], strict=True)
         )
         if target is None:
-            return points, shares, None
+            return points, shares, state["plan"] if len(state["plan"]) else None
         smallest = int(state["smallest"])
         if not smallest:
             last = points[-1]
@@ -591,9 +636,11 @@ class _Design:
         return points, shares_of(self.cell, smallest), state["plan"]
 
     def _size_curve(
-        self, setup: Setup, pool: FeasiblePool, target: float | None, numbers: tuple[int, ...]
-    ) -> dict[str, NDArray]:
-        """As `size_curve`: bounds NaN where there are none, `smallest` 0 where none meets."""
+        self, setup: Setup, pool: FeasiblePool, target: float | None, numbers: tuple[int, ...],
+        shares: IntArray,
+    ) -> dict[str, NDArray]:  # fmt: skip
+        """As `size_curve`: bounds NaN where there are none, `smallest` 0 where none meets;
+        `plan` that of `smallest`, without a target that of `shares` where it was among them."""
         found = size_curve(
             lambda n: setup.problem(pool, shares_of(self.cell, n)),
             numbers,
@@ -605,13 +652,16 @@ class _Design:
             progress=self.progress,
         )
         plans = {p.n_poses: p.plan.chosen for p in found.points}
+        n = found.smallest or 0
+        if target is None and np.array_equal(shares_of(self.cell, int(shares.sum())), shares):
+            n = int(shares.sum())
         bounds = [np.nan if p.bound is None else p.bound for p in found.points]
         return {
             "n": np.array([p.n_poses for p in found.points]),
             "value": np.array([p.value for p in found.points]),
             "bound": np.array(bounds),
             "smallest": np.array(found.smallest or 0),
-            "plan": plans.get(found.smallest or 0, np.zeros(0, dtype=np.int64)),
+            "plan": plans.get(n, np.zeros(0, dtype=np.int64)),
         }
 
     def _target(self, setup: Setup, target: float) -> float:
@@ -633,8 +683,9 @@ class _Design:
     ) -> Plan:  # fmt: skip
         self.progress("order of execution")
         found, execution, told = ordered(
-            setup, found, shares, self.feasibility, self.options.seed, self.progress
-        )
+            setup, found, shares, self.feasibility, self.options.seed, self.progress,
+            self.checkpoint,
+        )  # fmt: skip
         self.warnings += told
         pool, chosen = found.pool, found.chosen
         q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
@@ -673,7 +724,43 @@ class _Design:
             warnings=tuple(self.warnings),
             first=next_number(self.options.done),
             chance=Chance.of(drawn, found.value, setup.criterion),
+            everywhere=self._everywhere(setup, problem, M),
         )  # fmt: skip
+
+    def _everywhere(self, setup: Setup, problem: DesignProblem, M: Array) -> Everywhere | None:
+        """The error of the plan of information M (p, p) at the test poses and elsewhere."""
+        own, elsewhere = setup.target_rows, setup.elsewhere_rows
+        if own is None or elsewhere is None:
+            return None
+        random = random_information(problem, self.options.seed)[:, 0]
+        return Everywhere.of(own, elsewhere, M, random)
+
+
+OPEN = frozenset({"time", "temperature", "approach"})
+
+
+def _without(
+    model: Model, effects: tuple[str, ...], options: DesignOptions
+) -> tuple[Model, DesignOptions]:
+    """The model without these effects, and nothing of them held."""
+    rest = tuple(c for c in model.cell.model.effects if c.name not in effects)
+    gone = {k for k, p in enumerate(model.parameters) if p.effect in effects}
+    meant = {name: set(model.meant_by(name)) for name in options.fixed}
+    fixed = tuple(name for name, of in meant.items() if not of or not of <= gone)
+    return model.with_effects(rest), replace(options, fixed=fixed)
+
+
+def _check_home(cell: Cell, feasibility: Feasibility) -> None:
+    """Told before the search: at home the arm touches nothing."""
+    home = cell.design.motion.home
+    if home is None:
+        return
+    met = Blockers(feasibility)(home, home, False)
+    require(
+        not met,
+        f"{cell.path or cell.name}: [design.motion] home brings {listed(met)} too close to each "
+        "other; state another home, or correct the bodies and clearances of [workspace]",
+    )
 
 
 def _check_criterion(model: Model) -> None:

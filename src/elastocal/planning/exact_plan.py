@@ -38,9 +38,14 @@ STREAM = 10_000  # of the seed's children, beyond those that draw candidates and
 def random_plans(problem: DesignProblem, seed: int, n: int = DRAWN) -> Array:
     """Φ (n,), ascending, of plans drawn uniformly from the candidates of `problem`, with its
     shares; inf for one that leaves a parameter open."""
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
-    M = np.stack([problem.prior + problem.sum_of(random_plan(problem, rng)) for _ in range(n)])
+    M = random_information(problem, seed, n)
     return np.sort(np.asarray(problem.criterion.value(M), dtype=np.float64))
+
+
+def random_information(problem: DesignProblem, seed: int, n: int = DRAWN) -> Array:
+    """M (n, S, p, p) of the plans of `random_plans`, as they were drawn."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
+    return np.stack([problem.prior + problem.sum_of(random_plan(problem, rng)) for _ in range(n)])
 
 
 # The best exact plan found from many starts, and the fewest poses that meet a target.

@@ -307,6 +307,32 @@ class Chance:
 
 
 @dataclass(frozen=True)
+class Everywhere:
+    """Rms position error in m after compensation, at the test poses and over all joint ranges, of
+    the plan and of the median random plan (None where that leaves parameters open)."""
+
+    test_poses: float
+    elsewhere: float
+    random_test_poses: float | None
+    random_elsewhere: float | None
+
+    @classmethod
+    def of(cls, own: Array, elsewhere: Array, M: Array, random: Array) -> Everywhere:
+        """Of R (r, p) at both, the plan's information M (p, p) and random plans' (n, p, p)."""
+
+        def rms(R: Array, M: Array) -> float:
+            try:
+                V = linalg.cho_solve(linalg.cho_factor(M), R.T)
+            except linalg.LinAlgError:
+                return np.inf
+            return float(np.sqrt(max(np.sum(R.T * V), 0.0)))
+
+        chance = [float(np.median([rms(R, m) for m in random])) for R in (own, elsewhere)]
+        told = [value if np.isfinite(value) else None for value in chance]
+        return cls(rms(own, M), rms(elsewhere, M), *told)
+
+
+@dataclass(frozen=True)
 class PlanSize:
     """The criterion of the best plan found of `poses` poses, and its bound, in the plan's unit."""
 
@@ -341,6 +367,7 @@ class Plan(Result):
         warnings: What to know before one measures, in sentences.
         first: Number of the first configuration: after those that were measured already.
         chance: What as many random poses would reach.
+        everywhere: The error at the test poses and over all joint ranges, in m.
 
     Examples:
         >>> plan = ec.design(
@@ -377,6 +404,7 @@ class Plan(Result):
     warnings: tuple[str, ...] = field(default=())
     first: int = 1
     chance: Chance | None = None
+    everywhere: Everywhere | None = None
 
     def __repr__(self) -> str:
         sure = self.certificate.efficiency_pool
@@ -442,6 +470,8 @@ class Plan(Result):
                 "ascents": c.ascents,
             },
             "random_plans": None if self.chance is None else asdict(self.chance),
+            "everywhere": None if self.everywhere is None else asdict(self.everywhere),
+            "drift": None if self.execution.drift is None else asdict(self.execution.drift),
             "predicted": [
                 {
                     "name": p.name,

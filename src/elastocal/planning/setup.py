@@ -28,6 +28,7 @@ from elastocal.planning.information import (
 from elastocal.planning.selection import DesignProblem
 from elastocal.planning.test_poses import (
     TargetPoses,
+    joined,
     on_kept,
     prediction_rows,
     remaining_bias,
@@ -147,8 +148,8 @@ class FeasiblePool:
 class Setup:
     """`information` over the kept parameters, `prior` (S, p, p) scaled, and the criterion.
 
-    `target_rows` (r, p): |R x| is the rms error at the test poses in m; None where the criterion
-    knows of none.
+    `target_rows` (r, p): |R x| is the rms error at the test poses in m, `elsewhere_rows` that over
+    all joint ranges; None where the criterion knows of none, or nothing can be said of them.
     """
 
     information: PoseInformation
@@ -157,6 +158,7 @@ class Setup:
     prior: Array
     warnings: tuple[str, ...]
     target_rows: Array | None = None
+    elsewhere_rows: Array | None = None
 
     def pool(self, q: Array, load: IntArray, group: IntArray) -> FeasiblePool:
         return FeasiblePool(q, load, group, self.information.blocks(q, load))
@@ -182,8 +184,12 @@ def set_up(
     targets: TargetPoses,
     known: Known,
     seed: int,
+    region: TargetPoses | None = None,
 ) -> Setup:
     """The parameters that the candidates q (N, n) show, and the criterion on them.
+
+    `region`: poses all over the joint ranges, which count for the criterion with the share
+    `[design] elsewhere`.
 
     Raises InsufficientDataError where no pose shows a parameter that the criterion needs, named
     with what it is combined with; InputError for unknown names.
@@ -204,18 +210,34 @@ def set_up(
     units = {p.unit for p in model.parameters if p.name in spec.combination}
     # A sentence per free parameter that no feasible pose shows at all.
     unseen = [int(i) for i in found.structure.invisible if i in free]
-    A, warnings = None, tuple(why(model, found, i) for i in unseen)
+    A, warnings = None, _unseen(model, found, unseen)
+    counted, own, elsewhere = targets, None, None
     if "test_poses" in criterion_named(spec.criterion).needs:
-        rows = np.stack([prediction_rows(information, targets, x) for x in scenarios])
+        T = len(targets.q)
+        both = targets if region is None else joined(targets, region, spec.elsewhere)
+        rows = np.stack([prediction_rows(information, both, x) for x in scenarios])
+        if region is not None:
+            elsewhere = _rms_rows(model, rows[:1, T:], region.weight, found)
+        if not spec.elsewhere:
+            rows = rows[:, :T]
+        elif elsewhere is None:
+            raise InsufficientDataError(
+                f"{model.cell.path or model.cell.name}: [design] elsewhere asks for poses all over "
+                "the joint ranges, but the rules allow none, or no plan can make all of them "
+                "certain; leave it out"
+            )
+        else:
+            counted = both
         A = on_kept(model, rows, found)
-        warnings += _held(model, found, remaining_bias(rows[0], targets.weight, found))
+        own = _root(A[0, :T], targets.weight)
+        warnings += _held(model, found, remaining_bias(rows[0], counted.weight, found))
     criterion = make_criterion(
         spec.criterion,
         parameters=len(kept),
         interest=interest,
         scenarios=len(scenarios),
         A=A,
-        weights=targets.weight,
+        weights=counted.weight,
         combination=_combination(model, found),
         unit=units.pop() if len(units) == 1 else "",
         n_poses=n_poses,
@@ -224,11 +246,37 @@ def set_up(
         robust=spec.robust,
     )
     prior = np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0)
-    R = None
-    if A is not None:
-        weighted = np.sqrt(targets.weight)[:, None, None] * A[0]
-        R = np.asarray(np.linalg.qr(weighted.reshape(-1, len(kept)), mode="r"))
-    return Setup(information, found, criterion, prior, warnings, R)
+    return Setup(information, found, criterion, prior, warnings, own, elsewhere)
+
+
+def _rms_rows(model: Model, rows: Array, weight: Array, found: Estimable) -> Array | None:
+    """R (r, p) of A (1, T, r, parameters): |R x| is the rms error in m at these poses; None where
+    no plan could make the position at all of them certain."""
+    try:
+        return _root(on_kept(model, rows, found)[0], weight)
+    except InsufficientDataError:
+        return None
+
+
+def _root(A: Array, weight: Array) -> Array:
+    """R (r, p) with RᵀR = Σ_t w_t A_tᵀ A_t, A (T, r, p)."""
+    weighted = np.sqrt(weight)[:, None, None] * A
+    return np.asarray(np.linalg.qr(weighted.reshape(-1, A.shape[-1]), mode="r"))
+
+
+def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...]:
+    """Why no feasible pose shows these parameters, in one sentence for those alike."""
+    if len(unseen) < 2:
+        return tuple(why(model, found, i) for i in unseen)
+    names = [model.names[i] for i in unseen]
+    loaded = model.cell.design.loads is not None and bool(np.any(model.cell.design.loads))
+    remedy = (
+        "change the load's direction or the limits" if loaded else "state a load ([design] loads_N)"
+    )
+    return (
+        f"no feasible pose shows {listed(names)}: they move no marker in any of them; {remedy}, or "
+        f"leave them out ({option('fixed', names[0])})",
+    )
 
 
 def _scenarios(model: Model, known: Known, seed: int) -> Array:

@@ -336,7 +336,10 @@ def remedy(cell: Cell) -> str:
 
 # The test poses: where position must be right, under which load, at which point of the tool.
 
-DEFAULT_COUNT = 20
+# Where the user states none: fewer, and the plan serves just these, and harms what is between them.
+DEFAULT_COUNT = 100
+ELSEWHERE = 200  # postures that stand for all of the joint ranges
+APART = 1  # added to the seed: not the postures that are drawn as test poses
 DRAWN = 4096  # postures among which the default test poses are sought, where a cell has rules
 
 
@@ -375,16 +378,13 @@ def test_poses(
     Several sources add up.  A pose without a force of its own is taken under each of the
     design's loads that is not zero, which share its weight.  Places are reached by the posture
     nearest to the home posture, or the middle of the joint ranges; with `feasibility` by the
-    first that its rules allow.  Without any source 20 poses are drawn over the joint limits.
+    first that its rules allow.  Without any source 100 poses are drawn over the joint limits.
 
     Raises InputError where a pose lies beyond the joint limits or out of reach, a table is wrong,
     and InsufficientDataError where the cell allows none of the drawn poses.
     """
     spec, groups = cell.design, []
-    # The load point where the cell states one, else the mean over the markers.
-    point = cell.tool.load_point
-    if not point.any() and cell.tool.markers:
-        point = np.asarray(np.mean(list(cell.tool.markers.values()), axis=0))
+    point = _point_of(cell)
     for k, pose in enumerate(spec.test_poses):
         key = place("design", "test_pose", k, "q_deg" if pose.degrees else "q_si")
         check_posture(cell, chain, key, pose.q, pose.degrees)
@@ -402,6 +402,36 @@ def test_poses(
         groups.append(_drawn(cell, chain, point, feasibility, seed))
     sources += [g.source for g in groups if g.source]
     return _together(groups, working_loads(cell), "test poses: " + ", ".join(sources))
+
+
+def everywhere(
+    cell: Cell, chain: Chain, feasibility: Checker | None = None, seed: int = 0
+) -> TargetPoses | None:
+    """Postures drawn over the joint limits that the rules allow, under each of the cell's loads:
+    what an arm may be used for besides the test poses.  None where none was found."""
+    point = _point_of(cell)
+    try:
+        group = _drawn(cell, chain, point, feasibility, seed + APART, ELSEWHERE)
+    except InsufficientDataError:
+        return None
+    return _together([group], working_loads(cell), "")
+
+
+def _point_of(cell: Cell) -> Array:
+    """The load point where the cell states one, else the mean over the markers."""
+    if cell.tool.load_point.any() or not cell.tool.markers:
+        return cell.tool.load_point
+    return np.asarray(np.mean(list(cell.tool.markers.values()), axis=0))
+
+
+def joined(stated: TargetPoses, others: TargetPoses, share: float) -> TargetPoses:
+    """Both, of which `others` have `share` of the weight."""
+    q, force, point, own = (
+        np.concatenate([getattr(stated, name), getattr(others, name)])
+        for name in ("q", "force", "point", "stated")
+    )
+    weight = np.concatenate([(1 - share) * stated.weight, share * others.weight])
+    return TargetPoses(q, force, weight, point, own, stated.source)
 
 
 def _together(groups: Sequence[_Group], loads: Array, source: str) -> TargetPoses:
@@ -482,9 +512,12 @@ def _in_box(
     return _Group(q, force, np.ones(len(q)), point, f"{len(q)} in [design.test_box]{lost}", stated)
 
 
-def _drawn(cell: Cell, chain: Chain, point: Array, rules: Checker | None, seed: int) -> _Group:
+def _drawn(
+    cell: Cell, chain: Chain, point: Array, rules: Checker | None, seed: int,
+    most: int = DEFAULT_COUNT,
+) -> _Group:  # fmt: skip
     low, high = finite_ranges(chain, *joint_limits(cell, chain))
-    count = DEFAULT_COUNT if rules is None else DRAWN
+    count = most if rules is None else DRAWN
     q = low + (high - low) * _sobol(chain.n_joints, count, seed)
     for name, levels in cell.model.compliance_levels.items():
         # Elsewhere the model has no compliance for that joint.
@@ -494,7 +527,7 @@ def _drawn(cell: Cell, chain: Chain, point: Array, rules: Checker | None, seed: 
         ok = np.logical_and.reduce(
             [rules.check(q, np.broadcast_to(f, (count, 3))).ok for f in loads]
         )
-        q = q[ok][:DEFAULT_COUNT]
+        q = q[ok][:most]
         if not len(q):
             raise InsufficientDataError(
                 f"{cell.path or cell.name}: the cell states no test poses, and its rules allow "

@@ -140,8 +140,11 @@ def plan_headline(plan: Plan) -> str:
     """What the plan is worth and how far from the best it is, in one sentence."""
     n = counted(len(plan.q), "pose")
     if plan.criterion == "test_pose":
+        share, rho = plan.model.cell.design.elsewhere, plan.reported
+        if share and plan.everywhere is not None:
+            rho = plan.everywhere.test_poses * 1e6
         text = (
-            f"{n} leave a position error of ρ₀ = {plan.reported:.3g} µm rms at the test poses "
+            f"{n} leave a position error of ρ₀ = {rho:.3g} µm rms at the test poses "
             "after compensation"
         )
     else:
@@ -171,8 +174,8 @@ def plan_tone(plan: Plan) -> Tone:
 
 def plan_steps(plan: Plan) -> list[str]:
     steps = [
-        "Measure the poses in the order given: it keeps drift apart from what is sought, and every "
-        "move was checked. Record the time of each reading."
+        "Measure the poses in the order given, which keeps a drift apart from what is sought, and "
+        "record the time of each reading."
     ]
     if plan.criterion == "test_pose":
         steps.append(
@@ -196,7 +199,8 @@ def plan_steps(plan: Plan) -> list[str]:
 
 def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     """What the plan is worth, as (label, sentence)."""
-    lines = [_criterion_line(plan), *_chance_lines(plan), _candidate_line(plan)]
+    lines = [_criterion_line(plan), *_everywhere_lines(plan), *_chance_lines(plan)]
+    lines.append(_candidate_line(plan))
     lines += _certificate_lines(plan)
     lines += [_execution_line(plan), *_drift_lines(plan)]
     if plan.polished:
@@ -206,12 +210,44 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _criterion_line(plan: Plan) -> tuple[str, str]:
+    share = plan.model.cell.design.elsewhere
+    if plan.criterion == "test_pose" and share:
+        return "Criterion", (
+            f"{plan.reported:.4g} µm, the rms position error that remains after compensation, "
+            f"{100 * (1 - share):.0f} % of it at the test poses ({printable(plan.targets)}) and "
+            f"{100 * share:.0f} % all over the joint ranges."
+        )
     if plan.criterion == "test_pose":
         return "Criterion", (
             f"ρ₀ = {plan.reported:.4g} µm, the rms position error that remains at the test poses "
             f"after compensation ({printable(plan.targets)})."
         )
     return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+
+
+def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
+    """The error at the test poses and all over the joint ranges, beside a random plan's."""
+    e = plan.everywhere
+    if e is None:
+        return []
+
+    def both(own: float | None, random: float | None) -> str:
+        chance = "none" if random is None else f"{random * 1e6:.4g}"
+        return f"{(own or 0.0) * 1e6:.4g} µm (a random plan {chance})"
+
+    text = (
+        f"rms error after compensation {both(e.test_poses, e.random_test_poses)} at the test "
+        f"poses, {both(e.elsewhere, e.random_elsewhere)} all over the joint ranges"
+    )
+    if worse_elsewhere(plan):
+        text += f"; {option('elsewhere', '0.2')} gives part of the weight to poses there"
+    return [("Elsewhere", f"{text}.")]
+
+
+def worse_elsewhere(plan: Plan) -> bool:
+    """Does the plan serve its test poses at the cost of the rest, where random plans do better?"""
+    e = plan.everywhere
+    return e is not None and e.random_elsewhere is not None and e.elsewhere > e.random_elsewhere
 
 
 def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
@@ -253,7 +289,8 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
         (
             "Certificate",
             f"certified on the pool: efficiency {c.efficiency_pool:.4f} against the best plan "
-            f"of these shares from {c.pool} candidates{told.replace(' )', ')')}.",
+            f"of these shares from {c.pool} candidates, each in it once"
+            f"{told.replace(' )', ')')}.",
         )
     ]
     if c.efficiency_continuum is not None:
@@ -282,7 +319,15 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
     if via:
         text += f", {via} points in between to get around obstacles"
-    return "Execution", f"{text}, {e.total / 60:.0f} min in all; every move checked."
+    space = plan.model.cell.workspace
+    bodies = len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0
+    checked = (
+        "every move checked"
+        if bodies
+        else "no move was checked, as [workspace] states no bodies, and poses may reach below the "
+        "mounting plane"
+    )
+    return "Execution", f"{text}, {e.total / 60:.0f} min in all; {checked}."
 
 
 def _drift_lines(plan: Plan) -> list[tuple[str, str]]:
