@@ -21,7 +21,6 @@ from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray
 
 CORRELATED = 0.9
-NO_BETTER = "held at nominal: poses that were not fitted are predicted no worse"
 NOT_SHOWN = "held: the readings do not show the smooth function that it is part of"
 
 
@@ -138,9 +137,8 @@ def _estimates(
         found[int(c)] = estimate(c, note=f"held at its bound {x[c]:g}: the data want it beyond")
     for i in range(len(model.parameters)):
         if i not in found:
-            unseen = i in reduction.with_prior and not model.shrunk[i]
-            note = NOT_SHOWN if i in left_out else NO_BETTER if unseen else "fixed by the user"
-            found[i] = estimate(i, note=note)
+            zero = i in left_out
+            found[i] = estimate(i, note=NOT_SHOWN if zero else "fixed by the user")
     return tuple(found[i] for i in range(len(model.parameters))), tuple(combinations)
 
 
