@@ -89,14 +89,21 @@ def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSum
     `leverage` (rows,) of the fit, where it is not that of its B alone.
     """
     problem, fit = solution.problem, solution.fit
-    if leverage is None and not problem.large:
-        R = fit.r_factor.R[: len(fit.columns)]
-        Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
-        leverage = np.minimum((Q**2).sum(axis=0), 1.0)
     return summarise_residuals(
-        problem.observations, fit.whitened, leverage, problem.weights.apply(solution.heldout),
-        absolute=problem.weights.absolute,
+        problem.observations, fit.whitened, leverage_of(solution, leverage),
+        problem.weights.apply(solution.heldout), absolute=problem.weights.absolute,
     )  # fmt: skip
+
+
+def leverage_of(solution: Solution, known: Array | None) -> Array | None:
+    """How much each row (rows,) draws the fit to itself, 0 to 1, where it is not `known`; None of a
+    large table."""
+    problem, fit = solution.problem, solution.fit
+    if known is not None or problem.large:
+        return known
+    R = fit.r_factor.R[: len(fit.columns)]
+    Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
+    return np.minimum((Q**2).sum(axis=0), 1.0)
 
 
 def _estimates(
