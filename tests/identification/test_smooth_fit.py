@@ -228,6 +228,41 @@ def test_methods_without_a_prior_are_refused(method):
         identify(model, table, Options(method=method))
 
 
+@lru_cache
+def corner():
+    """Geometry and curves fitted in a corner of the joints' ranges, and tested there and beyond."""
+    effects = (*EFFECTS, "link_geometry")
+    model, rng = arm(*effects), np.random.default_rng(3)
+    x = true(model, rng)
+    for i, p in enumerate(model.parameters):
+        if p.effect == "link_geometry":
+            x[i] += float(p.typical or 0.0) * rng.normal()
+    drawn = ((0.6, 1.0, 100, SIGMA), (0.6, 1.0, 100, 0.0), (-HALF, HALF, 200, 0.0))
+    near, inside, far = (
+        measured(model, table_at(rng.uniform(low, high, (n, 3))), x, sigma, rng)
+        for low, high, n, sigma in drawn
+    )
+    return identify(model, near, test=inside), identify(model, near, test=far)
+
+
+def test_far_from_what_was_measured_geometry_stays_within_its_sizes():
+    """A minimal set, the rest at nominal, errs there by centimetres."""
+    inside, far = corner()
+    assert inside.test.rms < 2 * SIGMA * 3**0.5
+    assert far.test.rms < 3e-3  # lengths of 1 mm, angles of 1 mrad, curves
+    assert all(far.prior_share[f"link{k}.dz"] > 0.9 for k in (1, 2))
+
+
+def test_the_result_says_where_it_was_not_measured():
+    inside, far = corner()
+    assert inside.test.p_far > 0.01 and inside.finding("test_data_far") is None
+    assert far.test.p_far < 1e-9 and far.test.far > 100
+    told = far.finding("test_data_far")
+    assert told is not None and told.numbers["far"] == far.test.far
+    assert far.test.std > 2 * inside.test.std > 0
+    assert far.to_json()["test"]["far"] == far.test.far
+
+
 def test_intervals_without_a_prior_are_refused():
     model, _, table, *_ = campaign()
     with pytest.raises(InputError, match="smooth functions"):
