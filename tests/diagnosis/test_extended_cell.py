@@ -146,3 +146,17 @@ def test_a_bad_cell_is_refused_and_nothing_written(tmp_path, text):
     with pytest.raises(InputError, match=r"cell\.toml"):
         write_extended_cell(tmp_path / "cell.toml", tmp_path / "new.toml", FOUND)
     assert [p.name for p in tmp_path.iterdir()] == ["cell.toml"]
+
+
+def test_sizes_of_parameters_travel_with_the_effects(tmp_path):
+    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
+    source, sizes = tmp_path / "cell.toml", {"move_lag": 2.5e-3, "move_lag_sign": 1e-3}
+    source.write_text(
+        '[robot]\nurdf = "arm.urdf"\n[model]\neffects = ["base_frame"]\n'
+        "[model.nominal]\nsizes.joint2 = { encoder_scale = 0.01 }\n"
+    )
+    lag = replace(ECCENTRICITY, effect="move_lag", parameters=(), sizes=sizes)
+    cell = write_extended_cell(source, tmp_path / "new.toml", (lag,))
+    assert cell.model.nominal.sizes == {"joint2": {"encoder_scale": 0.01, **sizes}}
+    typical = {p.name: p.typical for p in Model(tmp_path / "new.toml").parameters}
+    assert typical["joint2.move_lag"] == 2.5e-3 and typical["joint2.move_lag_sign"] == 1e-3

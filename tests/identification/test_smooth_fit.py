@@ -91,10 +91,11 @@ def test_every_parameter_stands_in_the_result_and_functions_stand_together():
         low, high = entry["rms_ci95"]
         assert 0 < low <= entry["rms"] <= high < 5 * SIZE
         assert 3 < entry["effective"] < part.coefficients == entry["coefficients"]
-    assert fit.dof == len(fit.residual) - round(
-        sum(part.effective for part in fit.smooth)
-        + sum(not name.startswith("joint") or "offset" in name for name in fit.determined)
-    )
+    # The offsets have a prior as well, and are worth less than one parameter each.
+    curves = sum(part.effective for part in fit.smooth)
+    placed = sum(not name.startswith("joint") for name in fit.determined)
+    assert 0 < len(fit.residual) - curves - placed - fit.dof < len(JOINTS)
+    assert set(fit.prior_share) == {f"{joint}.offset" for joint in JOINTS}
 
 
 def test_the_band_of_a_curve_holds_the_true_one():
@@ -111,7 +112,8 @@ def test_the_band_of_a_curve_holds_the_true_one():
 
 def test_held_out_residuals_are_those_of_refits():
     """Leaving out a configuration for good: prior and noise as found, on the model itself."""
-    model, _x, table, _, _ = campaign(n=40)
+    model, rng = arm(*(e for e in EFFECTS if e != "joint_offset")), np.random.default_rng(0)
+    table = readings(model, true(model, rng), 40, rng)
     options = Options(method="ols", faulty="keep")
     fit = identify(model, table, options)
     observed = observe(table, model.observe)
@@ -224,6 +226,41 @@ def test_methods_without_a_prior_are_refused(method):
     model, _, table, *_ = campaign()
     with pytest.raises(InputError, match="smooth functions"):
         identify(model, table, Options(method=method))
+
+
+@lru_cache
+def corner():
+    """Geometry and curves fitted in a corner of the joints' ranges, and tested there and beyond."""
+    effects = (*EFFECTS, "link_geometry")
+    model, rng = arm(*effects), np.random.default_rng(3)
+    x = true(model, rng)
+    for i, p in enumerate(model.parameters):
+        if p.effect == "link_geometry":
+            x[i] += float(p.typical or 0.0) * rng.normal()
+    drawn = ((0.6, 1.0, 100, SIGMA), (0.6, 1.0, 100, 0.0), (-HALF, HALF, 200, 0.0))
+    near, inside, far = (
+        measured(model, table_at(rng.uniform(low, high, (n, 3))), x, sigma, rng)
+        for low, high, n, sigma in drawn
+    )
+    return identify(model, near, test=inside), identify(model, near, test=far)
+
+
+def test_far_from_what_was_measured_geometry_stays_within_its_sizes():
+    """A minimal set, the rest at nominal, errs there by centimetres."""
+    inside, far = corner()
+    assert inside.test.rms < 2 * SIGMA * 3**0.5
+    assert far.test.rms < 3e-3  # lengths of 1 mm, angles of 1 mrad, curves
+    assert all(far.prior_share[f"link{k}.dz"] > 0.9 for k in (1, 2))
+
+
+def test_the_result_says_where_it_was_not_measured():
+    inside, far = corner()
+    assert inside.test.p_far > 0.01 and inside.finding("test_data_far") is None
+    assert far.test.p_far < 1e-9 and far.test.far > 100
+    told = far.finding("test_data_far")
+    assert told is not None and told.numbers["far"] == far.test.far
+    assert far.test.std > 2 * inside.test.std > 0
+    assert far.to_json()["test"]["far"] == far.test.far
 
 
 def test_intervals_without_a_prior_are_refused():

@@ -78,9 +78,9 @@ def write_extended_cell(
     """Write the cell file `source` to `target` with the effects `found` switched on; read it back.
 
     Each effect joins `[model] effects` as "effect:where", its searched constants join
-    `[model.nominal.settings]`, the sizes of its parameters, where known, `[model.nominal.sizes]`.
-    Relative paths are rewritten so that they lead from `target`'s folder to the same files; a cell
-    without a name keeps the one that its old file gave it.
+    `[model.nominal.settings]`, the sizes of its parameters, where they were estimated,
+    `[model.nominal.sizes]`.  Relative paths are rewritten so that they lead from `target`'s folder
+    to the same files; a cell without a name keeps the one that its old file gave it.
     `model_keys` join [model] as they are.  Comments are not carried over.  Without effects the
     model is the one that was read.
 

@@ -25,7 +25,7 @@ from scipy import stats
 
 from elastocal.above import Result
 from elastocal.cell.arm_description import Tool
-from elastocal.errors import InputError, InsufficientDataError, computing, option, require
+from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.export.exportable import Conditions, Valued, keep, random_table
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
@@ -322,8 +322,7 @@ def _tested(
     family = np.empty(len(p))
     family[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
     scaled = V / np.outer(std, std)
-    with computing(f"{old.source} and {new.source}", "write both anew with identify"):
-        together = float((z / std) @ np.linalg.solve(scaled, z / std)) / len(z)
+    together = float((z / std) @ np.linalg.solve(scaled, z / std)) / len(z)
     smallest = float(min(d.min() for d in dofs))
     a = old.values
     units = {q.name: q.unit for q in old.model.parameters}

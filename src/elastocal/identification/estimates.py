@@ -27,7 +27,6 @@ from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray
 
 CORRELATED = 0.9
-NO_BETTER = "held at nominal: poses that were not fitted are predicted no worse"
 NOT_SHOWN = "held: the readings do not show the smooth function that it is part of"
 
 
@@ -110,14 +109,21 @@ def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSum
     `leverage` (rows,) of the fit, where it is not that of its B alone.
     """
     problem, fit = solution.problem, solution.fit
-    if leverage is None and not problem.large:
-        R = fit.r_factor.R[: len(fit.columns)]
-        Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
-        leverage = np.minimum((Q**2).sum(axis=0), 1.0)
     return summarise_residuals(
-        problem.observations, fit.whitened, leverage, problem.weights.apply(solution.heldout),
-        absolute=problem.weights.absolute,
+        problem.observations, fit.whitened, leverage_of(solution, leverage),
+        problem.weights.apply(solution.heldout), absolute=problem.weights.absolute,
     )  # fmt: skip
+
+
+def leverage_of(solution: Solution, known: Array | None) -> Array | None:
+    """How much each row (rows,) draws the fit to itself, 0 to 1, where it is not `known`; None of a
+    large table."""
+    problem, fit = solution.problem, solution.fit
+    if known is not None or problem.large:
+        return known
+    R = fit.r_factor.R[: len(fit.columns)]
+    Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
+    return np.minimum((Q**2).sum(axis=0), 1.0)
 
 
 def _estimates(
@@ -160,9 +166,8 @@ def _estimates(
         found[i] = estimate(i, limits=limits, note=_hardly_shown(model.parameters[i], x[i]))
     for i in range(len(model.parameters)):
         if i not in found:
-            unseen = i in reduction.with_prior and not model.shrunk[i]
-            note = NOT_SHOWN if i in left_out else NO_BETTER if unseen else "fixed by the user"
-            found[i] = estimate(i, note=note)
+            zero = i in left_out
+            found[i] = estimate(i, note=NOT_SHOWN if zero else "fixed by the user")
     return tuple(found[i] for i in range(len(model.parameters))), tuple(combinations)
 
 

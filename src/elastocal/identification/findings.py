@@ -19,8 +19,9 @@ from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary, held_out_residual
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
 from elastocal.identification.scrutiny import stage_of
-from elastocal.identification.solve import Solution
+from elastocal.identification.solve import WORTH_A_COLUMN, Solution, reduce
 from elastocal.identification.weighted_problem import weights_for
+from elastocal.model.manipulator import Model
 from elastocal.text import listed
 from elastocal.units import Array
 
@@ -95,6 +96,10 @@ def _fitted(
         for _ in range(STEPS):
             at = model.regressor(observed.table, x, columns, observed)
             error = weights.apply(at.residual)
+            if best is None and result.smooth and len(columns):
+                # What has a prior in the whole fit has none here: a minimal complete set.
+                own = _worth_a_column(model, columns, weights.apply(at.B), error)
+                columns, at = columns[own], replace(at, B=at.B[:, own])
             cost = float(error @ error)
             if best is not None and cost > (1 - SETTLED) * best[0]:
                 break
@@ -111,6 +116,16 @@ def _fitted(
         return residual
     found = held_out_residual(B, residual, weights, observed.configuration, observed.size)
     return found if np.isfinite(found).all() else None
+
+
+def _worth_a_column(
+    model: Model, columns: NDArray[np.int64], B: Array, error: Array
+) -> NDArray[np.int64]:
+    """Which columns of the whitened B make up a minimal complete set beside this residual."""
+    sigma = max(float(np.sqrt(np.mean(error**2))), 1e-300)
+    own = tuple(model.parameters[c] for c in columns)
+    sizes = np.array([p.typical or 1.0 for p in own])
+    return reduce(B, sizes, own, sigma, WORTH_A_COLUMN).kept
 
 
 def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
@@ -565,6 +580,15 @@ def _test(result: Calibration) -> Iterator[Finding]:
         if test.rms > max(WORSE, allowed) * held:
             numbers: dict[str, Number] = {"test_rms_um": _um(test.rms), "heldout_rms_um": _um(held)}
             yield Finding("test_data_worse", "care", numbers, COMPARE)
+    if test is not None and test.p_far < CHANCE:
+        yield Finding(
+            "test_data_far", "care",
+            {
+                "far": test.far, "configurations": test.configurations, "p": test.p_far,
+                "predicted_std_um": _um(test.std), "fitted_std_um": _um(test.most_fitted),
+            },
+            "Measure poses there: what is fitted tells little about them.",
+        )  # fmt: skip
 
 
 # What only the solver can tell.

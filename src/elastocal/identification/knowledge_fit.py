@@ -523,9 +523,11 @@ def fit_with_knowledge(
         posed, found, local, constraints, prior, dof, options,
         set() if own is None else set(own.prior.names),
     )  # fmt: skip
-    shares = {} if options.prior is None else dict(zip(found.names, local.prior_share, strict=True))
-    if own is not None:
-        shares = {n: s for n, s in shares.items() if n not in set(own.prior.names)}
+    # Of smooth functions' parameters, which are many, nobody asks.
+    shares = {} if prior is None else {
+        name: share for c, name, share in zip(columns, found.names, local.prior_share, strict=True)
+        if not problem.model.shrunk[c]
+    }  # fmt: skip
     known = replace(
         solution,
         fit=_as_fit(posed, found, local),

@@ -211,8 +211,8 @@ def with_smooth(
     found = fit_smooth(every, sound, faulty, free, options, progress)
     result = MethodResult(
         found.method, found.solution, found.intervals, found.noise, found.good,
-        effective=found.effective, leverage=found.leverage, warnings=found.warnings,
-        smooth=found.parts, standard=found.standard,
+        prior_share=found.prior_share, effective=found.effective, leverage=found.leverage,
+        warnings=found.warnings, smooth=found.parts, standard=found.standard,
     )  # fmt: skip
     if not options.knows:
         return result

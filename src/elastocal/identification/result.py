@@ -117,13 +117,33 @@ def deviation(name: str, held: float | None, digits: int = 6) -> str:
 
 @dataclass(frozen=True)
 class TestErrors:
-    """Length of the position error on data never fitted, in m."""
+    """Length of the position error on data never fitted, in m.
+
+    Of the fit's own uncertainty there `std` is the rms in m, `most_fitted` the largest of any
+    configuration fitted, predicted from the others; so many of the test `configurations` lie
+    beyond it (`far`), as they would by chance with probability `p_far`.  NaN and 1 where the table
+    is too large to say.
+    """
 
     __test__ = False  # not a pytest class
     rms: float
     mean: float
     maximum: float
     n: int
+    std: float = math.nan
+    most_fitted: float = math.nan
+    far: int = 0
+    configurations: int = 0
+    p_far: float = 1.0
+
+    def to_json(self) -> dict[str, float | None]:
+        known = math.isfinite(self.std)
+        return {
+            "rms_um": _um(self.rms), "mean_um": _um(self.mean), "max_um": _um(self.maximum),
+            "n": self.n, "predicted_std_um": _um(self.std) if known else None,
+            "fitted_std_um": _um(self.most_fitted) if known else None,
+            "far": self.far if known else None, "p_far": self.p_far if known else None,
+        }  # fmt: skip
 
 
 Severity = Literal["good", "note", "care", "poor"]
@@ -536,10 +556,7 @@ class Calibration(Result):
             "heldout_rms_um": _um(self.heldout_rms),
             "heldout_all_rms_um": _um(self.heldout_all_rms),
             "nominal_rms_um": _um(self.nominal_rms),
-            "test": None if self.test is None else {
-                "rms_um": _um(self.test.rms), "mean_um": _um(self.test.mean),
-                "max_um": _um(self.test.maximum), "n": self.test.n,
-            },
+            "test": None if self.test is None else self.test.to_json(),
             "test_rms_um": None if self.test is None else _um(self.test.rms),
             "test_mean_um": None if self.test is None else _um(self.test.mean),
             "test_max_um": None if self.test is None else _um(self.test.maximum),

@@ -95,7 +95,7 @@ class SmoothFit(NamedTuple):
     `parts` are the functions; `effective` says how many parameters the readings paid for,
     `leverage` (rows,) how much each row drew the fit to itself.
     `standard` (N, size) are the residuals of all readings as they would be without the fit's part
-    in them.
+    in them, `prior_share` says what share of a sized parameter's information is the prior's.
     """
 
     method: str
@@ -108,6 +108,7 @@ class SmoothFit(NamedTuple):
     effective: int
     leverage: Array
     standard: Array
+    prior_share: dict[str, float]
     warnings: tuple[str, ...]
 
 
@@ -687,29 +688,25 @@ class _Course:
         return fit, cross
 
     def without_those_that_harm(self, fit: JointFit, cross: Crossed) -> tuple[JointFit, Crossed]:
-        """Without the functions and sized parameters that the readings do not show, or that
-        predict held-out configurations worse than none; the least supported is tried first."""
-        size, gain = self.observed.size, fit.scales.gain
-
-        def left(gone: BoolArray) -> JointFit:
-            scale = np.where(gone, 0.0, fit.scales.scale)
-            return replace(fit, scales=replace(fit.scales, scale=scale))
-
-        gone = (fit.scales.scale <= 0) | (gain <= LEAST_GAIN)
-        if gone.any():
-            cross = crossed(*fit.linear(left(gone).scales, fit.reduction))
-        for g in np.argsort(gain):
-            if gone[g] or gain[g] > CERTAIN:
+        """Without the functions that the readings do not show, or that predict held-out
+        configurations worse than none; the least supported is tried first."""
+        size, alive = self.observed.size, fit.scales.scale > 0
+        for g in np.argsort(fit.scales.gain[: len(self.functions.groups)]):
+            if not alive[g] or fit.scales.gain[g] > CERTAIN:
                 continue
-            trial = gone.copy()
-            trial[g] = True
-            there = crossed(*fit.linear(left(trial).scales, fit.reduction))
-            if rms_3d(there.held_out, size) > rms_3d(cross.held_out, size):
+            scale = np.where(alive, fit.scales.scale, 0.0)
+            scale[g] = 0.0
+            trial, step = fit.linear(replace(fit.scales, scale=scale), fit.reduction)
+            there = crossed(trial, step)
+            shown = fit.scales.gain[g] > LEAST_GAIN
+            if shown and rms_3d(there.held_out, size) > rms_3d(cross.held_out, size):
                 continue
-            gone, cross = trial, there
-            if g < len(self.functions.groups):
+            if shown:
                 self.harmful.append(self.functions.groups[g].name)
-        fit = left(gone)
+            alive[g], cross = False, there
+            fit = replace(
+                fit, scales=replace(fit.scales, scale=np.where(alive, fit.scales.scale, 0.0))
+            )
         if (fit.scales.scale > 0).all():
             return fit, cross
         fit = joint_fit(
@@ -758,7 +755,8 @@ class _Course:
             method = "ols" if fit.problem.weights.kind == "none" else "wls"
         return SmoothFit(
             method, solution, intervals, noise, good, self._parts(fit, covariance.matrix),
-            self._prior(fit, spare), effective, cross.leverage, self.standard, self._warnings(fit),
+            self._prior(fit, spare), effective, cross.leverage, self.standard,
+            self._shares(fit), self._warnings(fit),
         )  # fmt: skip
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
@@ -783,6 +781,11 @@ class _Course:
         b = (fit.x[columns] - f.nominal[own]) * fit.posterior.prior
         prior = GaussianPrior.independent(names, f.nominal[own], std)
         return FunctionPrior(prior, fit.sigma, dof, float(b @ b))
+
+    def _shares(self, fit: JointFit) -> dict[str, float]:
+        sized = set(self.functions.sized.tolist())
+        shares = zip(fit.columns.tolist(), fit.posterior.prior_share.tolist(), strict=True)
+        return {self.model.names[c]: share for c, share in shares if c in sized}
 
     def _warnings(self, fit: JointFit) -> tuple[str, ...]:
         told = []

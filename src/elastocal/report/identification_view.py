@@ -686,6 +686,11 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "test_data_worse": lambda f: (
         f"test data are off by {_length(f, 'test_rms_um')} rms, more than chance explains"
     ),
+    "test_data_far": lambda f: (
+        f"{f.numbers['far']} of {f.numbers['configurations']} test poses lie where the fit knows "
+        f"less than at every pose measured (to {_length(f, 'predicted_std_um')} rms in all, there "
+        f"to {_length(f, 'fitted_std_um')} at most)"
+    ),
 }
 
 

@@ -132,3 +132,34 @@ def test_every_effect_vanishes_at_its_nominal_parameters() -> None:
     )
     difference = all_of_it.predict(table) - plain.predict(table)
     assert np.abs(difference).max() < 1e-14
+
+
+def sized(sizes: dict[str, dict[str, float]], *effects: str) -> Model:
+    return Model.assembled(kr270_chain(), kr270_cell(effects, nominal=Nominal(sizes=sizes)))
+
+
+def test_a_cell_states_how_large_a_parameter_of_this_arm_is():
+    stated = sized({"joint2": {"encoder_scale": 0.02}}, "encoder_scale", "joint_offset")
+    plain = sized({}, "encoder_scale", "joint_offset")
+    typical = {p.name: p.typical for p in stated.parameters}
+    assert typical.pop("joint2.encoder_scale") == 0.02
+    assert typical == {p.name: p.typical for p in plain.parameters if p.name in typical}
+
+
+@pytest.mark.parametrize(
+    "sizes, message",
+    [
+        ({"joint9": {"offset": 1.0}}, "nominal.sizes: unknown place 'joint9'"),
+        ({"joint2": {"ofset": 1.0}}, "unknown parameter of joint2 'ofset'"),
+        ({"joint2": {"curve_1": 1.0}}, "unknown parameter of joint2 'curve_1'"),
+    ],
+)
+def test_sizes_of_what_no_effect_has_are_refused(sizes, message) -> None:
+    with pytest.raises(InputError, match=message):
+        sized(sizes, "joint_offset")
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
+def test_sizes_are_positive_numbers(size: float) -> None:
+    with pytest.raises(InputError, match="sizes"):
+        Nominal(sizes={"joint2": {"offset": size}})
