@@ -394,11 +394,6 @@ def test_numbers_beyond_all_measure_in_options(campaign):
         assert code == 2 and arguments[-2] in message and message.count("\n") == 1, message
 
 
-def test_lengths_that_overflow_are_told_with_the_table(campaign):
-    edit(campaign[0], r"^M1 = .*", "M1 = [1e308, 1e308, 1e308]")
-    refused(2, "data.csv: the model predicts no finite numbers", campaign=campaign)
-
-
 def test_import_without_files_names_the_argument():
     assert run("import", "-o", "out.csv") == (
         2,

@@ -72,7 +72,8 @@ def import_(
         return
     paths = list(files or ())
     require(
-        bool(paths), "the argument FILES is missing: the tracker's export, and the log of the joints"
+        bool(paths),
+        "the argument FILES is missing: the tracker's export, and the log of the joints",
     )
     require(
         output is not None or preview or as_json,
