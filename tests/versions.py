@@ -2,7 +2,8 @@
 
 Each of VERSIONS that is found by name, or among pyenv's, gets an empty environment outside the
 checkout, the wheel with the tested versions of what it needs, and then runs as a user would: demo,
-identify, a report (the one that runs this has `make test`).  What is missing is said and left out; exit code 1 where something breaks.
+identify, a report.  The one that runs this is left to `make test`.  What is missing is said and
+left out; exit code 1 where something breaks.
 """
 
 from __future__ import annotations
