@@ -23,13 +23,14 @@ NOT_AT_HOME := not-at-home
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long bench lint docs docs-figures clean not-at-home
+.PHONY: help demo test test-long test-versions bench lint docs docs-figures clean not-at-home
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo       set up .venv if needed, then calibrate a simulated arm"
 	@echo "make test       the test suite              (PYTEST_ARGS=\"tests/model -x\", WORKERS=2)"
 	@echo "make test-long  the long studies among the tests"
+	@echo "make test-versions  the wheel with every other supported Python that is found"
 	@echo "make bench      the benchmarks, to benchmarks/result.md      (BENCH_ARGS=--full: all sizes)"
 	@echo "make lint       ruff check, ruff format --check, mypy"
 	@echo "make docs       the documentation as pages in site/ (strict: a broken link is an error)"
@@ -54,6 +55,9 @@ test: $(TEST_TOOLS)
 
 test-long: $(TEST_TOOLS)
 	$(PYTEST) -m long $(PYTEST_ARGS)
+
+test-versions: $(RUN_TIME)
+	$(BIN)/python tests/versions.py
 
 bench: $(RUN_TIME)
 	$(BIN)/python benchmarks/run.py $(BENCH_ARGS)

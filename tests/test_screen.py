@@ -194,7 +194,7 @@ sys.argv = ["elastocal", "attacked"]
 main()
 """
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=50
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=300
     )
     told = (130, "elastocal: interrupted\n") if "by nobody" not in how else (0, "")
     assert (done.returncode, done.stderr) == told

@@ -392,16 +392,3 @@ def test_numbers_beyond_all_measure_in_options(campaign):
     ):
         code, message = run(*arguments, "-q")
         assert code == 2 and arguments[-2] in message and message.count("\n") == 1, message
-
-
-def test_lengths_that_overflow_are_told_with_the_table(campaign):
-    edit(campaign[0], r"^M1 = .*", "M1 = [1e308, 1e308, 1e308]")
-    refused(2, "data.csv: the model predicts no finite numbers", campaign=campaign)
-
-
-def test_import_without_files_names_the_argument():
-    assert run("import", "-o", "out.csv") == (
-        2,
-        "elastocal: the argument FILES is missing: the tracker's export, and the log of the "
-        "joints\n",
-    )

@@ -18,6 +18,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from itertools import chain, product
 from pathlib import Path
 from random import Random
@@ -150,7 +151,10 @@ class Victim:
         self.operations = int(os.pread(counter, 99, 0))
         os.close(counter)
         self.restore()
-        self.standing = Standing(self.case())
+
+    @cached_property
+    def standing(self) -> Standing:
+        return Standing(self.case())
 
     def case(self) -> Case:
         return Case(0, self.command, shlex.split(self.command.line), "", self.folder)
@@ -309,7 +313,8 @@ def run_kills(
                 tried[verb, harm] += 1
                 break
     for victim in chain(*victims.values()):
-        victim.standing.close()
+        if "standing" in vars(victim):
+            victim.standing.close()
     return broken, tried
 
 

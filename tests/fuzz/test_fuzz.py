@@ -29,8 +29,8 @@ def fuzzed(*words: str) -> str:
 
 
 def test_spoilt_input_ends_with_a_message_and_a_kill_with_whole_files() -> None:
-    told = fuzzed("--cases", "60", "--seed", "1", "--kills", "2", "--full", "1")
-    assert "60 cases from 1 on, 18 kills, interrupts and full disks (seed 1)" in told
+    told = fuzzed("--cases", "40", "--seed", "1", "--kills", "2", "--full", "1")
+    assert "40 cases from 1 on, 18 kills, interrupts and full disks (seed 1)" in told
     assert ": 0 with a finding" in told
 
 
@@ -41,7 +41,7 @@ def test_many_spoilt_inputs() -> None:
 
 @pytest.mark.long
 def test_many_kills_and_full_disks() -> None:
-    fuzzed("--cases", "0", "--kills", "200", "--full", "20")
+    fuzzed("--cases", "0", "--kills", "200", "--full", "20", "--interrupts", "40")
 
 
 def test_every_verb_is_among_the_commands() -> None:

@@ -4,8 +4,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from support.parts import positions, solved
 
+from elastocal.errors import ElastocalError
 from elastocal.identification import fit, part_of
 
 
@@ -38,3 +40,18 @@ def test_B_follows_the_rows_of_the_problem():
     shorter = replace(solution.fit, problem=own)
     assert shorter.B.shape == (60, len(problem.columns))
     np.testing.assert_array_equal(shorter.B, solution.fit.B[:60])
+
+
+def test_a_start_without_finite_predictions_names_the_table(monkeypatch):
+    """Where a length overflows B may be finite and the prediction not."""
+    model, table = positions()
+    problem = solved(model, table).fit.problem
+    regressor = type(model).regressor
+
+    def overflowed(*given):
+        at = regressor(*given)
+        return replace(at, prediction=np.full_like(at.prediction, np.inf))
+
+    monkeypatch.setattr(type(model), "regressor", overflowed)
+    with pytest.raises(ElastocalError, match=f"^{table.source}: .* no finite numbers"):
+        fit(problem)

@@ -1,0 +1,92 @@
+"""The wheel on every supported Python of this machine: python tests/versions.py.
+
+Each of VERSIONS that is found by name, or among pyenv's, gets an empty environment outside the
+checkout, the wheel with the tested versions of what it needs, and then runs as a user would: demo,
+identify, a report.  The one that runs this is left to `make test`.  What is missing is said and
+left out; exit code 1 where something breaks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+VERSIONS = ("3.11", "3.12", "3.13")
+AGAIN = ("demo_out/cell.toml", "demo_out/data.csv", "-o", "result.json", "-q")
+
+
+def interpreter(version: str) -> str | None:
+    """A Python of this version that runs, or None."""
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    named = [shutil.which(f"python{version}"), *sorted(pyenv.glob(f"{version}.*/bin/python"))]
+    for found in filter(None, named):
+        asked = [str(found), "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
+        if subprocess.run(asked, capture_output=True, text=True).stdout.strip() == version:
+            return str(found)
+    return None
+
+
+def run(folder: Path, *words: object) -> str:
+    """What a program prints on stdout; raises CalledProcessError where it fails."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    done = subprocess.run(
+        [str(word) for word in words], cwd=folder, env=clean, capture_output=True, text=True
+    )
+    if done.returncode:
+        sys.stderr.write(done.stdout + done.stderr)
+        done.check_returncode()
+    return done.stdout
+
+
+def tried(python: str, source: Path, folder: Path) -> str:
+    """Install and run; returns what was made with what."""
+    run(folder, python, "-m", "venv", "venv")
+    own = folder / "venv" / "bin"
+    run(folder, own / "python", "-m", "pip", "install", "-q", "--disable-pip-version-check",
+        "-c", ROOT / "constraints.txt", source)  # fmt: skip
+    where = run(folder, own / "python", "-c", "import elastocal; print(elastocal.__file__)")
+    assert Path(where.strip()).is_relative_to(folder), where
+    assert "Report to open" in run(folder, own / "elastocal", "demo", "-q")
+    told = run(folder, own / "elastocal", "identify", *AGAIN, "--report", "report.html")
+    assert "wrote report.html" in told
+    size = (folder / "report.html").stat().st_size
+    assert size > 100_000, f"a report of {size} bytes"
+    return f"{run(folder, own / 'python', '--version').strip()}: demo, identify, report"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    own = "{}.{}".format(*sys.version_info)
+    others = [version for version in VERSIONS if version != own]
+    parser.add_argument("versions", nargs="*", default=others, help="default: all but this one")
+    failed = 0
+    with tempfile.TemporaryDirectory(prefix="elastocal-versions-") as place:
+        source = Path(place, "source")  # pip builds where the sources are
+        shutil.copytree(ROOT / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info"))
+        for name in ("pyproject.toml", "README.md", "LICENSE"):
+            shutil.copyfile(ROOT / name, source / name)
+        for version in parser.parse_args().versions:
+            begun, python = time.monotonic(), interpreter(version)
+            if python is None:
+                print(f"Python {version}: left out, there is none on this machine", flush=True)
+                continue
+            folder = Path(place, version)
+            folder.mkdir()
+            try:
+                print(f"{tried(python, source, folder)}, {time.monotonic() - begun:.0f} s")
+            except (subprocess.CalledProcessError, AssertionError) as error:
+                failed += 1
+                print(f"Python {version}: {error}")
+            shutil.rmtree(folder, ignore_errors=True)
+    return int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
