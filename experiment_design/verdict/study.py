@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from campaigns import campaign
+from judged_campaigns import campaign
 
 from elastocal.errors import ElastocalError
 from elastocal.identification import rms_3d
 from elastocal.identification.identify import identify
 from elastocal.model import observe
 
+NUMBERS = (
+    "at_um", "true_um", "heldout_um", "predicted_um", "from_um", "own_um", "open_um", "lacking_um",
+)  # fmt: skip
 ALLOWED = 1.25  # the true error over what the verdict says
 
 
@@ -28,7 +31,8 @@ def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def run(task: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
     """What the verdict says of a campaign, and what is true; `rng` is not used."""
     made = campaign(task["number"])
-    row: dict[str, Any] = dict(made.kind)
+    unknown = dict.fromkeys(NUMBERS, np.nan)
+    row: dict[str, Any] = made.kind | {"refused": "", "tone": "", "missing": ""} | unknown
     try:
         fit = identify(made.model, made.table)
     except ElastocalError as error:
@@ -36,15 +40,14 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
     new = observe(made.exact, fit.model.observe)
     true = rms_3d(fit.model.predict(made.exact, fit.x, new) - new.value, new.size) * 1e6
     verdict, found = fit.verdict.to_json(), fit.predicted
+    if found is not None:
+        low = found.ci95[0]
+        parts = (found.rms, low, found.parameters, found.open, found.lacking or 0.0)
+        row |= dict(zip(NUMBERS[3:], (1e6 * v for v in parts), strict=True))
     return row | {
-        "refused": "", "tone": verdict["tone"], "at_um": verdict["at_um"],
+        "tone": verdict["tone"], "at_um": verdict["at_um"],
         "missing": ",".join(verdict["missing"]), "true_um": true,
         "heldout_um": fit.heldout_rms * 1e6,
-        "predicted_um": np.nan if found is None else found.rms * 1e6,
-        "from_um": np.nan if found is None else found.ci95[0] * 1e6,
-        "open_um": np.nan if found is None else found.open * 1e6,
-        "lacking_um": np.nan if found is None else 1e6 * (found.lacking or 0.0),
-        "own_um": np.nan if found is None else found.parameters * 1e6,
     }  # fmt: skip
 
 

@@ -27,13 +27,14 @@ ROOMS = {
     "noise_summary": "LackOfFit Noise NoiseSize lack_of_fit",
     "options": "Method Options",
     "outliers": "Outlier blocks describe find_faulty least_trimmed_squares majority verdict",
+    "prediction": "NewPoses Position PredictedError Uncertainty position_at predicted_error",
     "published": "eq14 eq14_weights group_sigma ols wls",
     "reml": "LogPrior evaluate kenward_roger prior_of_groups slope stacks",
     "residuals": (
         "ResidualSummary held_out_by_parts held_out_residual normal_scores rms_3d "
         "simultaneous_level summarise_residuals"
     ),
-    "result": "Calibration Combination Finding TestErrors",
+    "result": "Calibration Combination Finding TestErrors Verdict",
     "robust": "asymptotic_covariance clustered_covariance robust_fit",
     "robust_core": (
         "Absolute Bisquare Huber StudentT bisquare breakdown_bisquare design efficiency huber "

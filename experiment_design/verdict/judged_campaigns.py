@@ -77,7 +77,8 @@ def campaign(number: int) -> Campaign:
     exact = simulate(real, _rows(real, far, loads, 1), x, rng, False)
     kind = {
         "arm": str(arm), "model": str(what), "hidden": hidden, "size": size, "scale": scale,
-        "sigma_um": sigma * 1e6, "stated": stated, "poses": poses, "markers": markers,
+        "sigma_um": sigma * 1e6, "stated": "yes" if stated else "no",
+        "poses": poses, "markers": markers,
         "range": share, "repeats": repeats,
     }  # fmt: skip
     return Campaign(fitted, table, exact, kind)
