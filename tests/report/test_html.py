@@ -40,7 +40,7 @@ def test_every_parameter_is_on_the_page_and_no_number_where_none_is_known(
 def test_structure(page: str) -> None:
     structure = Page(page)
     structure.check_harmless(page)
-    assert page.count("<figure") == page.count("</figure>") == 13
+    assert page.count("<figure") == page.count("</figure>") == 14
     for heading in (
         "Where the error goes",
         "Parameters",
@@ -60,7 +60,7 @@ def test_structure(page: str) -> None:
 
 def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
     figures = re.findall(r"<svg xmlns=.*?</svg>", page, re.DOTALL)
-    assert len(figures) == 13
+    assert len(figures) == 14
     for figure in figures:
         ElementTree.fromstring(figure)
         assert "var(--ink)" in figure
@@ -92,6 +92,7 @@ def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:
         residual=np.tile(case.result.residual, times),
         held_out=np.tile(case.result.held_out, times),
         noise=replace(case.result.noise, kind="none"),
+        weights=None,
     )
     write_page(long, tmp_path / "r.html")
     assert (tmp_path / "r.html").stat().st_size < 6e6

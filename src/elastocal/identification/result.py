@@ -408,8 +408,13 @@ class Calibration(Result):
 
     @cached_property
     def _looked(self) -> scrutiny.Looked | None:
-        """The fit for a second look; None for a table too large to do it in passing."""
-        if self.weights is None or len(self.residual) * len(self.estimates) > MOST_NUMBERS:
+        """The fit for a second look; None for a table too large to do it in passing, and for an
+        exact fit, which leaves nothing to look at."""
+        if (
+            self.weights is None
+            or not self.residual.any()
+            or len(self.residual) * len(self.estimates) > MOST_NUMBERS
+        ):
             return None
         columns = np.array([self.model.names.index(name) for name in self.determined])
         return scrutiny.Looked(
