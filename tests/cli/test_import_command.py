@@ -131,3 +131,12 @@ def test_presets_are_printed_to_be_copied(tmp_path):
     from elastocal.importing import read_mapping
 
     assert read_mapping(path).sources[0].role == "joints"
+
+
+def test_without_a_preset_those_that_read_the_files_are_suggested(campaign):
+    code, _, err = run("points.txt", "poses.dat", "-o", "data.csv")
+    assert code == 2
+    hint = err.partition("what reads your files: ")[2]
+    points, poses = hint.split(", ")
+    assert points.startswith("points.txt as --preset") and "spatialanalyzer" in points
+    assert poses.strip() == "poses.dat as --preset kuka"

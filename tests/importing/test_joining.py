@@ -1,5 +1,7 @@
 """Points find their joint values by order, name, time or standstill; nothing is lost silently."""
 
+import re
+
 import numpy as np
 import pytest
 from support.tracker_exports import imported
@@ -206,3 +208,19 @@ coupling = [{ joint = 3, of = 2, factor = 0.5 }, { joint = 2, of = 3, factor = 1
     found = imported(tmp_path, files, text)
     # q2 = -10 + 90 + 30 and q3 = 30 + 0.5 * (-10 + 90): couplings see the values before them.
     np.testing.assert_allclose(np.degrees(found.table.q), [[20, 110, 70]])
+
+
+@pytest.mark.parametrize("by", ["time", "standstill"])
+def test_the_offset_at_which_most_points_meet_a_standing_arm_is_told(by, tmp_path):
+    """Eight visits of 6 s at unequal distances; the tracker's clock is 3600 s ahead."""
+    start = np.cumsum([0, 20, 31, 17, 44, 23, 38, 29.0])
+    log = [(t + s, 10 * k, -5 * k) for k, t in enumerate(start) for s in range(7)]
+    read = [(t + 3 + 3600, 1000 + k, k, 2 * k) for k, t in enumerate(start)]
+    files = {"points.csv": table("t,x,y,z", *read), "joints.csv": table("t,a,b", *log)}
+    with pytest.raises(InputError) as caught:
+        imported(tmp_path, files, TIMED + f'[join]\nby = "{by}"\n')
+    told = re.search(r"with offset_s = (\S+) in \[join\] 8 of 8 points", str(caught.value))
+    assert told and abs(float(told[1]) - 3600) <= 3.1
+    join = f'[join]\nby = "{by}"\noffset_s = {told[1]}\n'
+    found = imported(tmp_path, files, TIMED + join)
+    assert q1(found) == [10.0 * k for k in range(8)]

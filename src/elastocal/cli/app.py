@@ -169,11 +169,11 @@ def options(
     ] = None,
 ) -> None:
     """Calibrate industrial robot arms and explain what is left over."""
-    from elastocal.model.evaluate import VARIABLE, chosen_backend
+    from elastocal.model.evaluate import VARIABLE, checked, chosen_backend
 
     # By the environment, so that processes which a command starts choose the same.
     if backend is not None:
-        os.environ[VARIABLE] = backend
+        os.environ[VARIABLE] = checked(backend.strip() or "auto", "--backend")
     chosen_backend()
 
 

@@ -125,8 +125,9 @@ def design(
 ) -> None:
     """Which poses should I measure?
 
-    Writes the plan (CSV) and plan.json beside it.  An interrupted run goes on where it was when
-    it is started again with the same input.
+    Writes the plan (CSV) and plan.json beside it.  An interrupted run, started again with
+    the same input, goes on behind the last step it had ended: the candidates, an exchange, a round
+    of polishing.
 
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """

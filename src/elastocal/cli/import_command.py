@@ -79,10 +79,10 @@ def import_(
         output is not None or preview or as_json,
         "import needs -o data.csv to write to, or --preview to only look",
     )
-    require(
-        mapping is not None or bool(preset),
-        f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}",
-    )
+    if mapping is None and not preset:
+        raise InputError(
+            f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}{_suggestion(paths)}"
+        )
     written = check_outputs(output)
     check_apart(written, [*paths, mapping, cell])
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
@@ -113,3 +113,14 @@ def import_(
             f"wrote {len(table)} readings of {len(table.configuration_labels)} configurations to "
             f"{output}"
         )
+
+
+def _suggestion(paths: list[Path]) -> str:
+    """The presets that read the files, as a hint."""
+    from elastocal.importing.records import likely_presets
+
+    told = []
+    for path in paths:
+        if path.is_file() and (found := likely_presets(path)):
+            told.append(f"{path} as --preset {' or '.join(found)}")
+    return f"; what reads your files: {', '.join(told)}" if told else ""

@@ -369,13 +369,49 @@ def join(
             f"{points.files[0]}: {len(found.left_out)} of {len(points)} points have no joint "
             f"values in {listed(log.files, 3)} (joined by {how}): {listed(found.left_out, SHOWN)}; "
             f'{_ADVICE[how]}, or set unmatched = "leave_out" in [join]'
+            f"{_likely_offset(points, log, settings, how)}"
         )
     if (found.row < 0).all():
         raise InputError(
             f"{points.files[0]}: no point has joint values in {listed(log.files, 3)} (joined by "
-            f"{how}); {_ADVICE[how]}"
+            f"{how}); {_ADVICE[how]}{_likely_offset(points, log, settings, how)}"
         )
     return found
+
+
+MOST_PAIRS = 1_000_000  # of points and standstills
+MOST_POINTS_JOINED = 0.8  # a share from which an offset is worth telling
+
+
+def _likely_offset(points: PooledRecords, log: PooledRecords, settings: JoinTable, how: str) -> str:
+    """The offset of the log's clock at which most points fall into standstills, as a hint.
+
+    "" where the join is not by clocks, few points would, or two offsets would do as well.
+    """
+    if how not in ("time", "standstill") or points.time is None or log.time is None:
+        return ""
+    at, clock, order = _clocks(points, log, settings, how)
+    still = log.spread(settings.still_deg or STILL_DEG, settings.still_mm or STILL_MM)
+    shortest = STILL_S if settings.still_s is None else settings.still_s
+    found = dwells(clock, log.q[order], still, shortest)
+    if not found or len(at) * len(found) > MOST_PAIRS:
+        return ""
+    ends = np.array([[clock[s.first], clock[s.last]] for s in found])
+    middle = ends.mean(axis=1)
+    tried = np.unique(np.round(at[:, None] - middle, 1))
+    joined = np.zeros(len(tried), dtype=int)
+    for k, offset in enumerate(tried):
+        t = at - offset
+        nearest = np.abs(t[:, None] - middle).argmin(axis=1)
+        joined[k] = ((t >= ends[nearest, 0]) & (t <= ends[nearest, 1])).sum()
+    best = tried[joined == joined.max()]
+    if joined.max() < MOST_POINTS_JOINED * len(at) or np.ptp(best) > np.ptp(ends, axis=1).max():
+        return ""
+    offset = float(np.median(best)) + (settings.offset_s or 0.0)
+    return (
+        f"; with offset_s = {offset:.1f} in [join] {joined.max()} of {len(at)} points are measured "
+        "while the arm stands still"
+    )
 
 
 _ADVICE = {

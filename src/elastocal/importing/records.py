@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.errors import InputError
+from elastocal.errors import ElastocalError, InputError
 from elastocal.importing.foreign_text import (
     SAMPLE,
     Clock,
@@ -23,6 +23,7 @@ from elastocal.importing.foreign_text import (
     unit_in_comments,
 )
 from elastocal.importing.mapping_file import (
+    PRESETS,
     ColumnKey,
     FileColumn,
     NamesTable,
@@ -32,6 +33,7 @@ from elastocal.importing.mapping_file import (
     by_name,
     lacking,
     no_header,
+    read_mapping,
     resolve,
     wanted,
 )
@@ -136,6 +138,19 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         ignored=tuple(sorted([*table.ignored, *reader.ignored])),
     )
     return reader.records(understood, source)
+
+
+def likely_presets(path: Path) -> list[str]:
+    """The presets that read most rows of a file; none where no preset reads it."""
+    rows = dict[str, int]()
+    for name in PRESETS:
+        mapping = read_mapping(None, [name])
+        try:
+            read = read_records(mapping.path, path, mapping.sources[0], UnitsTable())
+        except ElastocalError:
+            continue
+        rows[name] = len(read)
+    return [name for name, n in rows.items() if n == max(rows.values())]
 
 
 def _table(text: Text, settings: TextSourceKeys, asked: Sequence[ColumnKey]) -> Rows:
