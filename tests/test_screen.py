@@ -17,7 +17,6 @@ from rich.text import Text
 from typer.testing import CliRunner
 
 from elastocal.cli.app import app, reporting_errors
-from elastocal.errors import InputError, computing
 from elastocal.screen import complain, safe_console, say
 from elastocal.text import printable
 
@@ -113,12 +112,6 @@ def test_what_a_library_raises_is_a_sentence_with_the_files(raised, code, told, 
     error = capsys.readouterr().err
     assert ended.value.exit_code == code
     assert re.search(told, error) and error.count("\n") == 1 and "Traceback" not in error
-
-
-def test_an_error_of_a_library_names_what_is_computed():
-    told = pytest.raises(InputError, match=r"box: OverflowError: .*; give a smaller one")
-    with told, computing("box", "give a smaller one"):
-        overflow()
 
 
 def test_warnings_of_numpy_do_not_reach_the_user(recwarn):

@@ -120,17 +120,6 @@ def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
     )
 
 
-@contextmanager
-def computing(what: str, remedy: str) -> Iterator[None]:
-    """Within it, what a library raises over numbers is an InputError: `what`, why, `remedy`."""
-    try:
-        yield
-    except ElastocalError:
-        raise
-    except (ArithmeticError, ValueError, RuntimeError, MemoryError) as error:
-        raise InputError(f"{what}: {type(error).__name__}: {error}; {remedy}") from error
-
-
 def require(condition: bool, message: str) -> None:
     """Raise InputError with `message` unless `condition` holds."""
     if not condition:
