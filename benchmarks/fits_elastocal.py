@@ -10,6 +10,7 @@ which ELASTOCAL_BACKEND chooses and which finds in its cache what it has compile
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -26,7 +27,7 @@ with clock.step("import"):
     from elastocal.identification.identify import identify
     from elastocal.identification.solve import settle
     from elastocal.measurements import Measurements
-    from elastocal.model import Model, observe, set_default_backend
+    from elastocal.model import Model, observe
 
 
 def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
@@ -43,7 +44,7 @@ def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
 def main(how: str, folder: Path, out: Path) -> None:
     given = np.load(folder / "given.npz")
     method, _, backend = how.partition("+")
-    set_default_backend(backend or None)
+    os.environ["ELASTOCAL_BACKEND"] = backend
     with clock.step("read"):
         model = Model(folder / "cell.toml")
         table = model.read(folder / "data.csv")

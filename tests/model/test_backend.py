@@ -18,7 +18,6 @@ from elastocal.model import (
     Model,
     Work,
     chosen_backend,
-    set_default_backend,
     summary,
 )
 from elastocal.model import evaluate as backend_module
@@ -29,10 +28,9 @@ ROWS = np.linspace(0.1, 2.0, 20).reshape(10, 2)
 
 @pytest.fixture(autouse=True)
 def fresh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No cache, no choice and no default of another test."""
+    """No cache, and no choice of another test."""
     monkeypatch.setenv("ELASTOCAL_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("ELASTOCAL_BACKEND", raising=False)
-    monkeypatch.setattr(backend_module, "_default", None)
 
 
 def function(backend: str | None = None) -> BatchFunction:
@@ -57,19 +55,15 @@ def test_auto_is_the_default() -> None:
     assert chosen_backend() == "auto"
 
 
-def test_argument_before_default_before_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_argument_before_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ELASTOCAL_BACKEND", "compiled")
     assert chosen_backend() == "compiled"
-    set_default_backend("numpy")
-    assert chosen_backend() == "numpy"
     assert chosen_backend("auto") == "auto"
-    set_default_backend(None)
-    assert chosen_backend() == "compiled"
 
 
 def test_an_unknown_name_is_refused_with_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"backend: unknown backend 'nunpy'.*'numpy'"):
-        set_default_backend("nunpy")
+        function("nunpy")
     with pytest.raises(InputError, match="unknown backend 'fortran'"):
         function("fortran")
     monkeypatch.setenv("ELASTOCAL_BACKEND", "complied")

@@ -12,8 +12,7 @@ ROOMS = {
     "dh": "read_dh",
     "effects": "effect_of register",
     "evaluate": (
-        "BackendReport BatchFunction Work chosen_backend row_blocks run_blocks "
-        "set_default_backend summary thread_count"
+        "BackendReport BatchFunction Work chosen_backend row_blocks run_blocks summary thread_count"
     ),
     "function_cache": "HashedFunction cache_folder content_key fetch store",
     "inverse_kinematics": "Postures",

@@ -87,8 +87,6 @@ COMPILE_START, COMPILE_INSTRUCTION = 0.2, 1.0e-4  # one run of the compiler, and
 COMPILE_LENGTH = 4.4e-9  # instruction and each of the others in the same function
 LOOKUP_START, LOOKUP_INSTRUCTION = 0.02, 1e-6  # hash, verify and load a library
 
-_default: str | None = None
-
 
 def checked(name: str, source: str) -> str:
     """`name` where it is a backend; InputError that says where it comes from otherwise."""
@@ -100,24 +98,13 @@ def checked(name: str, source: str) -> str:
     return name
 
 
-def set_default_backend(name: str | None) -> None:
-    """What functions use that were not told otherwise; None: ELASTOCAL_BACKEND, else "auto".
-
-    Raises InputError for an unknown name.
-    """
-    global _default
-    _default = None if name is None else checked(name, "backend")
-
-
 def chosen_backend(name: str | None = None) -> str:
-    """`name`, else the default set here, else ELASTOCAL_BACKEND, else "auto".
+    """`name`, else ELASTOCAL_BACKEND, else "auto".
 
     Raises InputError for an unknown name.
     """
     if name is not None:
         return checked(name, "backend")
-    if _default is not None:
-        return _default
     return checked(os.environ.get(VARIABLE, "").strip() or "auto", f"{VARIABLE} in the environment")
 
 
@@ -198,7 +185,7 @@ class BatchFunction:
     `inputs` and `outputs` are lists of SX vectors / matrices.  Calling it takes one array
     per input: (n, size) for a quantity that varies by row, (size,) for one that is the same in
     every row; it returns one array (n, rows, columns) per output, float64, or complex where an
-    input is.  `backend` is "auto", "numpy" or "compiled"; None follows `set_default_backend`.
+    input is.  `backend` is "auto", "numpy" or "compiled"; None follows ELASTOCAL_BACKEND.
     Complex numbers are always evaluated by numpy.
 
     `wider`, where given, is a function of the same inputs and outputs whose last output has more

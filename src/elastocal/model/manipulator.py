@@ -61,8 +61,8 @@ class Model:
         cell: A cell file (TOML), or a `Cell` built in Python.
         markers: The markers' names where the cell lists none; default one, "M1".  Every verb
             takes them from the table where neither says them.
-        backend: What evaluates it: "auto", "numpy" or "compiled"; None follows
-            `set_default_backend` and the environment variable ELASTOCAL_BACKEND.
+        backend: What evaluates it: "auto", "numpy" or "compiled"; None follows the
+            environment variable ELASTOCAL_BACKEND.
 
     Raises:
         InputError: The cell, or a file that it names, is wrong; the message says where.
