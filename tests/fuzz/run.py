@@ -48,14 +48,16 @@ def main() -> int:
     os.environ.setdefault("ELASTOCAL_CACHE", str(folder / "cache"))
     base = folder / "campaign"
     base.mkdir()
-    campaign.write(base)
-    harness.load_everything()
+    anything = asked.cases or asked.kills or asked.full or asked.interrupts
+    if anything or asked.case is not None:
+        campaign.write(base)
+        harness.load_everything()
     if asked.case is not None:
         case = harness.run(harness.make(asked.case, base, folder / "case", tuple(asked.verb)))
         print(f"cd {case.folder}\n{case.told()}\nstdout:\n{case.stdout[-3000:]}")
         return int(bool(case.complaints))
     begun = time.monotonic()
-    parts = {fork(asked, base, folder, k): k for k in range(asked.jobs)}
+    parts = {fork(asked, base, folder, k): k for k in range(asked.jobs if anything else 0)}
     tally = Tally()
     while parts:
         child, status = os.wait()
