@@ -368,8 +368,9 @@ def uncertainty_budget(
     if table is not None:
         B = fit.model.regressor(table, fit.x, fit.columns).B
         own, at = _spread(B, fit.covariance, size), table.source
-    roots = np.sqrt([own, parts.get("visits", 0.0), parts.get("readings", 0.0), lack])
-    return UncertaintyBudget(*(float(v) for v in roots), at)
+    squares = (own, parts.get("visits", 0.0), parts.get("readings", 0.0), lack)
+    parameters, visits, readings, beyond = (float(np.sqrt(v)) for v in squares)
+    return UncertaintyBudget(parameters, visits, readings, beyond, at)
 
 
 def _spread(B: Array, covariance: Array, size: int) -> float:
