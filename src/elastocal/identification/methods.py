@@ -264,9 +264,12 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
 
     One that lies beyond its bound by more than its interval contradicts the model and stays
     fitted: whoever reads it has to see that.  Of methods other than generalised and ordinary least
-    squares, and where bounds or knowledge were given, all stay fitted.
+    squares all stay fitted; where bounds or knowledge were given, these say what the readings do
+    not, and nothing is held.
     """
-    fitted = found.method in ("reml", "wls", "ols") and not (options.bounded or options.knows)
+    if options.bounded or options.knows:
+        return found
+    fitted = found.method in ("reml", "wls", "ols")
     limits: dict[int, tuple[float, float]] = {}
     while True:
         limits = hardly_shown(found) | limits  # held ones keep what was found of them
