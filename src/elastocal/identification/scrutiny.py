@@ -368,15 +368,9 @@ def uncertainty_budget(
     if table is not None:
         B = fit.model.regressor(table, fit.x, fit.columns).B
         own, at = _spread(B, fit.covariance, size), table.source
-<<<<<<< HEAD
-    roots = np.sqrt([own, parts.get("visits", 0.0), parts.get("readings", 0.0), lack])
-    parameters, repeatability, instrument, lack_of_fit = (float(v) for v in roots)
-    return UncertaintyBudget(parameters, repeatability, instrument, lack_of_fit, at)
-=======
     squares = (own, parts.get("visits", 0.0), parts.get("readings", 0.0), lack)
     parameters, visits, readings, beyond = (float(np.sqrt(v)) for v in squares)
     return UncertaintyBudget(parameters, visits, readings, beyond, at)
->>>>>>> found19
 
 
 def _spread(B: Array, covariance: Array, size: int) -> float:
