@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
-    from elastocal.export.changes import Comparison
+    from elastocal.export.changes import Comparison, compare
     from elastocal.identification.knowledge import Knowledge
     from elastocal.identification.result import Calibration
+    from elastocal.importing.first_cell import init
     from elastocal.measurements import Measurements
     from elastocal.model.arm import Parameter
     from elastocal.model.calibrated import CalibratedArm, read_calibrated
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from elastocal.model.manipulator import Model
     from elastocal.planning.plan import Plan
     from elastocal.plugins import register_criterion, register_effect, register_noise_model
-    from elastocal.verbs import compare, compensate, design, diagnose, identify, init, simulate
+    from elastocal.verbs import compensate, design, diagnose, identify, simulate
 
 __version__ = "0.1.0"
 
@@ -65,10 +66,11 @@ ROOMS = {
     "cell.workspace_rules": "Workspace",
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
-    "export.changes": "Comparison",
+    "export.changes": "Comparison compare",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
+    "importing.first_cell": "init",
     "measurements": "Measurements",
     "model.arm": "Parameter",
     "model.calibrated": "CalibratedArm read_calibrated",
@@ -76,7 +78,7 @@ ROOMS = {
     "model.manipulator": "Model",
     "planning.plan": "Plan",
     "plugins": "register_criterion register_effect register_noise_model",
-    "verbs": "compare compensate design diagnose identify init simulate",
+    "verbs": "compensate design diagnose identify simulate",
 }
 
 __all__ = [

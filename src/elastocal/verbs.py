@@ -1,4 +1,4 @@
-"""The verbs of the front door: init, design, simulate, identify, diagnose, compensate.
+"""The verbs of the front door: design, simulate, identify, diagnose, compensate.
 
 Each takes the model first (or a cell, or the path of one) and its options as keyword arguments;
 it checks them, makes the option objects that the packages below work with, and calls them.  What
@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.cell.arm_description import Robot
 from elastocal.cell.plan_wishes import Motion, TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.compensation.targets import Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.export.changes import Comparison
     from elastocal.identification.intervals import IntervalKind
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, Method
@@ -49,54 +47,6 @@ Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
 MOST = 10_000_000  # of poses, candidates, processes: more is a slip of the key
 Progress: TypeAlias = Callable[[str], None]
 T = TypeVar("T")
-
-
-def init(
-    robot: str | Path | Robot,
-    output: str | Path | None = None,
-    *,
-    base: str | None = None,
-    flange: str | None = None,
-    convention: Literal["standard", "modified"] = "standard",
-    force: bool = False,
-) -> str:
-    """How does a first cell for my arm look?
-
-    What the robot's file says (joints, limits, flange, masses, a MuJoCo model's sites) and guesses
-    of what it does not, marked as such: a cell file that `design` and `simulate` run with.
-
-    Args:
-        robot: A URDF, MuJoCo model (MJCF) or DH table, or a `Robot`.
-        output: The cell file to write; None writes none.
-        base: First link or body, None for the root.
-        flange: Last link, body or site; None for the one that is found.
-        convention: Of a DH table: "standard" or "modified".
-        force: Write over a file that is there.
-
-    Returns:
-        The text of the cell file.
-
-    Raises:
-        InputError: The robot's file is wrong, leaves a choice open, or `output` is there already.
-
-    Examples:
-        >>> text = ec.init("kr270_2.urdf", "first.toml")
-        >>> ec.Model("first.toml").chain.n_joints
-        6
-    """
-    from elastocal.files import atomic_write_text
-    from elastocal.importing.first_cell import first_cell, robot_of
-
-    target = None if output is None else Path(output)
-    require(
-        target is None or force or not target.exists(),
-        f"{target} is there already; name another file, or give {option('force', True)}",
-    )
-    found = robot if isinstance(robot, Robot) else robot_of(robot, base, flange, convention)
-    text = first_cell(found, "." if target is None else target.parent)
-    if target is not None:
-        atomic_write_text(target, text)
-    return text
 
 
 def design(
@@ -678,54 +628,6 @@ def compensate(
     where = _tool_point(arm.model.cell, point)
     wanted = _targets(targets, chain.kinds, frame, force)
     return run(arm, wanted, where, start, _whole("seed", seed, 0), progress or _silent)
-
-
-def compare(
-    old: CalibratedArm | Calibration,
-    new: CalibratedArm | Calibration,
-    *,
-    load: ArrayLike | None = None,
-    level: float = 0.05,
-    poses: int = 300,
-    seed: int = 0,
-) -> Comparison:
-    """What has changed since the last calibration?
-
-    The parameters of the arm itself, one by one by Holm's rule and all together, and how far the
-    tool has moved over the workspace where it is commanded and set up alike.
-
-    Args:
-        old: The earlier calibration, or its arm (`fit.arm`, `read_calibrated`).
-        new: The later one, of the same cell.
-        load: Force (3,) in N at the load point under which the tool is compared; default none.
-        level: Chance that any parameter is called changed where none is.
-        poses: Random poses within the joint limits.
-        seed: Of these poses.
-
-    Returns:
-        The `Comparison`: changes with their uncertainty, displacements, the verdict.
-
-    Raises:
-        InputError: The two are of different models, or an option is wrong.
-        InsufficientDataError: They have no parameter in common, or no pose settles under the load.
-
-    Examples:
-        >>> fit = ec.identify("cell.toml", "data.csv")
-        >>> ec.compare(fit, fit).verdict
-        'no_change_shown'
-    """
-    from elastocal.export.changes import compare as run
-    from elastocal.identification.result import Calibration
-
-    arms = [arm.arm if isinstance(arm, Calibration) else arm for arm in (old, new)]
-    for name, arm in zip(("old", "new"), arms, strict=True):
-        if not isinstance(arm, CalibratedArm):
-            raise InputError(
-                f"{option(name)} takes a calibrated arm, as fit.arm or what read_calibrated gives; "
-                f"found {type(arm).__name__}"
-            )
-    count, drawn = _whole("poses", poses, 2), _whole("seed", seed, 0)
-    return run(arms[0], arms[1], given_force(load), float(level), count, drawn)
 
 
 def check_frame(frame: str) -> None:

@@ -49,7 +49,7 @@ def compare(
 
     Example: elastocal compare january.json june.json --cell cell.toml --report changes.html
     """
-    from elastocal import verbs
+    from elastocal.export.changes import compare as run
     from elastocal.files import together
     from elastocal.model.calibrated import read_calibrated
     from elastocal.report.changes_view import change_rows, changes_lines
@@ -66,7 +66,7 @@ def compare(
         arms = [read_calibrated(known, path) for path in (old, new)]
         check_apart(written, [], arms[0].model.cell)
         progress("comparing")
-        found = verbs.compare(*arms, load=load, level=level, poses=poses, seed=seed)
+        found = run(*arms, load=load, level=level, poses=poses, seed=seed)
     with together(written):
         if output is not None:
             write_json(output, found.to_json())

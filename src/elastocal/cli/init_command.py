@@ -33,12 +33,12 @@ def init(
 
     Example: elastocal init arm.urdf -o cell.toml
     """
-    from elastocal import verbs
     from elastocal.cell.work_cell import read_cell
+    from elastocal.importing.first_cell import init as write
     from elastocal.model.choice import load_chain
 
     check_apart(check_outputs(output), [robot])
-    verbs.init(robot, output, base=base, flange=flange, convention=convention, force=force)  # type: ignore[arg-type]
+    write(robot, output, base=base, flange=flange, convention=convention, force=force)  # type: ignore[arg-type]
     cell = read_cell(output)
     names = [joint.name for joint in load_chain(cell).joints]
     say(f"wrote {output}: {len(names)} joints ({', '.join(names)})")

@@ -20,14 +20,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from elastocal.above import Result
 from elastocal.cell.arm_description import Tool
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.export.exportable import Conditions, Valued, keep, random_table
+from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
+from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.manipulator import Model
@@ -42,7 +44,7 @@ POINT = "tool"
 
 
 @dataclass(frozen=True)
-class Change:
+class ParameterChange:
     """One parameter: values and their difference in SI units, its standard deviation, p alone and
     by Holm's rule, whether that is below the level, and `moves`: rms in m at the tool."""
 
@@ -81,7 +83,7 @@ class Comparison(Result):
 
     old: CalibratedArm
     new: CalibratedArm
-    changes: tuple[Change, ...]
+    changes: tuple[ParameterChange, ...]
     p: float
     level: float
     moved: Array
@@ -91,7 +93,7 @@ class Comparison(Result):
     first_order: bool
 
     @property
-    def changed(self) -> list[Change]:
+    def changed(self) -> list[ParameterChange]:
         """Those that exceed their joint uncertainty, the largest at the tool first."""
         return sorted((c for c in self.changes if c.changed), key=lambda c: -c.moves)
 
@@ -140,19 +142,57 @@ class Comparison(Result):
 
 
 def compare(
-    old: CalibratedArm,
-    new: CalibratedArm,
-    force: Array | None = None,
+    old: CalibratedArm | Calibration,
+    new: CalibratedArm | Calibration,
+    *,
+    load: ArrayLike | None = None,
     level: float = LEVEL,
     poses: int = 300,
     seed: int = 0,
 ) -> Comparison:
-    """What has changed from `old` to `new`, over random poses within the joint limits.
+    """What has changed since the last calibration?
 
-    Raises InputError for arms of two models, and InsufficientDataError where the campaigns have no
-    parameter of the arm in common, or no pose has an equilibrium under the force.
+    The parameters of the arm itself, one by one by Holm's rule and all together, and how far the
+    tool has moved over the workspace where it is commanded and set up alike.
+
+    Args:
+        old: The earlier calibration, or its arm (`fit.arm`, `read_calibrated`).
+        new: The later one, of the same cell.
+        load: Force (3,) in N at the load point under which the tool is compared; default none.
+        level: Chance that any parameter is called changed where none is.
+        poses: Random poses within the joint limits.
+        seed: Of these poses.
+
+    Returns:
+        The `Comparison`: changes with their uncertainty, displacements, the verdict.
+
+    Raises:
+        InputError: The two are of different models, or an option is wrong.
+        InsufficientDataError: They have no parameter in common, or no pose settles under the load.
+
+    Examples:
+        >>> fit = ec.identify("cell.toml", "data.csv")
+        >>> ec.compare(fit, fit).verdict
+        'no_change_shown'
     """
+    before, after = (arm.arm if isinstance(arm, Calibration) else arm for arm in (old, new))
+    for name, arm in (("old", before), ("new", after)):
+        if not isinstance(arm, CalibratedArm):
+            raise InputError(
+                f"{option(name)} takes a calibrated arm, as fit.arm or what read_calibrated gives; "
+                f"found {type(arm).__name__}"
+            )
+    for name, count, least in (("poses", poses, 2), ("seed", seed, 0)):
+        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+        require(whole and count >= least, f"{option(name)} takes a whole number, {least} or more")
     require(0 < level < 1, f"{option('level')} takes a number between 0 and 1; found {level}")
+    force = given_force(load)
+    return _compared(before, after, force, float(level), int(poses), int(seed))
+
+
+def _compared(
+    old: CalibratedArm, new: CalibratedArm, force: Array | None, level: float, poses: int, seed: int
+) -> Comparison:
     require(
         old.model.names == new.model.names,
         f"{old.source} and {new.source} are of two models: their parameters differ; identify both "
@@ -305,7 +345,7 @@ def _tested(
     V: Array,
     level: float,
     slope: Array,
-) -> tuple[tuple[Change, ...], float]:
+) -> tuple[tuple[ParameterChange, ...], float]:
     """Each parameter by Holm's rule, and p of all together."""
     variance = np.diag(V)
     require(
@@ -327,8 +367,10 @@ def _tested(
     a = old.values
     units = {q.name: q.unit for q in old.model.parameters}
     changes = tuple(
-        Change(n, units[n], a[n], a[n] + float(z[k]), float(z[k]), float(std[k]), float(p[k]),
-               float(family[k]), bool(family[k] < level), float(abs(z[k]) * slope[k]))
+        ParameterChange(
+            n, units[n], a[n], a[n] + float(z[k]), float(z[k]), float(std[k]), float(p[k]),
+            float(family[k]), bool(family[k] < level), float(abs(z[k]) * slope[k]),
+        )
         for k, n in enumerate(names)
     )  # fmt: skip
     return changes, float(stats.f.sf(together, len(z), smallest))

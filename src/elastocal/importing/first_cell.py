@@ -17,6 +17,7 @@ import numpy as np
 from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
+from elastocal.files import atomic_write_text
 from elastocal.model.chain import Chain, Joint
 from elastocal.model.choice import load_chain
 from elastocal.model.effects.compliances import JointCompliance
@@ -33,10 +34,55 @@ ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
 FLANGE_SITES = ("attachment_site", "flange", "tool0", "ee_site")
 MOST_SITES = 8  # listed as markers; of more most are something else
 # Of the KR 270 of the demo, in m and N, from which loads are guessed by the fourth power of the
-# reach: small arms carry less for their size (a UR5e of 0.95 m 50 N, an arm of 1.45 m 100 N).
+# reach: small arms carry less for their size.
 REACH, LOAD = 2.9, 2600.0
 THICKNESS = 15.0  # reach over a link's radius
 POSES, CANDIDATES = 20, 2000  # three markers read nine numbers in each pose and load state
+
+
+def init(
+    robot: str | Path | Robot,
+    output: str | Path | None = None,
+    *,
+    base: str | None = None,
+    flange: str | None = None,
+    convention: Convention = "standard",
+    force: bool = False,
+) -> str:
+    """How does a first cell for my arm look?
+
+    What the robot's file says (joints, limits, flange, masses, a MuJoCo model's sites) and guesses
+    of what it does not, marked as such: a cell file that `design` and `simulate` run with.
+
+    Args:
+        robot: A URDF, MuJoCo model (MJCF) or DH table, or a `Robot`.
+        output: The cell file to write; None writes none.
+        base: First link or body, None for the root.
+        flange: Last link, body or site; None for the one that is found.
+        convention: Of a DH table: "standard" or "modified".
+        force: Write over a file that is there.
+
+    Returns:
+        The text of the cell file.
+
+    Raises:
+        InputError: The robot's file is wrong, leaves a choice open, or `output` is there already.
+
+    Examples:
+        >>> text = ec.init("kr270_2.urdf", "first.toml")
+        >>> ec.Model("first.toml").chain.n_joints
+        6
+    """
+    target = None if output is None else Path(output)
+    require(
+        target is None or force or not target.exists(),
+        f"{target} is there already; name another file, or give {option('force', True)}",
+    )
+    found = robot if isinstance(robot, Robot) else robot_of(robot, base, flange, convention)
+    text = first_cell(found, "." if target is None else target.parent)
+    if target is not None:
+        atomic_write_text(target, text)
+    return text
 
 
 def robot_of(
