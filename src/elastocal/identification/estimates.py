@@ -142,18 +142,20 @@ def _estimates(
     for k, c in enumerate(reduction.kept):
         parameter = model.parameters[c]
         terms = reduction.terms(k, solution.sizes, std[k])
-        value, ci = float(x[c]), (float(intervals.ci95[k, 0]), float(intervals.ci95[k, 1]))
+        value, wide = float(x[c]), reduction.widening(k, solution.sizes, std[k])
+        low, high = (float(value + wide * (end - value)) for end in intervals.ci95[k])
+        spread, ci = wide * float(std[k]), (low, high)
         for d in terms:
             partners[d].append(parameter.name)
         if terms:
             shares = {parameter.name: 1.0} | {model.names[d]: f for d, f in terms.items()}
             held = {model.names[d]: float(x[d]) for d in terms}
-            combination = Combination(shares, parameter.unit, value, float(std[k]), ci, held)
+            combination = Combination(shares, parameter.unit, value, spread, ci, held)
             combinations.append(combination)
             note = f"only as {combination.expression}"
             found[int(c)] = estimate(c, combined_with=tuple(held), note=note)
         else:
-            found[int(c)] = estimate(c, value=value, std=float(std[k]), ci95=ci, dof=float(dof[k]))
+            found[int(c)] = estimate(c, value=value, std=spread, ci95=ci, dof=float(dof[k]))
     invisible = set(reduction.invisible.tolist())
     for d in reduction.dropped:
         note = "held: no reading depends on it enough to determine it"

@@ -85,14 +85,20 @@ class Reduction:
         """Parameters combined with kept parameter number k, and their factors.
 
         A dropped parameter counts where its typical deviation would shift the estimate by more
-        than a tenth of its standard deviation `std`: less would not show in the interval.
+        than its standard deviation `std`; what shifts it less is in its interval (`widening`).
         """
         row = self.mixing[k]
         return {
             int(d): float(row[j])
             for j, d in enumerate(self.dropped)
-            if abs(row[j]) * sizes[d] > 0.1 * std
+            if abs(row[j]) * sizes[d] > std
         }
+
+    def widening(self, k: int, sizes: Array, std: float) -> float:
+        """√(std² + Σ_d (m_kd s_d)²)/std over the dropped parameters d that are not among `terms`:
+        what their typical deviations s_d, as a prior N(0, s_d²), add to the standard deviation."""
+        shift = np.abs(self.mixing[k]) * sizes[self.dropped]
+        return float(np.sqrt(1 + ((shift[shift <= std] / std) ** 2).sum())) if std > 0 else 1.0
 
 
 def reduce(
