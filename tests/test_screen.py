@@ -10,7 +10,7 @@ import sys
 import unicodedata
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.table import Table
 from rich.text import Text
@@ -38,6 +38,7 @@ def test_an_escaped_text_is_harmless_and_stays_as_it_is(text):
     assert once == text or not text.isprintable()
 
 
+@settings(deadline=None)
 @given(HOSTILE)
 def test_no_table_line_or_message_obeys_a_name(name):
     screen = safe_console(file=io.StringIO(), width=200, force_terminal=True, color_system=None)
