@@ -146,7 +146,7 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
     """
     problem, kept = solution.problem, solution.reduction.kept
     model, observed = problem.model, problem.observations
-    if not len(open_):
+    if not len(open_) or model.shrunk[kept].all():
         return ()
     anywhere = over_the_workspace(model.cell, model, observed.table)
     try:
@@ -391,6 +391,7 @@ def excess_of(
 
 def _chi2(dof: int, rng: np.random.Generator) -> Array:
     """Draws (DRAWS,) of ν/χ²_ν: by what factor a mean square may be off."""
+    dof = max(dof, 1)
     return np.asarray(dof / rng.chisquare(dof, DRAWS))
 
 
@@ -410,6 +411,8 @@ def predicted_error(
     """
     left = arm.left
     if left is None or not arm.determined or observed.kind == "distance":
+        return None
+    if not np.isfinite(arm.covariance).all():
         return None
     try:
         B, weight = readings_at(arm.model, arm.x, observed, poses)
