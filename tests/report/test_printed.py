@@ -11,7 +11,7 @@ import pytest
 from support.diagnoses import VERDICTS
 
 from elastocal.identification import judged
-from elastocal.report.identification_view import judgement
+from elastocal.report.judgement_view import judgement
 from elastocal.report.terminal import PRINTED_WIDTH, diagnosis_text, identification_text
 
 

@@ -14,16 +14,15 @@ from elastocal.identification import Combination, standings
 from elastocal.report.identification_view import (
     HALF_LENGTH,
     MIDDLE,
-    SECTIONS,
     bar_from_nominal,
     combination_truth,
     inside,
-    judgement,
     parameter_rows,
     shortened,
     summary_lines,
     texts,
 )
+from elastocal.report.judgement_view import SECTIONS, judgement
 from elastocal.report.terminal import combination_table, parameter_table, print_result
 
 

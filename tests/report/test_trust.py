@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from elastocal.identification import LackOfFit, TestErrors, judged
-from elastocal.report import identification_view
+from elastocal.report import judgement_view
 
 MISFIT = LackOfFit(9.0, 1e-5, 30, 200)
 
 
-def judgement(result: Any) -> identification_view.Judgement:
+def judgement(result: Any) -> judgement_view.Judgement:
     """What is said of a result whose fields were changed, judged anew."""
-    return identification_view.judgement(judged(result))
+    return judgement_view.judgement(judged(result))
 
 
 @pytest.fixture(scope="module")

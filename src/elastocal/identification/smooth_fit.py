@@ -38,7 +38,7 @@ from elastocal.identification.noise_choice import (
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.outliers import FALSE_ALARM
-from elastocal.identification.residuals import predicts_better, rms_3d
+from elastocal.identification.residuals import rms_3d
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.smooth_prior import (
     LinearRows,
@@ -55,6 +55,7 @@ from elastocal.identification.solve import (
     Solution,
     choose,
     is_placed,
+    wider_is_needed,
 )
 from elastocal.identification.weighted_problem import (
     Part,
@@ -338,13 +339,6 @@ class Crossed(NamedTuple):
     held_out: Array
     leverage: Array
     standard: Array
-
-
-def _needed(problem: Problem, narrow: Crossed, wide: Crossed) -> bool:
-    observed = problem.observations
-    return predicts_better(
-        narrow.held_out, wide.held_out, problem.weights, observed.configuration, observed.size
-    )
 
 
 def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
@@ -673,7 +667,7 @@ class _Course:
                 continue
             tried = len(wide.kept)
             there = crossed(*fit.linear(fit.scales, wide))
-            if not _needed(fit.problem, cross, there):
+            if not wider_is_needed(fit.problem, cross.held_out, there.held_out):
                 continue
             try:
                 other = joint_fit(
@@ -683,7 +677,8 @@ class _Course:
                 there = crossed(other)
             except (ElastocalError, np.linalg.LinAlgError, ValueError):
                 continue  # along an undetermined direction it may leave every valid arm
-            if other.converged and _needed(fit.problem, cross, there):
+            held = cross.held_out, there.held_out
+            if other.converged and wider_is_needed(fit.problem, *held):
                 fit, cross = other, there
         return fit, cross
 

@@ -259,6 +259,12 @@ def heldout_of(problem: Problem, found: Fit) -> Array:
     )  # fmt: skip
 
 
+def wider_is_needed(problem: Problem, narrow: Array, wide: Array) -> bool:
+    """Do the held-out residuals (rows,) of a wider set show that the narrow one lacks something?"""
+    observed = problem.observations
+    return predicts_better(narrow, wide, problem.weights, observed.configuration, observed.size)
+
+
 def prefer_wider(
     problem: Problem, sizes: Array, found: Fit, reduction: Reduction, heldout: Array,
     r_factor: RFactor,
@@ -269,18 +275,13 @@ def prefer_wider(
     decides, first on the linearised model, then on the refitted one.  `r_factor` is that of the
     free columns.
     """
-    observed = problem.observations
-
-    def needed(narrow: Array, wide: Array) -> bool:
-        return predicts_better(narrow, wide, problem.weights, observed.configuration, observed.size)
-
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
         wider = choose(problem, sizes, r_factor, sigma, threshold)
         if len(wider.kept) <= len(reduction.kept):
             continue
         x, linear_heldout = _linear_step(problem, sizes, found.x, wider, r_factor)
-        if not needed(heldout, linear_heldout):
+        if not wider_is_needed(problem, heldout, linear_heldout):
             continue
         try:
             wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
@@ -289,7 +290,7 @@ def prefer_wider(
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
-        if wide.converged and needed(heldout, wide_heldout):
+        if wide.converged and wider_is_needed(problem, heldout, wide_heldout):
             found, reduction, heldout = wide, wider, wide_heldout
             r_factor = free_r_factor(problem, found)
     return found, reduction, heldout

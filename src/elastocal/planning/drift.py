@@ -125,7 +125,7 @@ HOT, COLD = 20.0, 1e-3  # in units of a bias that is as good as none
 
 
 @dataclass(frozen=True)
-class Clock:
+class VisitTimes:
     """When each visit of an order is read, and what a drift then does.
 
     `travel` (V + 1, V + 1) s between nodes, `change` s where that changes the load, `visit` s of
@@ -143,7 +143,7 @@ class Clock:
     @classmethod
     def of(
         cls, moves: Moves, motion: Motion, costs: Costs, alias: Alias | None, shortest: list[int]
-    ) -> Clock:
+    ) -> VisitTimes:
         """Allows so much more travel than in the `shortest` tour as `motion` has extra time."""
         visits = moves.visits
         share = np.zeros((1 + visits.pose.max(), 1 + visits.load.max(), 1, 3))
@@ -162,7 +162,7 @@ class Clock:
         driving = made.driving(shortest)
         return replace(made, longest=driving + motion.extra_time * (driving + waiting))
 
-    def at(self, costs: Costs) -> Clock:
+    def at(self, costs: Costs) -> VisitTimes:
         """With what is known of the moves since."""
         return replace(self, travel=_travel(costs))
 
@@ -196,7 +196,7 @@ class Clock:
 
 
 def balanced(
-    tour: list[int], load: IntArray, clock: Clock, seed: int, steps: int, hot: float
+    tour: list[int], load: IntArray, clock: VisitTimes, seed: int, steps: int, hot: float
 ) -> list[int]:
     """The tour with its visits exchanged and moved between blocks of the same load state (V,),
     never more changes of load, by annealing the clock's price from `hot` down to COLD."""

@@ -21,8 +21,8 @@ from elastocal.planning.drift import (
     STEPS,
     TRIES,
     Alias,
-    Clock,
     Drifting,
+    VisitTimes,
     balanced,
     in_turns,
     turns,
@@ -403,7 +403,7 @@ def _against_drift(
     load = moves.visits.load
     used = [int(s) for s in dict.fromkeys(load[np.array(tour) - 1])]
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
-    clock = Clock.of(moves, motion, costs, alias, tour)
+    clock = VisitTimes.of(moves, motion, costs, alias, tour)
     before = clock.bias(tour)
     begun = in_turns(tour, load, sequence)
     tries = [balanced(begun, load, clock, seed + k, STEPS, HOT) for k in range(TRIES)]

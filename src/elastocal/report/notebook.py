@@ -36,12 +36,8 @@ from elastocal.report.diagnosis_view import (
 )
 from elastocal.report.effect_names import effect_at, name_of
 from elastocal.report.formatting import display, length, minus
-from elastocal.report.identification_view import (
-    combination_rows,
-    judgement,
-    parameter_rows,
-    summary_lines,
-)
+from elastocal.report.identification_view import combination_rows, parameter_rows, summary_lines
+from elastocal.report.judgement_view import judgement
 from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
 from elastocal.report.plan_view import first_stops, plan_lines
 from elastocal.report.residual_view import residuals_of

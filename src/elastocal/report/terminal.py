@@ -37,12 +37,12 @@ from elastocal.report.identification_view import (
     any_lopsided,
     combination_rows,
     half_head,
-    judgement,
     names_of,
     parameter_rows,
     summary_lines,
     undetermined_lines,
 )
+from elastocal.report.judgement_view import judgement
 from elastocal.report.method_and_noise import candidate_rows, size_rows
 from elastocal.report.plan_view import curve_rows, interval_rows, plan_lines, pose_rows, reason_rows
 from elastocal.screen import safe_console
