@@ -208,7 +208,7 @@ def main() -> None:
         "Table 4: stated intervals": four,
         "Fig. 3: iteration of eq. (14) on each residual": figure_3(c, dp, HERE / "fig3.png"),
         "What iterating adds to a single iteration": iterating(
-            c, min(chosen.replicates, 100), chosen.jobs
+            c, min(chosen.replicates, 40), chosen.jobs
         ),
         "What it is worth: noise of Table 1": worth(c, 0.0, chosen.replicates, chosen.jobs),
         "What it is worth: with an 80 µm configuration effect": worth(
