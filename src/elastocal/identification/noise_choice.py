@@ -62,6 +62,7 @@ from elastocal.units import Array, BoolArray, IntArray
 
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
 LEAST_START = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
+FEWEST_TELLING = 10  # degrees of freedom of repeats, from which on they tell the noise
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
 
 
@@ -321,6 +322,11 @@ def _parts(
     readings = readings.by_visit(kind.by_visit)
     structure = STRUCTURES[kind.own](readings)
     effects = shared_effects(structure.sets, readings.size, kind.shared)
+    if structure.sets.dof.sum() * readings.size < FEWEST_TELLING:
+        # Nothing but repeats tells a deviation of each set from the noise of single readings, and a
+        # few of them may agree by chance.
+        n = len(structure.sets)
+        effects = tuple(e for e in effects if len(np.unique(e.unit)) < n) or effects
     if kind.shared and not effects:
         raise InputError(
             f"'{kind.own}{SHARED}' needs repeats or several markers in a configuration; this table "

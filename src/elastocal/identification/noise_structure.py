@@ -513,16 +513,13 @@ def _common(
 LABELS = 2**20  # that a table may have of each kind, so that three of them make one number
 
 
-FEWEST_TELLING = 10  # degrees of freedom of repeats, from which on they tell the noise
-
-
 def shared_effects(sets: RepeatSets, size: int, wanted: bool = True) -> tuple[SharedEffect, ...]:
     """The shared effects that these readings can tell apart.
 
     An arm does not come back to quite the same place: a deviation per configuration; per
     configuration and load; per configuration and marker; and per set, common to its repeats.
-    One is left out where it would coincide with another or with the noise of single readings, or
-    has too few repeats to be told from it.  Rotations, in rad, have variances of their own.
+    One is left out where it would coincide with another or with the noise of single readings.
+    Rotations, in rad, have variances of their own.
     """
     if not wanted:
         return ()
@@ -534,9 +531,6 @@ def shared_effects(sets: RepeatSets, size: int, wanted: bool = True) -> tuple[Sh
         # Alone in its unit and not repeated, a reading's own noise covers it.
         observed = np.bincount(unit, sets.repeats)
         if (observed < 2).all() or any(np.array_equal(unit, other) for other in kept.values()):
-            continue
-        # Then nothing but repeats tells it from that noise: a few of them may agree by chance.
-        if len(observed) == len(sets) and sets.dof.sum() * size < FEWEST_TELLING:
             continue
         kept[by] = unit
     position = np.where(np.arange(size) < 3, 1.0, 0.0)
