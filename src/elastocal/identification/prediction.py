@@ -124,7 +124,8 @@ def left_open(solution: Solution) -> OpenParameters:
     """What a fit left open, from its weighted B_K and B_D at the values found."""
     model, reduction = solution.problem.model, solution.reduction
     free, x = solution.problem.free, solution.fit.x
-    kept, own = reduction.kept, ~model.shrunk[reduction.kept]
+    kept = reduction.kept
+    own = ~(model.shrunk[kept] | np.isin(kept, reduction.with_prior))
     open_ = reduction.dropped[~model.shrunk[reduction.dropped]]
     mixing = np.zeros((len(kept), len(open_)))
     typical = typical_sizes(model.parameters, x, kept)
