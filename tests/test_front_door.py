@@ -311,7 +311,18 @@ def test_arrays_become_tables(model):
 
 
 # What the command line writes, and how it says in text what Python says otherwise.
-OF_FILES = {"output", "report", "residuals", "program", "picture", "plan", "cell_out", "truth"}
+# In Python `fit.unmet(...)` asks what `--require` does.
+OF_FILES = {
+    "require",
+    "output",
+    "report",
+    "residuals",
+    "program",
+    "picture",
+    "plan",
+    "cell_out",
+    "truth",
+}
 OF_TEXT = {"json", "quiet", "help", "set", "no_noise", "target", "partial", "poses", "fix"}
 OF_A_TABLE = {"table", "grid", "box", "rotation"}
 

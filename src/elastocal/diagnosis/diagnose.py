@@ -61,7 +61,7 @@ from elastocal.units import BoolArray, Progress
 # Tables of the cell file, and the keys in them whose values are paths.  A list of tables counts
 # as each of its members.
 PATHS = (
-    (("robot",), ("urdf", "dh", "masses")),
+    (("robot",), ("urdf", "mjcf", "dh", "masses")),
     (("workspace", "obstacle"), ("file",)),
     (("workspace", "body"), ("file",)),
     (("workspace", "load"), ("file",)),

@@ -109,3 +109,17 @@ class Options:
         if self.weights == "auto" and self.covariance is None:
             return "reml"
         return "ols" if self.weights == "none" else "wls"
+
+
+def check_for_functions(options: Options) -> None:
+    """Raise InputError for a method or intervals that take no prior, as smooth functions have."""
+    if options.resolved in ROBUST or options.resolved.startswith("eq14"):
+        raise InputError(
+            f"the method {options.resolved} takes no prior, which smooth functions have; use the "
+            "default method, which sets faulty readings apart"
+        )
+    if options.intervals not in ("auto", "classical"):
+        raise InputError(
+            f"{option('intervals', options.intervals)} knows of no prior, which smooth functions "
+            "have; leave it away"
+        )

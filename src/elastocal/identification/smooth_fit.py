@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, sparse, stats
 
-from elastocal.errors import ElastocalError, InputError, option
+from elastocal.errors import ElastocalError
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.intervals import LEVEL, Intervals
 from elastocal.identification.knowledge import GaussianPrior
@@ -36,7 +36,7 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import ROBUST, Options
+from elastocal.identification.options import Options, check_for_functions
 from elastocal.identification.outliers import FALSE_ALARM
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.smooth_part import SmoothPart
@@ -129,12 +129,12 @@ class Functions:
     nominal: Array
 
     @classmethod
-    def of(cls, model: Model, free: IntArray) -> Functions:
-        """Those of the parameters `free`."""
+    def of(cls, model: Model, free: IntArray, sized: IntArray) -> Functions:
+        """Those of the parameters `free`, and the parameters `sized`."""
         own = [g for g in smooth_groups(model) if np.isin(g.columns, free).any()]
         columns = [c[np.isin(c, free)] for c in (g.columns.ravel() for g in own)]
         alike: dict[tuple[str, str, str], list[int]] = {}
-        for c in (sized := sized_of(model, free)).tolist():
+        for c in sized.tolist():
             p = model.parameters[c]
             alike.setdefault((p.effect, p.where, p.unit), []).append(c)
         columns += [np.array(same) for same in alike.values()]
@@ -450,28 +450,21 @@ def fit_smooth(
 
     Raises InputError for methods and intervals that take no prior.
     """
-    _check_options(options)
-    functions = Functions.of(every.problem.model, free)
-    progress("fitting smooth functions")
-    search = _Course(every, sound, functions, options, progress)
-    fit, noise, good = search.settled(~faulty)
-    fit = search.bounded(fit)
-    fit, cross = search.wider(fit)
-    fit, cross = search.without_those_that_harm(fit, cross)
-    return search.result(fit, cross, noise, good)
-
-
-def _check_options(options: Options) -> None:
-    if options.resolved in ROBUST or options.resolved.startswith("eq14"):
-        raise InputError(
-            f"the method {options.resolved} takes no prior, which smooth functions have; use the "
-            "default method, which sets faulty readings apart"
-        )
-    if options.intervals not in ("auto", "classical"):
-        raise InputError(
-            f"{option('intervals', options.intervals)} knows of no prior, which smooth functions "
-            "have; leave it away"
-        )
+    check_for_functions(options)
+    model, size, tried = every.problem.model, every.problem.observations.size, []
+    for sized in (sized_of(model, free), np.zeros(0, dtype=np.int64)):
+        progress("fitting smooth functions")
+        search = _Course(every, sound, Functions.of(model, free, sized), options, progress)
+        fit, noise, good = search.settled(~faulty)
+        fit, cross = search.wider(search.bounded(fit))
+        fit, cross = search.without_those_that_harm(fit, cross)
+        held = rms_3d(cross.held_out, size)
+        tried.append((not fit.converged, held, search, (fit, cross, noise, good)))
+        # A prior that leads astray predicts worse than the ordinary parameters alone.
+        if not len(sized) or (fit.converged and held <= rms_3d(sound.heldout, size)):
+            break
+    _, _, search, parts = min(tried, key=lambda course: course[:2])
+    return search.result(*parts)
 
 
 def _followed(observed: Observations, group: SmoothGroup) -> Array:
