@@ -408,10 +408,14 @@ class Calibration(Result):
 
     @cached_property
     def _looked(self) -> scrutiny.Looked | None:
-        """The fit for a second look; None for a table too large to do it in passing, and for an
-        exact fit, which leaves nothing to look at."""
+        """The fit for a second look; None for a table too large to do it in passing, for an exact
+        fit, which leaves nothing to look at, and for one that priors or bounds hold as well: what
+        a configuration decides there is not said by B alone."""
         if (
             self.weights is None
+            or self.prior_share
+            or self.smooth
+            or self.active
             or not self.residual.any()
             or len(self.residual) * len(self.estimates) > MOST_NUMBERS
         ):
