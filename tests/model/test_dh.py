@@ -191,6 +191,10 @@ WRONG_DH = {
     "too many": (f"{HEADER}\n" + f"{ROW}\n" * 10, "10 rows below the header.*4 to 9"),
     "degrees": (f"{HEADER}\n" + "0,0,0,90\n" * 4, "90 rad is more than two turns.*alpha_deg"),
     "millimetres": (f"{HEADER}\n" + "0,750,0,0\n" * 4, "750 m is too long for a link.*d_mm"),
+    "beyond any unit": (
+        "theta0_rad,d_mm,a_mm,alpha_rad\n" + "0,1e300,0,0\n" * 4,
+        "column d_mm: 1e.297 m is too long for a link; correct it",
+    ),
     "joint type": (
         f"{HEADER},type\n" + f"{ROW},revolut\n" * 4,
         r"line 2, column type: unknown joint type 'revolut' \(did you mean 'revolute'",

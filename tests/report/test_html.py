@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from support.pages import Page
 from elastocal.model import observe
 from elastocal.report import residual_view
 from elastocal.report.page import page_of, write_page
+from elastocal.report.residual_figures import by_region
 
 
 @pytest.fixture(scope="module")
@@ -133,3 +135,10 @@ def test_other_observations(pose: Any, bare: Any) -> None:
     (faulty,) = bare.result.outliers
     (row,) = [row for row in Page(text).rows if len(row) == 5 and row[0] == str(faulty.line)]
     assert row[1:3] == [faulty.configuration, faulty.marker]
+
+
+def test_readings_far_from_zero_have_their_map_without_a_warning() -> None:
+    far = 1e15 * np.ones((4, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "</svg>" in by_region(far, np.ones((4, 3)))

@@ -150,17 +150,15 @@ def _plausible(table: RawTable, i: int, family: str, stem: str) -> float:
     value, column = dh_number(table, i, family, stem), table.column(family, stem)
     if column is None:
         return value
-    if column.unit == "rad" and abs(value) > MAX_ANGLE:
-        raise InputError(
-            f"{table.where(i, column.header)}: {value:g} rad is more than two turns; "
-            f"if these are degrees, call the column {stem}_deg"
-        )
-    if column.unit == "m" and abs(value) > MAX_LENGTH:
-        raise InputError(
-            f"{table.where(i, column.header)}: {value:g} m is too long for a link; "
-            f"if these are millimetres, call the column {stem}_mm"
-        )
-    return value
+    lengths = column.unit in LENGTH
+    if not abs(value) > (MAX_LENGTH if lengths else MAX_ANGLE):
+        return value
+    wrong = "m is too long for a link" if lengths else "rad is more than two turns"
+    meant = {"rad": ("degrees", "deg"), "m": ("millimetres", "mm")}.get(str(column.unit))
+    remedy = (
+        f"if these are {meant[0]}, call the column {stem}_{meant[1]}" if meant else "correct it"
+    )
+    raise InputError(f"{table.where(i, column.header)}: {value:g} {wrong}; {remedy}")
 
 
 def _kind(table: RawTable, i: int) -> JointKind:

@@ -351,7 +351,8 @@ def by_region(position: Array, residual: Array) -> str:
     """
     squared = (residual**2).sum(axis=1)
     views = ((0, 1, "from above"), (0, 2, "from the side"))
-    side = max(float(np.ptp(position, axis=0).max()) / CELLS, 1e-3)
+    # Of readings far from zero a side has to be more than rounding.
+    side = max(float(np.ptp(position, axis=0).max()) / CELLS, 1e-3, 1e-9 * np.abs(position).max())
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 2)
