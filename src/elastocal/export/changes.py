@@ -46,7 +46,8 @@ POINT = "tool"
 @dataclass(frozen=True)
 class ParameterChange:
     """One parameter: values and their difference in SI units, its standard deviation, p alone and
-    by Holm's rule, whether that is below the level, and `moves`: rms in m at the tool."""
+    by Holm's rule, whether that is below the level, and `moves`: rms in m at the tool.  Where no
+    reading told it from others, `combined_with`, the values are those of their sum."""
 
     name: str
     unit: str
@@ -58,6 +59,7 @@ class ParameterChange:
     p_family: float
     changed: bool
     moves: float
+    combined_with: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, repr=False)
@@ -366,10 +368,12 @@ def _tested(
     smallest = float(min(d.min() for d in dofs))
     a = old.values
     units = {q.name: q.unit for q in old.model.parameters}
+    others = {str(e["name"]): tuple(e.get("combined_with") or ()) for e in old.entries}
     changes = tuple(
         ParameterChange(
             n, units[n], a[n], a[n] + float(z[k]), float(z[k]), float(std[k]), float(p[k]),
             float(family[k]), bool(family[k] < level), float(abs(z[k]) * slope[k]),
+            others.get(n, ()),
         )
         for k, n in enumerate(names)
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from elastocal.export.changes import Comparison
 from elastocal.report.effect_names import p_value, size_of
 from elastocal.report.formatting import ShownTable, estimate, length
-from elastocal.text import printable
+from elastocal.text import listed, printable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -84,8 +84,9 @@ def change_rows(c: Comparison) -> ShownTable:
         value, half, unit = estimate(one.change, one.std, one.unit)
         old, new = (estimate(v, one.std, one.unit)[0] for v in (one.old, one.new))
         told = "changed" if one.changed else ""
+        with_others = f" (with {listed(one.combined_with, 3)})" if one.combined_with else ""
         rows.append(
-            (printable(one.name), old, new, value, half, unit, p_value(one.p_family),
+            (printable(one.name + with_others), old, new, value, half, unit, p_value(one.p_family),
              length(one.moves), told)
         )  # fmt: skip
     return ShownTable(heads, rows, (0, 5, 8))
