@@ -142,9 +142,8 @@ def _estimates(
     for k, c in enumerate(reduction.kept):
         parameter = model.parameters[c]
         terms = reduction.terms(k, solution.sizes, std[k])
-        value, wide = float(x[c]), reduction.widening(k, solution.sizes, std[k])
-        low, high = (float(value + wide * (end - value)) for end in intervals.ci95[k])
-        spread, ci = wide * float(std[k]), (low, high)
+        value = float(x[c])
+        spread, ci = reduction.widened(k, solution.sizes, std[k], value, intervals.ci95[k])
         for d in terms:
             partners[d].append(parameter.name)
         if terms:

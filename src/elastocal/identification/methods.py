@@ -251,8 +251,9 @@ def hardly_shown(found: MethodResult) -> dict[int, tuple[float, float]]:
     std, reach = intervals.covariance.std, {}
     for k, c in enumerate(solution.reduction.kept.tolist()):
         p = solution.problem.model.parameters[c]
-        x, wide = solution.fit.x[c], solution.reduction.widening(k, solution.sizes, std[k])
-        low, high = (float(x + wide * (end - x)) for end in intervals.ci95[k])
+        _, (low, high) = solution.reduction.widened(
+            k, solution.sizes, std[k], float(solution.fit.x[c]), intervals.ci95[k]
+        )
         beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
         if beyond and not p.shrunk and not solution.reduction.terms(k, solution.sizes, std[k]):
             reach[c] = (low, high)

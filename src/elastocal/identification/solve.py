@@ -85,7 +85,7 @@ class Reduction:
         """Parameters combined with kept parameter number k, and their factors.
 
         A dropped parameter counts where its typical deviation would shift the estimate by more
-        than its standard deviation `std`; what shifts it less is in its interval (`widening`).
+        than its standard deviation `std`; what shifts it less is in its interval (`widened`).
         """
         row = self.mixing[k]
         return {
@@ -94,11 +94,16 @@ class Reduction:
             if abs(row[j]) * sizes[d] > std
         }
 
-    def widening(self, k: int, sizes: Array, std: float) -> float:
-        """√(std² + Σ_d (m_kd s_d)²)/std over the dropped parameters d that are not among `terms`:
-        what their typical deviations s_d, as a prior N(0, s_d²), add to the standard deviation."""
+    def widened(
+        self, k: int, sizes: Array, std: float, value: float, ci95: Array
+    ) -> tuple[float, tuple[float, float]]:
+        """Standard deviation and interval of kept parameter number k at `value`, with what the
+        dropped parameters d that are not among `terms` add: √(std² + Σ_d (m_kd s_d)²), their
+        typical deviations s_d being a prior N(0, s_d²)."""
         shift = np.abs(self.mixing[k]) * sizes[self.dropped]
-        return float(np.sqrt(1 + ((shift[shift <= std] / std) ** 2).sum())) if std > 0 else 1.0
+        wide = float(np.sqrt(1 + ((shift[shift <= std] / std) ** 2).sum())) if std > 0 else 1.0
+        low, high = (float(value + wide * (end - value)) for end in ci95)
+        return wide * float(std), (low, high)
 
 
 def reduce(
