@@ -226,8 +226,9 @@ preset = "kuka"
 """
 STUDY = """\
 def tasks(options):
-    return [{"n": n, "label": "few" if n < 9 else "many", "replicate": k}
-            for n in (4, 16) for k in range(options["replicates"])]
+    for n in (4, 16):
+        for k in range(options["replicates"]):
+            yield {"n": n, "label": "few" if n < 9 else "many", "replicate": k}
 
 
 def run(task, rng):

@@ -69,6 +69,8 @@ class Chain:
 
 # Joint limits: the robot's own, narrowed by the cell's.
 
+NO_LIMIT = 100.0  # half turns, or m
+
 
 def joint_limits(cell: Cell, chain: Chain) -> tuple[Array, Array]:
     """Lower and upper joint limits (n,) in rad or m, infinite where there is none.
@@ -93,9 +95,12 @@ def finite_ranges(
     chain: Chain, lower: Array, upper: Array, near: Array | None = None
 ) -> tuple[Array, Array]:
     """Ranges (n,) to draw joint values from: the limits, and where there are none, a turn (2 m
-    for a prismatic joint) from the one limit, or about `near` (n,), by default about zero."""
+    for a prismatic joint) from the one limit, or about `near` (n,), by default about zero.  A
+    limit beyond `NO_LIMIT` such half turns (1 m) from there is none: files write 1e16 for it."""
     half = np.where([kind == "revolute" for kind in chain.kinds], np.pi, 1.0)
     centre = np.zeros(len(lower)) if near is None else near
+    lower = np.where(lower < centre - NO_LIMIT * half, -np.inf, lower)
+    upper = np.where(upper > centre + NO_LIMIT * half, np.inf, upper)
     low = np.where(np.isfinite(upper), upper - 2 * half, centre - half)
     low = np.where(np.isfinite(lower), lower, low)
     return low, np.where(np.isfinite(upper), upper, low + 2 * half)
