@@ -292,6 +292,7 @@ def scatter_of(noise: Noise, n_joints: int) -> Scatter:
 
 # The error to be expected at poses that nobody measured.
 
+MOST_LOADS = 100  # kept with a result
 POSES = 256  # drawn over the joint limits where nobody says where the arm will work
 DRAWS = 2000
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
@@ -316,13 +317,24 @@ def over_the_workspace(cell: Cell, model: Model, table: Measurements) -> NewPose
     for name, levels in cell.model.compliance_levels.items():
         # Elsewhere the model has no compliance for that joint.
         q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, POSES)
-    forces = np.unique(np.round(table.force, 3), axis=0)
-    if model.observe == "deflection":
-        forces = forces[(forces != 0).any(axis=1)]
-    if not len(forces):
-        forces = np.zeros((1, 3))
+    forces = _loads(table.force, model.observe)
     source = f"{POSES} poses drawn over the joint limits, as the cell states no test poses"
     return NewPoses(q, np.resize(forces, (POSES, 3)), np.full(POSES, 1 / POSES), source)
+
+
+def _loads(force: Array, observe: str) -> Array:
+    """The forces (L, 3) of rows (n, 3), each once; of deflections those that deflect."""
+    forces = np.unique(np.round(force, 3), axis=0)
+    if observe == "deflection":
+        forces = forces[(forces != 0).any(axis=1)]
+    return forces if len(forces) else np.zeros((1, 3))
+
+
+def measured_loads(observed: Observations) -> Array:
+    """The forces (L, 3) N of the readings, at most MOST_LOADS of them, evenly chosen."""
+    forces = _loads(observed.table.force, observed.kind)
+    chosen = np.linspace(0, len(forces) - 1, min(len(forces), MOST_LOADS)).round().astype(int)
+    return np.asarray(forces[chosen])
 
 
 @dataclass(frozen=True)
