@@ -344,6 +344,8 @@ class PredictedError:
     `rms` is its expectation, `ci95` its 95 % interval.  The parts of the expectation: of the
     `parameters` determined, of those left `open`, of what the model lacks (`lacking`, None where
     nothing tells the noise from it).  `blamed` names open parameters, the worst first.
+    `unchecked` is that part of `parameters` which single configurations alone hold, infinite
+    where it is not known.
     """
 
     rms: float
@@ -354,6 +356,7 @@ class PredictedError:
     blamed: tuple[str, ...]
     poses: int
     source: str
+    unchecked: float = np.inf
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready, in µm."""
@@ -362,6 +365,7 @@ class PredictedError:
             "rms": self.rms * 1e6, "ci95": [low * 1e6, high * 1e6],
             "parameters": self.parameters * 1e6, "open_parameters": self.open * 1e6,
             "lack_of_fit": None if self.lacking is None else self.lacking * 1e6,
+            "unchecked": self.unchecked * 1e6 if np.isfinite(self.unchecked) else None,
             "blamed": list(self.blamed), "poses": self.poses, "source": self.source,
         }  # fmt: skip
 
@@ -415,8 +419,10 @@ def predicted_error(
     dof: float,
     poses: NewPoses,
     rng: np.random.Generator,
+    unchecked: Array | None = None,
 ) -> PredictedError | None:
-    """The error at new poses, at the markers, in the circumstances of the readings.
+    """The error at new poses, at the markers, in the circumstances of the readings; P of
+    `told_by_one` says how much of it is `unchecked`.
 
     e² = zᵀ G z + τ² with G = Σ_t w_t [A_K L, O S]ᵀ [A_K L, O S] and Σ = L Lᵀ: its distribution
     by draws of z, normal, and t with `dof` degrees of freedom for what the estimates' covariance
@@ -452,6 +458,9 @@ def predicted_error(
     squares = squares if excess is None else squares + excess.squared
     own = float(np.trace(G[:n, :n]) * inflated.mean())
     rest = float(np.trace(G[n:, n:]))
+    alone = np.inf
+    if unchecked is not None:
+        alone = float(np.sqrt((((known @ (unchecked @ root)) * each) ** 2).sum() * inflated.mean()))
     low, high = np.sqrt(np.quantile(squares, [0.025, 0.975]))
     return PredictedError(
         float(np.sqrt(own + rest + (lacking or 0.0))),
@@ -462,6 +471,7 @@ def predicted_error(
         _blamed(left, np.diag(G)[n:]),
         len(poses.q),
         poses.source,
+        alone,
     )
 
 
