@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell, read_cell
     from elastocal.cell.workspace_rules import Workspace
     from elastocal.compensation.compensate import Compensation
+    from elastocal.diagnosis.changes import Comparison, compare
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
-    from elastocal.export.changes import Comparison, compare
     from elastocal.identification.knowledge import Knowledge
     from elastocal.identification.result import Calibration
     from elastocal.importing.first_cell import init
@@ -66,7 +66,7 @@ ROOMS = {
     "cell.workspace_rules": "Workspace",
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
-    "export.changes": "Comparison compare",
+    "diagnosis.changes": "Comparison compare",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from elastocal.compensation.compensate import Compensation
+    from elastocal.diagnosis.changes import Comparison
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.export.changes import Comparison
     from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
     from elastocal.measurements import Measurements
@@ -134,8 +134,8 @@ def wish_of(
         InputError: An option is wrong; the message names it.
     """
     from elastocal.export.export import Wish, format_of
-    from elastocal.export.exportable import Conditions
     from elastocal.export.urdf_file import Frames
+    from elastocal.model.valued import Conditions
 
     chosen = format_of(path, format)
     for name, value in (("temperature_c", temperature_c), ("time_s", time_s)):

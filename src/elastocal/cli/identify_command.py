@@ -109,6 +109,10 @@ def identify(
     jobs: Annotated[int, typer.Option(help="Processes of a bootstrap; -1 for all cores.")] = 1,
     seed: Seed = 0,
     as_json: Json = False,
+    details: Annotated[
+        bool,
+        typer.Option("--details", help="Also method, noise, residuals, intervals, all lists."),
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """What are the parameters of my arm, and how sure are we?
@@ -139,7 +143,7 @@ def identify(
     else:
         from elastocal.report.terminal import print_result
 
-        print_result(console(), result)
+        print_result(console(), result, details=details)
         for path in written:
             say(f"wrote {path}")
     if unmet := result.unmet(**limits):

@@ -19,8 +19,14 @@ from elastocal.identification.prediction import (
     over_the_workspace,
     predicted_error,
 )
-from elastocal.identification.residuals import ResidualSummary, rms_3d, summarise_residuals
+from elastocal.identification.residuals import (
+    ResidualSummary,
+    rms_3d,
+    summarise_residuals,
+    told_by_one,
+)
 from elastocal.identification.result import Calibration, Combination, Estimate
+from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.model.arm import Parameter
 from elastocal.model.manipulator import Model
@@ -96,11 +102,28 @@ def summarise(
     predicted = predicted_error(
         result.arm, observed, result.excess, float(np.median(dofs)) if len(dofs) else np.inf,
         new_poses or over_the_workspace(model.cell, model, observed.table),
-        np.random.default_rng(0),
+        np.random.default_rng(0), _unchecked(result, solution),
     )  # fmt: skip
     result = replace(result, predicted=predicted)
     result = judged(result, of_solution(result, solution))
     return replace(result, warnings=found.warnings + warning_sentences(result))
+
+
+def _unchecked(result: Calibration, solution: Solution) -> Array | None:
+    """What single configurations alone hold (`told_by_one`); None where it is not to be had."""
+    observed, kept = result.observations, solution.reduction.kept
+    lone = ~np.isfinite(result.held_out)
+    weights = solution.problem.weights
+    if not lone.any():
+        return np.zeros((len(kept), len(kept)))
+    usual = not (
+        result.prior_share or result.smooth or result.active or weights.together is not None
+    )
+    if not usual or len(lone) * len(kept) > MOST_NUMBERS:
+        return None
+    B = result.model.regressor(observed.table, result.x, kept, observed).B
+    configuration = np.repeat(observed.configuration, observed.size)
+    return told_by_one(weights.apply(B), np.where(lone, configuration, -1))
 
 
 def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSummary | None:

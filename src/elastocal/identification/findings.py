@@ -22,7 +22,7 @@ from elastocal.identification.scrutiny import stage_of
 from elastocal.identification.solve import WORTH_A_COLUMN, Solution, reduce
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.manipulator import Model
-from elastocal.text import listed
+from elastocal.text import gathered, listed
 from elastocal.units import Array
 
 # Where the error of the nominal arm goes, step by step, as an identification can tell it.
@@ -296,9 +296,15 @@ def _few_poses(result: Calibration) -> Iterator[Finding]:
             "Measure more poses.",
         )  # fmt: skip
     if not math.isfinite(result.heldout_rms):
-        # Test data tell what held-out poses cannot.
-        severity: Severity = "care" if result.test is None else "note"
-        yield Finding("not_held_out", severity, {}, _more_poses())
+        # Test data check it; it matters little where it is the smaller part of the error.
+        found, numbers = result.predicted, dict[str, Number]()
+        if found is not None and math.isfinite(found.unchecked):
+            numbers = {"unchecked_um": _um(found.unchecked), "rms_um": _um(found.rms)}
+        little = found is not None and found.unchecked**2 <= MOSTLY * found.rms**2
+        severity: Severity = "note" if little or result.test is not None else "care"
+        yield Finding(
+            "not_held_out", severity, numbers, _more_poses() if severity == "care" else ""
+        )
 
 
 def _more_poses() -> str:
@@ -697,13 +703,28 @@ SENTENCES = {
         "that the model lacks in some load state, marker or region. {remedy}"
     ),
 }
+# The same of several parameters, whose names are told together.
+OF_SEVERAL = {
+    "at_bound": "{named} stand at their bound {bound:g} {unit}; they are held there and have no "
+    "interval. {remedy}",
+    "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
+}
 
 
 def warning_sentences(result: Calibration) -> tuple[str, ...]:
-    """The findings that call for attention as sentences that name the remedy."""
+    """The findings that call for attention as sentences that name the remedy; of those that are
+    alike one sentence."""
     told: list[str] = []
+    alike: dict[tuple[Any, ...], list[Finding]] = {}
     for f in result.findings:
-        if f.kind == "faulty_readings":
+        if f.kind in OF_SEVERAL:
+            alike.setdefault((f.kind, f.numbers["bound"], f.numbers["unit"]), []).append(f)
+    for f in result.findings:
+        same = alike.get((f.kind, f.numbers.get("bound"), f.numbers.get("unit")), [])
+        if len(same) > 1:
+            if f is same[0]:
+                told.append(_of_several(same))
+        elif f.kind == "faulty_readings":
             told += _faulty_readings(result)
         elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
             words = {k: ", ".join(map(_word, v)) if isinstance(v, tuple) else v
@@ -714,6 +735,16 @@ def warning_sentences(result: Calibration) -> tuple[str, ...]:
             remedy = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
             told.append(SENTENCES[f.kind].format(**words, remedy=remedy))
     return tuple(told)
+
+
+def _of_several(same: list[Finding]) -> str:
+    first, remedy = same[0].numbers, same[0].remedy
+    if "std" in first:
+        remedy = remedy[:1].lower() + remedy[1:]
+    values = [f"{f.numbers.get('value', 0):.3g} ± {f.numbers.get('std', 0):.2g}" for f in same]
+    named = gathered(str(f.numbers["parameter"]) for f in same)
+    words = first | {"remedy": remedy, "named": named, "values": listed(values, 4)}
+    return OF_SEVERAL[same[0].kind].format(**words)
 
 
 def _word(value: float | str) -> str:

@@ -292,6 +292,7 @@ def scatter_of(noise: Noise, n_joints: int) -> Scatter:
 
 # The error to be expected at poses that nobody measured.
 
+MOST_LOADS = 100  # kept with a result
 POSES = 256  # drawn over the joint limits where nobody says where the arm will work
 DRAWS = 2000
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
@@ -316,13 +317,24 @@ def over_the_workspace(cell: Cell, model: Model, table: Measurements) -> NewPose
     for name, levels in cell.model.compliance_levels.items():
         # Elsewhere the model has no compliance for that joint.
         q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, POSES)
-    forces = np.unique(np.round(table.force, 3), axis=0)
-    if model.observe == "deflection":
-        forces = forces[(forces != 0).any(axis=1)]
-    if not len(forces):
-        forces = np.zeros((1, 3))
+    forces = _loads(table.force, model.observe)
     source = f"{POSES} poses drawn over the joint limits, as the cell states no test poses"
     return NewPoses(q, np.resize(forces, (POSES, 3)), np.full(POSES, 1 / POSES), source)
+
+
+def _loads(force: Array, observe: str) -> Array:
+    """The forces (L, 3) of rows (n, 3), each once; of deflections those that deflect."""
+    forces = np.unique(np.round(force, 3), axis=0)
+    if observe == "deflection":
+        forces = forces[(forces != 0).any(axis=1)]
+    return forces if len(forces) else np.zeros((1, 3))
+
+
+def measured_loads(observed: Observations) -> Array:
+    """The forces (L, 3) N of the readings, at most MOST_LOADS of them, evenly chosen."""
+    forces = _loads(observed.table.force, observed.kind)
+    chosen = np.linspace(0, len(forces) - 1, min(len(forces), MOST_LOADS)).round().astype(int)
+    return np.asarray(forces[chosen])
 
 
 @dataclass(frozen=True)
@@ -332,6 +344,8 @@ class PredictedError:
     `rms` is its expectation, `ci95` its 95 % interval.  The parts of the expectation: of the
     `parameters` determined, of those left `open`, of what the model lacks (`lacking`, None where
     nothing tells the noise from it).  `blamed` names open parameters, the worst first.
+    `unchecked` is that part of `parameters` which single configurations alone hold, infinite
+    where it is not known.
     """
 
     rms: float
@@ -342,6 +356,7 @@ class PredictedError:
     blamed: tuple[str, ...]
     poses: int
     source: str
+    unchecked: float = np.inf
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready, in µm."""
@@ -350,6 +365,7 @@ class PredictedError:
             "rms": self.rms * 1e6, "ci95": [low * 1e6, high * 1e6],
             "parameters": self.parameters * 1e6, "open_parameters": self.open * 1e6,
             "lack_of_fit": None if self.lacking is None else self.lacking * 1e6,
+            "unchecked": self.unchecked * 1e6 if np.isfinite(self.unchecked) else None,
             "blamed": list(self.blamed), "poses": self.poses, "source": self.source,
         }  # fmt: skip
 
@@ -403,8 +419,10 @@ def predicted_error(
     dof: float,
     poses: NewPoses,
     rng: np.random.Generator,
+    unchecked: Array | None = None,
 ) -> PredictedError | None:
-    """The error at new poses, at the markers, in the circumstances of the readings.
+    """The error at new poses, at the markers, in the circumstances of the readings; P of
+    `told_by_one` says how much of it is `unchecked`.
 
     e² = zᵀ G z + τ² with G = Σ_t w_t [A_K L, O S]ᵀ [A_K L, O S] and Σ = L Lᵀ: its distribution
     by draws of z, normal, and t with `dof` degrees of freedom for what the estimates' covariance
@@ -440,6 +458,9 @@ def predicted_error(
     squares = squares if excess is None else squares + excess.squared
     own = float(np.trace(G[:n, :n]) * inflated.mean())
     rest = float(np.trace(G[n:, n:]))
+    alone = np.inf
+    if unchecked is not None:
+        alone = float(np.sqrt((((known @ (unchecked @ root)) * each) ** 2).sum() * inflated.mean()))
     low, high = np.sqrt(np.quantile(squares, [0.025, 0.975]))
     return PredictedError(
         float(np.sqrt(own + rest + (lacking or 0.0))),
@@ -450,6 +471,7 @@ def predicted_error(
         _blamed(left, np.diag(G)[n:]),
         len(poses.q),
         poses.source,
+        alone,
     )
 
 

@@ -23,6 +23,7 @@ from elastocal.identification.prediction import (
     Position,
     PredictedError,
     excess_of,
+    measured_loads,
     position_at,
     scatter_of,
 )
@@ -466,6 +467,7 @@ class Calibration(Result):
             tuple(_estimate_json(e) for e in self.estimates),
             self.left,
             0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean())),
+            measured_loads(self.observations),
         )
 
     @cached_property
@@ -558,6 +560,7 @@ class Calibration(Result):
             "covariance": self.covariance.tolist(),
             "covariance_of": list(self.determined),
             "correlations": [list(c) for c in self.correlations],
+            "loads_N": measured_loads(self.observations).tolist(),
             "n_rows": len(self.residual),
             "n_readings": len(self.observations.lead),
             "dof": self.dof,

@@ -65,7 +65,7 @@ from elastocal.report.method_and_noise import (
     size_rows,
 )
 from elastocal.report.smooth_view import counted_functions, smooth_lines, smooth_table
-from elastocal.text import printable
+from elastocal.text import listed, printable
 
 LARGEST_TERMS = 4
 Truth = dict[str, float]
@@ -158,9 +158,13 @@ def nominal_known(result: Calibration, name: str) -> bool:
     return parameter.nominal != 0 or parameter.typical is not None
 
 
-def undetermined_lines(result: Calibration) -> list[str]:
-    """Which parameters have no number of their own, and why, one line per reason."""
+def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
+    """Which parameters have no number of their own, and why, one line per reason; `most` names."""
     lines = []
+
+    def told(names: list[str]) -> str:
+        return listed(names, most or len(names))
+
     extra = {printable(name) for name in result.left.redundant} if result.left else set()
     weak = [
         f"{printable(e.name)} ({limits(result, e)})"
@@ -168,21 +172,21 @@ def undetermined_lines(result: Calibration) -> list[str]:
         if e.limits is not None
     ]
     if weak:
-        lines.append(f"hardly shown, so without a value (95 %): {', '.join(weak)}")
+        lines.append(f"hardly shown, so without a value (95 %): {told(weak)}")
     if names := [n for n in names_of(result, INVISIBLE) if n not in extra]:
         where = held_where(result, names)
-        lines.append(f"{where} (not visible in these data): {', '.join(names)}")
+        lines.append(f"{where} (not visible in these data): {told(names)}")
     if names := [n for n in names_of(result, ABSORBED) if n not in extra]:
         where = held_where(result, names)
-        lines.append(f"{where}, absorbed in a combination: {', '.join(names)}")
+        lines.append(f"{where}, absorbed in a combination: {told(names)}")
     if names := [n for s in (INVISIBLE, ABSORBED) for n in names_of(result, s) if n in extra]:
         where = held_where(result, names)
         lines.append(
             f"{where}, redundant by construction (no pose under such loads shows them; nothing to "
-            f"do): {', '.join(names)}"
+            f"do): {told(names)}"
         )
     if names := names_of(result, FIXED):
-        lines.append(f"fixed by the user: {', '.join(names)}")
+        lines.append(f"fixed by the user: {told(names)}")
     return lines
 
 
@@ -359,27 +363,35 @@ def held_lines(result: Calibration) -> list[tuple[str, str]]:
     return [(label, text) for label, text in found if text is not None]
 
 
-def summary_lines(result: Calibration, truth: Truth | None = None) -> list[str]:
-    """The result in words, one statement per line, warnings last."""
-    lines = [
-        f"Readings: {readings(result)}",
-        f"Method: {method_and_weights(result)}",
-        f"Error (rms): {error_line(result)}",
-        f"Degrees of freedom: {result.dof}",
-        f"Identified: {what_was_identified(result)}",
-        f"Prediction: {how_well_it_predicts(result)}",
-        f"Noise: {does_noise_explain_it(result)}",
-    ]
-    lines += [f"{label}: {text}" for label, text in noise_lines(result)]
-    lines.append(f"Intervals: {intervals_line(result)}")
-    lines += [f"{label}: {text}" for label, text in held_lines(result)]
-    lines += [f"Smooth function: {text}" for text in smooth_lines(result)]
+def leading_lines(result: Calibration) -> list[tuple[str, str]]:
+    """Label and sentence of what comes first: verdict, errors, what to do, warnings."""
+    (verdict, *steps) = judgement(result).lines
+    new = [] if result.predicted is None else [("Expected", at_new_poses(result.predicted))]
+    warnings = [("Warning", printable(w)) for w in result.warnings]
+    return [verdict, ("Error (rms)", error_line(result)), *new, *steps, *warnings]
+
+
+def summary_lines(
+    result: Calibration, truth: Truth | None = None, details: bool = True
+) -> list[tuple[str, str]]:
+    """Label and sentence of what else there is to say; `details`: of method, noise, intervals."""
+    lines = [("Readings", readings(result)), ("Identified", what_was_identified(result))]
+    if details:
+        lines += [
+            ("Method", method_and_weights(result)),
+            ("Degrees of freedom", str(result.dof)),
+            ("Prediction", how_well_it_predicts(result)),
+        ]
+    lines.append(("Noise", does_noise_explain_it(result)))
+    if details:
+        lines += [*noise_lines(result), ("Intervals", intervals_line(result))]
+    lines += held_lines(result)
+    lines += [("Smooth function", text) for text in smooth_lines(result)]
     if truth:
-        lines.append(f"Truth: {coverage_line(result, truth)}")
-    if pairs := correlation_lines(result):
-        lines.append("Correlated over 0.9: " + "; ".join(pairs))
-    lines += [f"Faulty: {text}" for text in fault_lines(result, MOST_TOLD)]
-    return lines + [f"Warning: {printable(w)}" for w in result.warnings]
+        lines.append(("Truth", coverage_line(result, truth)))
+    if details and (pairs := correlation_lines(result)):
+        lines.append(("Correlated over 0.9", "; ".join(pairs)))
+    return lines + [("Faulty", text) for text in fault_lines(result, MOST_TOLD)]
 
 
 # Bars have the true or nominal value in the middle and reach HALF_LENGTH to either side.

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from elastocal import __version__
 from elastocal.compensation.compensate import Compensation
+from elastocal.diagnosis.changes import Comparison
 from elastocal.diagnosis.diagnosis import Diagnosis
-from elastocal.export.changes import Comparison
 from elastocal.files import atomic_write_text, open_input
 from elastocal.identification.findings import gap_budget
 from elastocal.identification.result import Calibration
