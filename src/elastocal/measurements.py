@@ -325,7 +325,8 @@ def read_measurements(
 
     raw = read_table(path, choose, text=text)
     n = len(raw.row)
-    marker = _marker(raw, marker_names)
+    # A plan without the column is of all markers.
+    marker = _marker(raw, marker_names if observe not in PLANS or "marker" in raw.labels else ())
     configuration = raw.labels.get("configuration")
     if configuration is None:
         configuration = Labels(np.arange(n), tuple(str(i) for i in range(1, n + 1)))
@@ -367,12 +368,17 @@ def read_measurements(
     return with_moves(table)
 
 
-def read_plan(path: str | Path, *, joint_kinds: tuple[str, ...]) -> Measurements:
-    """The poses of a plan: configuration, q1_deg …, and forces where the plan states them.
+def read_plan(
+    path: str | Path, *, joint_kinds: tuple[str, ...], marker_names: tuple[str, ...] = ()
+) -> Measurements:
+    """The poses of a plan: configuration, q1_deg …, and where the plan states them forces and
+    which of the cell's markers are read.
 
     `level` and `order`, which a designed plan has, are passed over.  Errors as for measurements.
     """
-    return read_measurements(path, joint_kinds=joint_kinds, observe="plan")
+    return read_measurements(
+        path, joint_kinds=joint_kinds, marker_names=marker_names, observe="plan"
+    )
 
 
 def _sigma(raw: RawTable) -> Array | None:

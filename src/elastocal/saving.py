@@ -63,11 +63,10 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
     `command` is the command line that repeats the design.  Raises InputError for a path that ends
     in .json, since that of the summary is made of it.
     """
-    from elastocal.planning.plan import plan_rows, write_plan, write_plan_json
+    from elastocal.planning.plan import write_plan, write_plan_json
 
     require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
-    rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
-    write_plan(path, rows, plan.model.chain.kinds)
+    write_plan(path, plan.rows, plan.model.chain.kinds)
     repeat = {"command": command, "backend": plan.model.backend_report()}
     write_plan_json(path.with_suffix(".json"), plan.to_json() | repeat)
 

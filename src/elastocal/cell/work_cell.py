@@ -145,6 +145,12 @@ class Cell:
         load_plugins(self.path or Path(self.name), self.plugins)
         where, sight = self.path or self.name, self.workspace.visibility
         self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
+        least = None if sight is None else sight.min_markers
+        require(
+            least is None or least <= len(self.tool.markers),
+            f"{where}: key workspace.visibility.min_markers is {least}, but [tool.markers_m] has "
+            f"{listed(self.tool.markers) or 'none'}; ask for fewer",
+        )
         self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
         require(
             not self.workspace.urdf_geometry or self.robot.urdf is not None,

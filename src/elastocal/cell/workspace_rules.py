@@ -30,7 +30,16 @@ from elastocal.cell.file_keys import (
     rotation_from_rpy,
     stated,
 )
-from elastocal.config import NonNegative, Numbers, Positive, Text, Vector2, Vector3, numbers
+from elastocal.config import (
+    Count,
+    NonNegative,
+    Numbers,
+    Positive,
+    Text,
+    Vector2,
+    Vector3,
+    numbers,
+)
 from elastocal.errors import require
 from elastocal.text import is_label, quoted
 from elastocal.units import Array
@@ -182,7 +191,7 @@ class HangingLoad:
 
 @record
 class Visibility:
-    """What the tracker must see: all markers, past arm and obstacles.
+    """What the tracker must see: all markers, or `min_markers` of them, past arm and obstacles.
 
     `normals` name → (3,) axis of the reflector in the flange frame, `max_incidence` rad from it;
     `range` m; `beam_radius` m of free sight.
@@ -200,6 +209,7 @@ class Visibility:
     )
     beam_radius: NonNegative = keyed("a number >= 0 in mm", "beam_radius_mm", default=0.005)
     line_of_sight: bool = keyed(default=True)
+    min_markers: Count | None = keyed("a whole number >= 1", default=None)
 
     def __post_init__(self) -> None:
         low, high = self.range

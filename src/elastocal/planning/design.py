@@ -574,6 +574,7 @@ class _Design:
             known,
             options.seed,
             region,
+            self.feasibility.seen if self.feasibility.partial else None,
         )
         self.warnings += setup.warnings
         pool = setup.pool(q, load, group)
@@ -692,7 +693,8 @@ class _Design:
         spec = self.cell.design
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
-        numbers = blocks.shape[1] * blocks.shape[2] * readings_each(self.cell)
+        seen = setup.information.seen(q, load)
+        numbers = round(blocks.shape[1] * blocks.shape[2] * seen.mean() * readings_each(self.cell))
         numbers += 0 if done is None else done.numbers
         value, unit = setup.criterion.reported(found.value)
         bound = found.certificate.bound_pool
@@ -725,6 +727,7 @@ class _Design:
             first=next_number(self.options.done),
             chance=Chance.of(drawn, found.value, setup.criterion),
             everywhere=self._everywhere(setup, problem, M),
+            seen=None if seen.all() else seen,
         )  # fmt: skip
 
     def _everywhere(self, setup: Setup, problem: DesignProblem, M: Array) -> Everywhere | None:

@@ -158,6 +158,10 @@ class LineOfSight(Rule):
             hidden[observed] = self._sight.blocked(poses.take(observed), marker)
         return hidden
 
+    def hides(self, poses: Poses, marker: str) -> BoolArray:
+        """(N,): this marker is not seen."""
+        return self._sight.blocked(poses, self._markers[marker])
+
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         found = {}
         for body in self._sight.bodies:
@@ -168,6 +172,41 @@ class LineOfSight(Rule):
 
     def remedy(self, poses: Poses) -> str:
         return f"{most_frequent(self.causes(poses))}; {ADVICE[self.name]}"
+
+
+class EnoughMarkers(Rule):
+    """At least so many markers are in range, turned towards the tracker, and in its sight."""
+
+    name = "markers_seen"
+
+    def __init__(self, rules: Sequence[Rule], markers: Sequence[str], least: int) -> None:
+        self._bounds = [rule for rule in rules if not isinstance(rule, LineOfSight)]
+        self._sight = [rule for rule in rules if isinstance(rule, LineOfSight)]
+        self._markers, self._least = tuple(markers), least
+
+    def seen(self, poses: Poses) -> BoolArray:
+        """(N, markers): which are seen; nothing is looked for behind bodies where too few remain
+        without."""
+        seen = np.ones((len(poses), len(self._markers)), dtype=bool)
+        for rule in self._bounds:
+            for name, outside in rule.causes(poses).items():
+                seen[:, self._markers.index(name)] &= ~outside
+        hopeful = seen.sum(axis=1) >= self._least
+        for sight in self._sight:
+            for k, name in enumerate(self._markers):
+                rows = np.flatnonzero(hopeful & seen[:, k])
+                seen[rows, k] = ~sight.hides(poses.take(rows), name)
+        return seen
+
+    def broken(self, poses: Poses) -> BoolArray:
+        return np.asarray(self.seen(poses).sum(axis=1) < self._least)
+
+    def causes(self, poses: Poses) -> dict[str, BoolArray]:
+        return dict(zip(self._markers, ~self.seen(poses).T, strict=True))
+
+    def remedy(self, poses: Poses) -> str:
+        told = most_frequent(self.causes(poses))
+        return f"{told} not seen; {ADVICE['line_of_sight']}, or lower min_markers"
 
 
 def most_frequent(causes: Mapping[str, BoolArray]) -> str:
@@ -221,16 +260,21 @@ def rule_book(
     pairs: Sequence[Pair],
 ) -> tuple[Rule, ...]:
     """All rules of the cell.  Raises InputError where they do not fit the robot."""
+    bounds = tuple(_visibility(cell))
+    sight = tuple(_line_of_sight(cell, kinematics, bodies))
+    least = None if cell.workspace.visibility is None else cell.workspace.visibility.min_markers
+    if least is not None and least < len(cell.tool.markers):
+        bounds, sight = (), (EnoughMarkers((*bounds, *sight), tuple(cell.tool.markers), least),)
     return (
         _joints(cell, chain),
-        *_visibility(cell),
+        *bounds,
         *_load(cell, chain),
         *(
             KeepApart(rule, kinematics, own)
             for rule in RULES
             if (own := [pair for pair in pairs if pair.rule == rule])
         ),
-        *_line_of_sight(cell, kinematics, bodies),
+        *sight,
     )
 
 
@@ -387,6 +431,20 @@ class Feasibility:
         ok = np.zeros(len(poses), dtype=bool)
         ok[left] = True
         return ok
+
+    @property
+    def partial(self) -> bool:
+        """May a pose show only some of the markers?"""
+        return any(isinstance(rule, EnoughMarkers) for rule in self.rules)
+
+    def seen(self, q: Array, force: Array) -> BoolArray:
+        """(N, markers): which markers the tracker sees of poses q (N, n) that are feasible under a
+        force (3,) or (N, 3) N."""
+        poses = self._poses(q, force)
+        for rule in self.rules:
+            if isinstance(rule, EnoughMarkers):
+                return rule.seen(poses)
+        return np.ones((len(poses), len(self.cell.tool.markers)), dtype=bool)
 
     def advice(self, verdict: PoseFeasibility) -> str:
         """Which rule to relax, how many candidates that frees, and how."""

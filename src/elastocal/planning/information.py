@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,12 +28,14 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, available_noise, observe
 from elastocal.simulation.simulate import simulate
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # What a pose will be read as: its table rows, load states, and the covariance of its readings.
 
+Sight = Callable[[Array, Array], BoolArray]  # joints (N, n), force (3,) → (N, markers): seen?
 ALL_LOADS = -1  # a candidate measured in every load state
 NO_FORCE = 1e-9  # N
+NEVER = 1e9  # m (rad): standard deviation of a reading that is not made
 
 
 @dataclass(frozen=True)
@@ -180,6 +183,8 @@ class PoseInformation:
 
     `scenarios` (S, parameters): parameter values at which the arm is linearised; `columns` (p,)
     the parameters to be estimated, `sizes` (p,) what one unit of a scaled parameter is.
+    `sight`: which markers are seen, None for all of them; a reading that is not made counts as
+    one that shows nothing.
     """
 
     model: Model
@@ -187,6 +192,7 @@ class PoseInformation:
     scenarios: Array
     columns: IntArray
     sizes: Array
+    sight: Sight | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -226,12 +232,36 @@ class PoseInformation:
         one = q[None], np.array([load])
         return np.stack([np.linalg.inv(self.noise(*one, x)[1][0]) for x in self.scenarios])
 
+    def seen(self, q: Array, load: IntArray) -> BoolArray:
+        """(N, L, markers): which markers are seen of poses q (N, n) in each load state; True in
+        those in which a pose is not measured."""
+        markers, forces = len(self.model.cell.tool.markers), self.states.forces
+        found = np.ones((len(q), len(forces), markers), dtype=bool)
+        for state, force in enumerate(forces) if self.sight is not None else ():
+            rows = np.flatnonzero((load == ALL_LOADS) | (load == state))
+            found[rows, state] = self.sight(q[rows], force)
+        if not self.states.observed.all():  # a difference takes both of its readings
+            found &= found.all(axis=1, keepdims=True)
+        return found
+
+    def _unread(self, q: Array, load: IntArray, covariance: Array, size: int) -> Array:
+        """The covariance (N, r, r) with that of NEVER in place of what is not seen."""
+        seen = self.seen(q, load)
+        if load[0] != ALL_LOADS:
+            seen = seen[np.arange(len(q)), load][:, None]
+        each = covariance.shape[1] // (size * seen.shape[2])  # load states that are observed
+        read = np.repeat(seen[:, -each:].reshape(len(q), -1), size, axis=1)
+        alone = np.einsum("nr,rs->nrs", ~read * NEVER**2, np.eye(read.shape[1]))
+        return np.asarray(covariance * (read[:, :, None] & read[:, None]) + alone)
+
     def noise(self, q: Array, load: IntArray, x: Array | None = None) -> tuple[Observations, Array]:
         """What is read at the poses of the arm x, by default the one known best, and the Cholesky
         factors (N, r, r) of its covariance."""
         x = self.scenarios[0] if x is None else x
         observed = observe(self.rows(q, load, x), self.model.observe)
         covariance = pose_covariance(self.model, observed, len(q), self.states)
+        if self.sight is not None:
+            covariance = self._unread(q, load, covariance, observed.size)
         return observed, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
 

@@ -20,7 +20,7 @@ from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text
 from elastocal.text import is_label, json_text, quoted
-from elastocal.units import Array, IntArray, to_si
+from elastocal.units import Array, BoolArray, IntArray, to_si
 
 # What a plan promises, and why each pose is in it.
 
@@ -117,7 +117,8 @@ UNITS = {"revolute": "deg", "prismatic": "mm"}
 class PlanRows:
     """R rows of plan.csv: `configuration` names, `q` (R, n) rad or m, `level` (R,) from 1 on,
     `order` (R,) of execution from 1 on, and where the plan states them `force` (R, 3) N and
-    `approach` (R, n) of ±1.  `notes`: further columns for people, passed over when read."""
+    `approach` (R, n) of ±1, and `marker` (R,) of `marker_names` where not all of them are read.
+    `notes`: further columns for people, passed over when read."""
 
     configuration: tuple[str, ...]
     q: Array
@@ -126,6 +127,8 @@ class PlanRows:
     force: Array | None = None
     approach: IntArray | None = None
     notes: Mapping[str, Sequence[str]] | None = None
+    marker: IntArray | None = None
+    marker_names: tuple[str, ...] = (DEFAULT_MARKER,)
 
     def table(self, joint_kinds: Sequence[str]) -> Measurements:
         """What `measurement_reader.read_plan` reads of these rows once they are written."""
@@ -144,8 +147,8 @@ class PlanRows:
             configuration=np.array([labels.index(name) for name in self.configuration]),
             configuration_labels=labels,
             repeat=np.zeros(n, dtype=np.int64),
-            marker=np.zeros(n, dtype=np.int64),
-            marker_names=(DEFAULT_MARKER,),
+            marker=np.zeros(n, dtype=np.int64) if self.marker is None else self.marker,
+            marker_names=self.marker_names,
             force=np.zeros((n, 3)) if self.force is None else self.force,
             approach=None if self.approach is None else self.approach.astype(float),
         )
@@ -156,6 +159,7 @@ def plan_rows(
     configurations: Sequence[str],
     level: IntArray,
     forces: Array | None = None,
+    seen: Mapping[str, BoolArray] | None = None,
 ) -> PlanRows:
     """The rows of an execution, sorted by pose, then side of approach, then load state.
 
@@ -164,7 +168,8 @@ def plan_rows(
     order in the first state, note_order_2 that in the second, and so on.  `configurations` and
     `level`: one per pose.  Where a pose is approached from both sides, they are two
     configurations, 7+ (joints moving up to it) and 7-: the difference between them is what such a
-    plan is for, not noise of repeats.
+    plan is for, not noise of repeats.  With `seen`, which markers are read of each pose in each
+    load state (N, L), there is a row for each of them.
     """
     numbered = list(enumerate(execution.stops, start=1))
     readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
@@ -182,6 +187,13 @@ def plan_rows(
         for i in range(1, most)
     }
     approach = [stop.approach for stop in first if stop.approach is not None]
+    marker = None
+    if seen is not None:
+        read = np.array([[each[stop.pose, stop.load] for each in seen.values()] for stop in first])
+        of, marker = np.nonzero(read)
+        rows, first = [rows[k] for k in of], [first[k] for k in of]
+        approach = [approach[k] for k in of] if approach else []
+        notes = {name: [cells[k] for k in of] for name, cells in notes.items()}
     return PlanRows(
         configuration=tuple(stop.name(configurations) + sides[stop.side] for stop in first),
         q=np.array([stop.q for stop in first]),
@@ -190,6 +202,8 @@ def plan_rows(
         force=None if forces is None else forces[[stop.load for stop in first]],
         approach=np.array(approach) if approach else None,
         notes=notes,
+        marker=marker,
+        marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
     )
 
 
@@ -206,7 +220,9 @@ def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> 
                 f"{path}: configuration name {quoted(name)} cannot stand in a table; use one "
                 "line without blanks at its ends"
             )
-    keys = list(zip(rows.configuration, *([] if rows.force is None else rows.force.T), strict=True))
+    more = [] if rows.marker is None else [rows.marker]
+    more += [] if rows.force is None else list(rows.force.T)
+    keys = list(zip(rows.configuration, *more, strict=True))
     require(len(set(keys)) == len(keys), f"{path}: two rows of the plan have the same name")
     for values in (rows.q, rows.force):
         if values is not None and not np.isfinite(values).all():
@@ -218,6 +234,8 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
     """Header → cells, in the units and names of the measurement table."""
     known = families(joint_kinds)
     columns: dict[str, Sequence[str]] = {"configuration": rows.configuration}
+    if rows.marker is not None:
+        columns["marker"] = [rows.marker_names[k] for k in rows.marker]
     for stem, kind, values in zip(known["q"].units, joint_kinds, rows.q.T, strict=True):
         columns[column(stem, UNITS[kind])] = [
             repr(round(float(v), DIGITS) + 0.0) for v in in_unit(values, kind)
@@ -368,6 +386,7 @@ class Plan(Result):
         first: Number of the first configuration: after those that were measured already.
         chance: What as many random poses would reach.
         everywhere: The error at the test poses and over all joint ranges, in m.
+        seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
 
     Examples:
         >>> plan = ec.design(
@@ -405,6 +424,7 @@ class Plan(Result):
     first: int = 1
     chance: Chance | None = None
     everywhere: Everywhere | None = None
+    seen: BoolArray | None = None
 
     def __repr__(self) -> str:
         sure = self.certificate.efficiency_pool
@@ -419,8 +439,30 @@ class Plan(Result):
 
     def table(self) -> Measurements:
         """The poses as a table for `simulate`, as the plan's file has them."""
-        rows = plan_rows(self.execution, self.configurations, self.group + 1, self.stated_forces)
-        return rows.table(self.model.chain.kinds)
+        return self.rows.table(self.model.chain.kinds)
+
+    @property
+    def rows(self) -> PlanRows:
+        """What its file has."""
+        return plan_rows(
+            self.execution, self.configurations, self.group + 1, self.stated_forces, self._read
+        )
+
+    @property
+    def _read(self) -> dict[str, BoolArray] | None:
+        """Which markers are read of each pose in each load state, where not all are."""
+        if self.seen is None:
+            return None
+        return dict(zip(self.model.cell.tool.markers, np.moveaxis(self.seen, 2, 0), strict=True))
+
+    def markers(self, k: int) -> str:
+        """The markers to be read of pose k, those in brackets under some of the loads only."""
+        names = self.model.cell.tool.markers
+        if self.seen is None:
+            return " ".join(names)
+        every, some = self.seen[k].all(axis=0), self.seen[k].any(axis=0)
+        told = zip(names, every, some, strict=True)
+        return " ".join(name if all_ else f"({name})" for name, all_, any_ in told if any_)
 
     @property
     def configurations(self) -> tuple[str, ...]:
@@ -443,12 +485,14 @@ class Plan(Result):
 
         Not where every pose is measured unloaded, or unloaded and under one load, which is what
         `simulate` does with a load to a plan without forces; but where poses are visited again
-        for reference, as that is under one of the loads.
+        for reference, as that is under one of the loads, or where the load hides a marker.
         """
         loaded = np.any(self.forces != 0, axis=1)
         usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2
         again = any(stop.again for stop in self.execution.stops)
-        return None if usual and (self.load < 0).all() and not again else self.forces
+        alike = self.seen is None or bool((self.seen == self.seen[:, :1]).all())
+        every = usual and alike and (self.load < 0).all() and not again
+        return None if every else self.forces
 
     def to_json(self) -> dict[str, Any]:
         """The plan as numbers and texts; the file adds its schema."""
@@ -485,6 +529,7 @@ class Plan(Result):
             "poses": [
                 {
                     "configuration": k + 1,
+                    "markers": self.markers(k),
                     "value_without": None if not np.isfinite(r.loss) else r.loss,
                     "serves": [
                         {"name": name, "std_without": None if not np.isfinite(f) else f}

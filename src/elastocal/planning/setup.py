@@ -20,6 +20,7 @@ from elastocal.planning.information import (
     Estimable,
     LoadStates,
     PoseInformation,
+    Sight,
     estimable,
     interest_of,
     typical_sizes,
@@ -185,11 +186,12 @@ def set_up(
     known: Known,
     seed: int,
     region: TargetPoses | None = None,
+    sight: Sight | None = None,
 ) -> Setup:
     """The parameters that the candidates q (N, n) show, and the criterion on them.
 
     `region`: poses all over the joint ranges, which count for the criterion with the share
-    `[design] elsewhere`.
+    `[design] elsewhere`.  `sight` as of `PoseInformation`.
 
     Raises InsufficientDataError where no pose shows a parameter that the criterion needs, named
     with what it is combined with; InputError for unknown names.
@@ -197,7 +199,7 @@ def set_up(
     spec = model.cell.design
     scenarios = _scenarios(model, known, seed)
     every = np.arange(len(model.parameters))
-    raw = PoseInformation(model, states, scenarios, every, np.ones(len(every)))
+    raw = PoseInformation(model, states, scenarios, every, np.ones(len(every)), sight)
     sizes = typical_sizes(raw, q, load)
     information = replace(raw, sizes=sizes)
     prior = _prior(model, known, sizes)

@@ -30,6 +30,7 @@ def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable
     kinds = plan.model.chain.kinds
     loads = len(plan.forces) > 1 and bool((plan.load >= 0).any())
     heads = ["pose", *joint_heads(kinds), *(["load N"] if loads else []), "order"]
+    heads += [] if plan.seen is None else ["markers"]
     heads += [SERVES] if reasons else []
     order = first_stops(plan)
     rows: list[tuple[str, ...]] = []
@@ -37,8 +38,10 @@ def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable
         row = [plan.configurations[k], *joint_texts(plan.q[k], kinds, decimals)]
         if loads:
             row.append(force_text(plan, int(plan.load[k])))
-        rows.append((*row, str(order[k]), *([served(reason)] if reasons else [])))
-    return ShownTable(tuple(heads), rows, (len(heads) - 1,) if reasons else ())
+        row += [str(order[k]), *([] if plan.seen is None else [printable(plan.markers(k))])]
+        rows.append((*row, *([served(reason)] if reasons else [])))
+    texts = [k for k, head in enumerate(heads) if head in ("markers", SERVES)]
+    return ShownTable(tuple(heads), rows, tuple(texts))
 
 
 def first_stops(plan: Plan) -> dict[int, int]:

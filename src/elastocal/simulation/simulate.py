@@ -86,7 +86,8 @@ def expand_plan(
     """Every pose of a plan once per load state, repeat and marker.
 
     `load` (3,) in N adds a loaded reading after each unloaded one where the plan itself states
-    no forces.  Rows are ordered as one would measure: configuration, repeat, load, marker.
+    no forces.  Where rows are of another marker than the first, each stays with its own.  Rows
+    are ordered as one would measure: configuration, repeat, load, marker.
     """
     forces = [plan.force]
     if load is not None:
@@ -96,12 +97,13 @@ def expand_plan(
                 "or drop them"
             )
         forces = [plan.force, plan.force + load]
+    stated = plan.marker_names == marker_names and plan.marker.any()
     parts = [
         (i, r, f, m)
         for i in range(len(plan))
         for r in range(repeats)
         for f in range(len(forces))
-        for m in range(len(marker_names))
+        for m in ([plan.marker[i]] if stated else range(len(marker_names)))
     ]
     index, repeat, state, marker = (np.array(v) for v in zip(*parts, strict=True))
     rows = replace(
