@@ -137,9 +137,13 @@ def wish_of(
     from elastocal.model.valued import Conditions
 
     chosen = format_of(path, format)
-    for name, value in (("temperature_c", temperature_c), ("time_s", time_s)):
-        if value is not None and not np.isfinite(value):
-            raise InputError(f"{option(name)} takes a finite number; found {value}")
+    for name, value, low, high in (
+        ("temperature_c", temperature_c, -273.15, 2000.0), ("time_s", time_s, -1e9, 1e9),
+    ):  # fmt: skip
+        if value is not None and not low <= value <= high:
+            raise InputError(
+                f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
+            )
     force = given_force(load)
     return Wish(
         format=chosen,

@@ -202,7 +202,7 @@ def diagnose(
     model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")
     base = fit_baseline(model, table, options.seed)
-    refuse_nonsense(model, base.observed, base.x, base.residual)
+    refuse_nonsense(model, base.observed, base.x, base.residual, table)
     hypotheses, untested = possible(model, table, options.without)
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))

@@ -439,7 +439,7 @@ class StartSearch:
         X = part.apply(B[rows][:, :, fitted]) * width
         r = base.residual.reshape(-1, size, 1)[chosen]
         r = r + X @ (from_centre(base) / width)[:, None]
-        X, r = ((whitening @ each).reshape(-1, each.shape[2]) for each in (X, r))
+        X, r = ((whitening @ each).reshape(len(part.lead) * size, -1) for each in (X, r))
         r = np.append(r[:, 0], np.zeros(X.shape[1]))
         X = np.vstack([X, np.eye(X.shape[1])])
         return cls(full, h, base, x, part, rows, whitening, X, r)

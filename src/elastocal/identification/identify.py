@@ -94,7 +94,7 @@ def identify(
         faulty, sound = find_faulty(every, refit)
     if 0 < faulty.mean() < 1:
         sound = refit(~faulty, final=True)
-    refuse_nonsense(model, sound.problem.observations, sound.fit.x, sound.fit.residual)
+    refuse_nonsense(model, sound.problem.observations, sound.fit.x, sound.fit.residual, table)
     if smooth:
         found = with_smooth(every, sound, faulty, free, options, progress)
     else:
