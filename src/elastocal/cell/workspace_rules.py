@@ -235,7 +235,8 @@ class Workspace:
     """`link_radius` (n,) m: capsules along the links, (1,) where all are alike, () for none;
     `urdf_geometry`: the URDF's own collision shapes.  `clearance` m to obstacles,
     `self_clearance` m between bodies of the arm; `ignored_pairs` of body names that may touch;
-    `torque_limits` (n,) N m static, () none.
+    `torque_limits` (n,) N m static, () none.  `mounting_plane`: links and tool stay on the arm's
+    side of z = 0 of the base; None: where neither obstacles nor half-spaces are stated.
 
     Examples:
         >>> from elastocal.cell import HalfSpace
@@ -266,6 +267,7 @@ class Workspace:
         default=False,
     )
     self_collision: bool = keyed(default=True)
+    mounting_plane: bool | None = keyed("true or false", default=None)
     ignored_pairs: Many[Pair] = keyed('pairs of names, as in [["link2", "link4"]]', default=())
     clearance: NonNegative = keyed(
         "a number >= 0 in {}", "clearance_mm", "clearance_m", default=0.0

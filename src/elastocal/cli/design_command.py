@@ -78,6 +78,18 @@ def design(
     augment: Annotated[
         Path | None, typer.Option(help="Measurements already done (CSV), which the plan adds to.")
     ] = None,
+    keep: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLAN[:3,7]", help="Poses of an earlier plan that stay: all or these."
+        ),
+    ] = None,
+    strike: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLAN:3,7", help="Replace these poses of a plan; all its others stay."
+        ),
+    ] = None,
     knowledge: Annotated[
         Path | None, typer.Option(help="Priors on parameters (TOML), as for identify.")
     ] = None,
@@ -95,6 +107,14 @@ def design(
         float | None,
         typer.Option(
             min=0, max=0.99, help="Share of the weight for poses beside the test poses, as in 0.2."
+        ),
+    ] = None,
+    elsewhere_cap: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=0.99,
+            help="How much worse the test poses may be for the least error elsewhere, as in 0.05.",
         ),
     ] = None,
     load_changes: Annotated[
@@ -132,8 +152,9 @@ def design(
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
     from elastocal.files import together
-    from elastocal.planning.design import Checkpoint, key_of
+    from elastocal.planning.checkpoint import Checkpoint, key_of
     from elastocal.planning.design import design as run
+    from elastocal.planning.pins import plan_and_names
     from elastocal.verbs import design_request
 
     summary = output.with_suffix(".json")
@@ -147,6 +168,7 @@ def design(
         "target": _target(target, poses),
         "candidates": candidates,
         "elsewhere": elsewhere,
+        "elsewhere_cap": elsewhere_cap,
         "load_changes": load_changes,
         "reference_every": reference_every,
     }
@@ -159,12 +181,15 @@ def design(
         progress("reading")
         wanted, options = design_request(
             cell, **asked, augment=augment, knowledge=knowledge, fixed=fix or (),
-            curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
+            keep=keep, strike=strike, curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
         )  # fmt: skip
         _check_programs(wanted, programs)
-        files = [p for p in (cell, augment, knowledge, *files_of(wanted)) if p is not None]
+        pinned = [plan_and_names(text)[0] for text in (keep, strike) if text]
+        given = (cell, augment, knowledge, *pinned, *files_of(wanted))
+        files = [p for p in given if p is not None]
         check_apart(written, files)
         told = asked | {"fix": fix, "curve": curve, "effort": effort}
+        told |= {"keep": keep, "strike": strike}
         checkpoint = Checkpoint.beside(output, key_of(files, seed=seed, **told), interrupts.check)
         if checkpoint.begun:
             progress("going on with the design that was interrupted")

@@ -14,7 +14,8 @@ ROOMS = {
         "make_criterion register"
     ),
     "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
-    "design": "Checkpoint DesignOptions DesignSearch Effort Selection Stage key_of ordered",
+    "checkpoint": "Checkpoint Stage key_of",
+    "design": "DesignOptions DesignSearch Effort Selection ordered",
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
     "drift": "Alias Drifting",
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",

@@ -381,13 +381,44 @@ def _belongs(state: Mapping[str, NDArray[Any]], problem: DesignProblem) -> bool:
 
 @dataclass(frozen=True)
 class SizedPlan:
-    """The best plan found of `n_poses` poses, its Φ `value`, and the certified lower `bound` on Φ
-    of every plan of so many; None where the criterion has none."""
+    """The best plan found of `n_poses` poses, and the relaxation that bounds every plan of so
+    many; None where the criterion has none."""
 
     n_poses: int
-    value: float
-    bound: float | None
     plan: ExactPlan
+    relaxed: Relaxed | None
+
+    @property
+    def value(self) -> float:
+        return self.plan.value
+
+    @property
+    def bound(self) -> float | None:
+        return None if self.relaxed is None else self.relaxed.bound
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What `kept` makes it from again."""
+        own = {"chosen": self.plan.chosen, "plan_value": np.array(self.plan.value)}
+        if (r := self.relaxed) is None:
+            return own
+        numbers = np.array([r.value, r.bound, r.gap, r.tangent.value])
+        return own | {"weights": r.weights, "relaxed": numbers, "G": r.tangent.G}
+
+    @classmethod
+    def kept(cls, state: Mapping[str, NDArray[Any]]) -> SizedPlan | None:
+        """From the arrays of one, among others; None where there are none."""
+        if "chosen" not in state:
+            return None
+        value = float(state["plan_value"])
+        plan = ExactPlan(state["chosen"], value, 0, 0, np.array([value]))
+        relaxed = None
+        if "weights" in state:
+            at, bound, gap, tangent = (float(v) for v in state["relaxed"])
+            relaxed = Relaxed(
+                state["weights"], at, bound, gap, 0, "first-order", (),
+                Gradient(tangent, state["G"]),
+            )  # fmt: skip
+        return cls(len(plan.chosen), plan, relaxed)
 
 
 @dataclass(frozen=True)
@@ -516,9 +547,8 @@ class _Sizes:
             seed=self.seed,
             jobs=self.jobs,
         )
-        bound = None if relaxed is None else relaxed.bound
-        self.found[n] = SizedPlan(n, plan.value, bound, plan)
-        told = "" if bound is None else f", bound {bound:.6g}"
+        self.found[n] = SizedPlan(n, plan, relaxed)
+        told = "" if relaxed is None else f", bound {relaxed.bound:.6g}"
         self.progress(f"{n} poses: {plan.value:.6g}{told}")
 
     def _relaxation(self, n: int, problem: DesignProblem) -> Relaxed | None:

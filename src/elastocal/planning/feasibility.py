@@ -93,6 +93,28 @@ class Bound(Rule):
         )
 
 
+NEARBY = 0.2  # rad or m in every joint: what stands in one pose's way will stand in the other's
+
+
+class Struck(Rule):
+    """Not near one of the poses (m, n) that the user has struck out."""
+
+    name = "struck"
+
+    def __init__(self, struck: Array) -> None:
+        self._struck = struck
+
+    def broken(self, poses: Poses) -> BoolArray:
+        off = [np.abs(poses.q - q).max(axis=1) for q in self._struck]
+        return np.asarray(np.min(off, axis=0) < NEARBY)
+
+    def causes(self, poses: Poses) -> dict[str, BoolArray]:
+        return {"a pose struck out": self.broken(poses)}
+
+    def remedy(self, poses: Poses) -> str:
+        return "strike fewer poses"
+
+
 # Rules about bodies: keep-out, obstacles, self-collision, height of the load, line of sight.
 
 # A pose keeps every margin by this much more, so that a move that ends there can be certified.
@@ -100,6 +122,9 @@ POSE_SLACK = 1e-4  # m
 SHOWN = 3  # causes that a remedy names
 
 ADVICE = {
+    "mounting_plane": (
+        "where the arm may reach below z = 0 of its base, set [workspace] mounting_plane = false"
+    ),
     "keep_out": "move the boundary in [[workspace.keep_out]]",
     "load_height": "lower [workspace.load] min_height_m or shorten its rope",
     "obstacle": "move or shrink the obstacle",
@@ -385,11 +410,11 @@ MOST_TRIED = 300  # random poses in which a pair must once keep apart to be beli
 _last_restored: dict[str, Feasibility] = {}
 
 
-def _restored(token: str, cell: Cell, chain: Chain) -> Feasibility:
+def _restored(token: str, cell: Cell, chain: Chain, struck: Array | None) -> Feasibility:
     """The rules anew, once per process: with every task the same ones are sent again."""
     if token not in _last_restored:
         _last_restored.clear()
-        _last_restored[token] = Feasibility(cell, chain)
+        _last_restored[token] = Feasibility(cell, chain, struck)
     return _last_restored[token]
 
 
@@ -397,19 +422,23 @@ class Feasibility:
     """The rules of a cell for the nominal, rigid arm.
 
     `bodies` and `pairs`: what there is and what must keep apart; `rules` in the order of
-    checking, cheap ones first.  Pickles by its cell and chain, so that processes can share it.
+    checking, cheap ones first; `struck` (m, n): poses near which none may be.  Pickles by what it
+    is made of, so that processes can share it.
     Raises InputError for a workspace that does not fit the robot.
     """
 
-    def __init__(self, cell: Cell, chain: Chain) -> None:
+    def __init__(self, cell: Cell, chain: Chain, struck: Array | None = None) -> None:
         self.cell, self.chain, self._token = cell, chain, uuid4().hex
+        self._struck = struck
         self.kinematics = Kinematics(cell, chain)
         self.bodies: tuple[Body, ...] = cell_bodies(cell, chain)
         self.pairs: tuple[Pair, ...] = cell_pairs(cell, chain, self.bodies)
         self.rules = rule_book(cell, chain, self.kinematics, self.bodies, self.pairs)
+        if struck is not None and len(struck):
+            self.rules = (self.rules[0], Struck(struck), *self.rules[1:])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self._token, self.cell, self.chain)
+        return _restored, (self._token, self.cell, self.chain, self._struck)
 
     def check(self, q: Array, force: Array) -> PoseFeasibility:
         """Every rule on every pose q (N, n) rad or m under a force (3,) or (N, 3) N.
@@ -480,7 +509,10 @@ class Feasibility:
 
     @cached_property
     def _paths(self) -> Paths:
-        return Paths(self.kinematics, self.bodies, self.pairs, self.cell.workspace.load)
+        kept_apart = [item for p in self.pairs for item in (p.body, p.other)]
+        bodies = {item.name: item for item in kept_apart if isinstance(item, Body)}
+        load = self.cell.workspace.load
+        return Paths(self.kinematics, tuple(bodies.values()), self.pairs, load)
 
     def _poses(self, q: Array, force: Array) -> Poses:
         q = np.atleast_2d(np.asarray(q, dtype=float))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -444,10 +444,9 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
     return Done(x, B.T @ B, len(B), note)
 
 
-def next_number(table: Measurements | None) -> int:
-    """The number after those of the table's configurations, so that what is measured next can
-    join it: 9 after "8", "8-" and "warm-up"; 1 where there is no table or no number."""
-    labels = () if table is None else table.configuration_labels
+def next_number(labels: Iterable[str]) -> int:
+    """The number after those of the configurations that there are, so that what is measured next
+    can join them: 9 after "8", "8-" and "warm-up"; 1 where there is no number."""
     numbers = [int(m[0]) for m in (re.match(r"[0-9]+", label) for label in labels) if m]
     return max(numbers, default=0) + 1
 

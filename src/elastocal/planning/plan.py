@@ -327,15 +327,22 @@ class Chance:
 @dataclass(frozen=True)
 class Everywhere:
     """Rms position error in m after compensation, at the test poses and over all joint ranges, of
-    the plan and of the median random plan (None where that leaves parameters open)."""
+    the plan and of the median random plan (None where that leaves parameters open).  `share` of
+    the criterion's weight lies on the joint ranges, so that the error at the test poses is at
+    most about `cap` above the least; 0 where no such cap was asked for."""
 
     test_poses: float
     elsewhere: float
     random_test_poses: float | None
     random_elsewhere: float | None
+    share: float = 0.0
+    cap: float = 0.0
 
     @classmethod
-    def of(cls, own: Array, elsewhere: Array, M: Array, random: Array) -> Everywhere:
+    def of(
+        cls, own: Array, elsewhere: Array, M: Array, random: Array, share: float = 0.0,
+        cap: float = 0.0,
+    ) -> Everywhere:  # fmt: skip
         """Of R (r, p) at both, the plan's information M (p, p) and random plans' (n, p, p)."""
 
         def rms(R: Array, M: Array) -> float:
@@ -347,7 +354,7 @@ class Everywhere:
 
         chance = [float(np.median([rms(R, m) for m in random])) for R in (own, elsewhere)]
         told = [value if np.isfinite(value) else None for value in chance]
-        return cls(rms(own, M), rms(elsewhere, M), *told)
+        return cls(rms(own, M), rms(elsewhere, M), told[0], told[1], share, cap)
 
 
 @dataclass(frozen=True)
@@ -387,6 +394,7 @@ class Plan(Result):
         chance: What as many random poses would reach.
         everywhere: The error at the test poses and over all joint ranges, in m.
         seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
+        names: Of the configurations, where poses of an earlier plan were kept.
 
     Examples:
         >>> plan = ec.design(
@@ -425,6 +433,7 @@ class Plan(Result):
     chance: Chance | None = None
     everywhere: Everywhere | None = None
     seen: BoolArray | None = None
+    names: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         sure = self.certificate.efficiency_pool
@@ -466,8 +475,8 @@ class Plan(Result):
 
     @property
     def configurations(self) -> tuple[str, ...]:
-        """Their names: numbers from `first` on."""
-        return tuple(str(self.first + k) for k in range(len(self.q)))
+        """Their names: numbers from `first` on, unless poses of an earlier plan have theirs."""
+        return self.names or tuple(str(self.first + k) for k in range(len(self.q)))
 
     @property
     def group_names(self) -> tuple[str, ...]:
@@ -530,6 +539,7 @@ class Plan(Result):
                 {
                     "configuration": k + 1,
                     "markers": self.markers(k),
+                    "name": self.configurations[k],
                     "value_without": None if not np.isfinite(r.loss) else r.loss,
                     "serves": [
                         {"name": name, "std_without": None if not np.isfinite(f) else f}

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from elastocal.errors import option
+from elastocal.planning.bodies import mounting_plane
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.drift import DRIFT
 from elastocal.planning.plan import Plan, Predicted, Reason
@@ -143,9 +144,7 @@ def plan_headline(plan: Plan) -> str:
     """What the plan is worth and how far from the best it is, in one sentence."""
     n = counted(len(plan.q), "pose")
     if plan.criterion == "test_pose":
-        share, rho = plan.model.cell.design.elsewhere, plan.reported
-        if share and plan.everywhere is not None:
-            rho = plan.everywhere.test_poses * 1e6
+        rho = plan.reported if plan.everywhere is None else plan.everywhere.test_poses * 1e6
         text = (
             f"{n} leave a position error of ρ₀ = {rho:.3g} µm rms at the test poses "
             "after compensation"
@@ -213,19 +212,13 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _criterion_line(plan: Plan) -> tuple[str, str]:
-    share = plan.model.cell.design.elsewhere
-    if plan.criterion == "test_pose" and share:
-        return "Criterion", (
-            f"{plan.reported:.4g} µm, the rms position error that remains after compensation, "
-            f"{100 * (1 - share):.0f} % of it at the test poses ({printable(plan.targets)}) and "
-            f"{100 * share:.0f} % all over the joint ranges."
-        )
-    if plan.criterion == "test_pose":
-        return "Criterion", (
-            f"ρ₀ = {plan.reported:.4g} µm, the rms position error that remains at the test poses "
-            f"after compensation ({printable(plan.targets)})."
-        )
-    return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+    if plan.criterion != "test_pose":
+        return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+    rho = plan.reported if plan.everywhere is None else plan.everywhere.test_poses * 1e6
+    return "Criterion", (
+        f"ρ₀ = {rho:.4g} µm, the rms position error that remains at the test poses after "
+        f"compensation ({printable(plan.targets)})."
+    )
 
 
 def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
@@ -234,23 +227,24 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
     if e is None:
         return []
 
-    def both(own: float | None, random: float | None) -> str:
-        chance = "none" if random is None else f"{random * 1e6:.4g}"
-        return f"{(own or 0.0) * 1e6:.4g} µm (a random plan {chance})"
+    def micrometres(error: float | None) -> str:
+        return "none" if error is None else f"{error * 1e6:.4g}"
 
+    own = "" if plan.criterion == "test_pose" else f"; at the test poses {e.test_poses * 1e6:.4g}"
     text = (
-        f"rms error after compensation {both(e.test_poses, e.random_test_poses)} at the test "
-        f"poses, {both(e.elsewhere, e.random_elsewhere)} all over the joint ranges"
+        f"{e.elsewhere * 1e6:.4g} µm rms all over the joint ranges{own}; a random plan leaves "
+        f"{micrometres(e.random_elsewhere)} there and {micrometres(e.random_test_poses)} at the "
+        "test poses"
     )
-    if worse_elsewhere(plan):
-        text += f"; {option('elsewhere', '0.2')} gives part of the weight to poses there"
+    if e.share:
+        text += f"; the joint ranges have {100 * e.share:.0f} % of the criterion's weight"
+        text += f", for which ρ₀ may be {100 * e.cap:g} % above the least" if e.cap else ""
+    elif plan.criterion == "test_pose":
+        text += (
+            f"; {option('elsewhere_cap', '0.05')} finds the least there for 5 % more at the test "
+            "poses"
+        )
     return [("Elsewhere", f"{text}.")]
-
-
-def worse_elsewhere(plan: Plan) -> bool:
-    """Does the plan serve its test poses at the cost of the rest, where random plans do better?"""
-    e = plan.everywhere
-    return e is not None and e.random_elsewhere is not None and e.elsewhere > e.random_elsewhere
 
 
 def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
@@ -264,6 +258,8 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
     if c.median is None or c.best is None:
         return [("Chance", f"{lost}.")]
     name = "ρ₀" if plan.criterion == "test_pose" else plan.criterion
+    if plan.everywhere is not None and plan.everywhere.share:
+        name = "the weighted error"
     unit = f" {plan.unit}" if plan.unit else ""
     worst = "no value" if c.worst is None else f"{c.worst:.4g}"
     text = (
@@ -323,13 +319,18 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     if via:
         text += f", {via} points in between to get around obstacles"
     space = plan.model.cell.workspace
-    bodies = len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0
-    checked = (
-        "every move checked"
-        if bodies
-        else "no move was checked, as [workspace] states no bodies, and poses may reach below the "
-        "mounting plane"
-    )
+    if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
+        checked = "every move checked"
+    elif mounting_plane(plan.model.cell, plan.model.chain) is not None:
+        checked = (
+            "every move checked against the mounting plane (z = 0 of the base; [workspace] "
+            "mounting_plane = false lifts it) and nothing else, as [workspace] states no bodies"
+        )
+    else:
+        checked = (
+            "no move was checked, as [workspace] states no bodies, and poses may reach below the "
+            "mounting plane"
+        )
     return "Execution", f"{text}, {e.total / 60:.0f} min in all; {checked}."
 
 
