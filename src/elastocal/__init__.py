@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from elastocal.cell.workspace_rules import Workspace
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.diagnosis.next_poses import next_poses
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
     from elastocal.export.changes import Comparison, compare
     from elastocal.identification.knowledge import Knowledge
@@ -66,6 +67,7 @@ ROOMS = {
     "cell.workspace_rules": "Workspace",
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
+    "diagnosis.next_poses": "next_poses",
     "export.changes": "Comparison compare",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "identification.knowledge": "Knowledge",
@@ -108,6 +110,7 @@ __all__ = [
     "diagnose",
     "identify",
     "init",
+    "next_poses",
     "read_calibrated",
     "read_cell",
     "register_criterion",

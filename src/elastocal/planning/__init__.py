@@ -15,6 +15,7 @@ ROOMS = {
     ),
     "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
     "design": "Checkpoint DesignOptions DesignSearch Effort Selection Stage key_of ordered",
+    "doubts": "in_doubt missing usual_sizes",
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
     "drift": "Alias Drifting",
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",
@@ -22,7 +23,7 @@ ROOMS = {
     "information": "Estimable LoadStates PoseInformation load_states measured next_number rows_of",
     "moves": "Blockers Unreachable",
     "plan": (
-        "Certificate Chance Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
+        "Certificate Chance Gain Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
         "write_plan_json"
     ),
     "polish": (

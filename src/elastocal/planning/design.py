@@ -28,6 +28,7 @@ from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
 from elastocal.planning.drift import Alias
 from elastocal.planning.exact_plan import (
     exact_plan,
@@ -67,13 +68,13 @@ from elastocal.units import Array, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
 
-Effort = Literal["quick", "normal", "thorough"]
+Effort = Literal["quick", "normal", "thorough", "batch"]
 
 
 @dataclass(frozen=True)
 class DesignSearch:
     """`rounds` of polishing and of poses from the continuum added to the pool; `starts` of the
-    exchange; new `points` per level and `ascents` when the continuum is searched."""
+    exchange; new `points` per level and `ascents` when the continuum is searched, if it is."""
 
     rounds: int
     starts: int
@@ -82,6 +83,7 @@ class DesignSearch:
 
 
 EFFORTS: dict[str, DesignSearch] = {
+    "batch": DesignSearch(rounds=0, starts=2, points=0, ascents=0),
     "quick": DesignSearch(rounds=0, starts=4, points=4096, ascents=2),
     "normal": DesignSearch(rounds=1, starts=10, points=16_384, ascents=4),
     "thorough": DesignSearch(rounds=3, starts=30, points=65_536, ascents=10),
@@ -92,7 +94,8 @@ EFFORTS: dict[str, DesignSearch] = {
 class DesignOptions:
     """`fixed`: parameters, places or effects held; `prior`: what is known of parameters;
     `done`: measurements that the plan adds to; `curve`: numbers of poses to compare; `notes`:
-    sentences on how these came about, for the plan's warnings."""
+    sentences on how these came about, for the plan's warnings; `doubts`: probability that an
+    effect is missing at a place, for a criterion that asks."""
 
     effort: Effort = "normal"
     seed: int = 0
@@ -102,6 +105,7 @@ class DesignOptions:
     done: Measurements | None = None
     curve: tuple[int, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
+    doubts: Mapping[Place, float] | None = None
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
@@ -378,6 +382,8 @@ class _Rounds:
     def certificate(self, pool: FeasiblePool, relaxed: Relaxed | None, value: float) -> Certificate:
         if relaxed is None:
             return Certificate(len(pool), None, None)
+        if not EFFORTS[self.options.effort].points:
+            return Certificate(len(pool), relaxed.bound, efficiency(value, relaxed.bound))
         found = self._continuum(pool, relaxed, 0)
         return Certificate(
             pool=len(pool),
@@ -557,23 +563,17 @@ class _Design:
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
-        done = None
+        model, known = self.model, Known(options.fixed, options.prior)
+        if "doubts" in CRITERIA[self.cell.design.criterion].needs:
+            model, known = in_doubt(model, known, self.states, q, load, options.doubts)
         if options.done is not None:
             progress("information of the measurements done")
-            done = measured(self.model, options.done, options.fixed)
+            done = measured(self.model, options.done, options.fixed, model)
+            known = replace(known, done=done)
             self.warnings.append(f"B is taken at {done.note}")
-        known = Known(options.fixed, options.prior, done)
         progress("information of the candidates")
         setup = set_up(
-            self.model,
-            self.states,
-            q,
-            load,
-            int(shares.sum()),
-            targets,
-            known,
-            options.seed,
-            region,
+            model, self.states, q, load, int(shares.sum()), targets, known, options.seed, region
         )
         self.warnings += setup.warnings
         pool = setup.pool(q, load, group)
@@ -582,7 +582,7 @@ class _Design:
         found = select(setup, pool, shares, searches, options, self.checkpoint, progress, begun)
         progress("random plans beside it")
         drawn = random_plans(setup.problem(pool, shares), options.seed)
-        return self._plan(setup, found, shares, counts, targets.source, curve, done, drawn)
+        return self._plan(setup, found, shares, counts, targets.source, curve, known.done, drawn)
 
     def _candidates(self) -> tuple[Array, IntArray, IntArray, CandidateCounts]:
         state = self.checkpoint.stage("candidates").finished(self._drawn)
@@ -689,7 +689,7 @@ class _Design:
         self.warnings += told
         pool, chosen = found.pool, found.chosen
         q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
-        spec = self.cell.design
+        spec, model = self.cell.design, setup.information.model
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
         numbers = blocks.shape[1] * blocks.shape[2] * readings_each(self.cell)
@@ -711,9 +711,11 @@ class _Design:
             execution=execution,
             candidates=counts,
             certificate=found.certificate,
-            predicted=predicted(self.model, setup.found, M, numbers),
+            predicted=tuple(
+                p for p in predicted(model, setup.found, M, numbers) if p.name in self.model.names
+            ),
             reasons=reasons(
-                self.model, setup.found, blocks[0], setup.prior[0],
+                model, setup.found, blocks[0], setup.prior[0],
                 values_without(problem, chosen), found.value,
             ),
             targets=targets,
@@ -725,6 +727,7 @@ class _Design:
             first=next_number(self.options.done),
             chance=Chance.of(drawn, found.value, setup.criterion),
             everywhere=self._everywhere(setup, problem, M),
+            gain=gain_of(setup, done, M, self.model.names, self.options.seed),
         )  # fmt: skip
 
     def _everywhere(self, setup: Setup, problem: DesignProblem, M: Array) -> Everywhere | None:
@@ -734,9 +737,6 @@ class _Design:
             return None
         random = random_information(problem, self.options.seed)[:, 0]
         return Everywhere.of(own, elsewhere, M, random)
-
-
-OPEN = frozenset({"time", "temperature", "approach"})
 
 
 def _without(
