@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.changes import Comparison, compare
     from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.diagnosis.next_poses import next_poses
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
     from elastocal.identification.knowledge import Knowledge
     from elastocal.identification.result import Calibration
@@ -67,6 +68,7 @@ ROOMS = {
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
     "diagnosis.changes": "Comparison compare",
+    "diagnosis.next_poses": "next_poses",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
@@ -108,6 +110,7 @@ __all__ = [
     "diagnose",
     "identify",
     "init",
+    "next_poses",
     "read_calibrated",
     "read_cell",
     "register_criterion",

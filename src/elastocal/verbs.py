@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from elastocal.identification.intervals import IntervalKind
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, Method
-    from elastocal.identification.prediction import NewPoses
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
     from elastocal.model.calibrated_tool import ToolPoint
@@ -83,6 +82,7 @@ def design(
     motion: Motion | None = None,
     load_changes: int | None = None,
     reference_every: int | None = None,
+    doubts: Mapping[tuple[str, str], float] | None = None,
     seed: int = 0,
     jobs: int = 1,
     progress: Progress | None = None,
@@ -96,8 +96,8 @@ def design(
     Args:
         model: The model, or a cell, or the path of a cell file.
         poses: Number of poses.
-        criterion: What is to become small: "test_pose" (error at the test poses), "D", "A", "E",
-            "G", "I", "c", "O1" to "O5".
+        criterion: What is to become small: "test_pose" (error at the test poses), "robust" (the
+            same with what the model may lack), "D", "A", "E", "G", "I", "c", "O1" to "O5".
         target: Find the smallest number of poses that reaches this error, in m; goes with the
             criteria test_pose, I and G, and instead of `poses`.
         curve: Numbers of poses to compare.
@@ -134,6 +134,8 @@ def design(
         load_changes: How often the load may be hung, exchanged or taken off; default as rarely as
             can be. More of them keep a drift further apart from what the loads show.
         reference_every: Visit a reference pose again after so many stops.
+        doubts: Probability that the model lacks an effect at a place, {("backlash", "joint2"):
+            0.1}, for the criterion robust; default equal shares of the catalogue.
         seed: Of all random draws.
         jobs: Processes; −1 for all cores.
         progress: Is told what is done.
@@ -173,6 +175,7 @@ def design_request(
     knowledge: Knowledge | str | Path | None = None,
     prior: Literal["none", "typical"] | Prior | None = None,
     effort: str = "normal",
+    doubts: Mapping[tuple[str, str], float] | None = None,
     seed: int = 0,
     jobs: int = 1,
     **asked: Any,
@@ -214,6 +217,7 @@ def design_request(
         curve=tuple(sorted({_whole("curve", n) for n in curve})),
         notes=notes,
         pins=pins,
+        doubts=doubts,
     )
     return cell, options
 
@@ -476,6 +480,7 @@ def identify(
     """
     from elastocal.identification.identify import identify as run
     from elastocal.identification.options import Options
+    from elastocal.planning.test_poses import where_used
 
     options = Options(
         method=method,
@@ -507,19 +512,7 @@ def identify(
         prior = prior or known_prior
     if prior is not None or constraints is not None:
         options = replace(options, constraints=constraints, prior=prior)
-    return run(made, table, options, kept_back, tell, _new_poses(made))
-
-
-def _new_poses(model: Model) -> NewPoses | None:
-    """Where the cell says that position must be right; None where it says nothing."""
-    from elastocal.identification.prediction import NewPoses
-    from elastocal.planning.test_poses import test_poses
-
-    spec = model.cell.design
-    if not spec.states_test_poses:
-        return None
-    found = test_poses(model.cell, model.chain)
-    return NewPoses(found.q, found.force, found.weight, found.source.removeprefix("test poses: "))
+    return run(made, table, options, kept_back, tell, where_used(made))
 
 
 def diagnose(

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 # The order of the work, in which --help lists the verbs.
 VERBS = (
-    "init", "effects", "design", "simulate", "import", "identify", "diagnose", "compensate",
-    "export", "compare", "study", "demo",
+    "init", "effects", "design", "simulate", "import", "identify", "diagnose", "next",
+    "compensate", "export", "compare", "study", "demo",
 )  # fmt: skip
 
 

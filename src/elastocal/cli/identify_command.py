@@ -125,7 +125,7 @@ def identify(
     from elastocal.model.choice import cell_of
 
     written = check_outputs(output, report, residuals)
-    limits = _limits(require or [])
+    limits = limits_of(require or [])
     inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
     known = cell_of(cell)  # its plug-ins may have the noise model
     check_apart(written, inputs, known)
@@ -150,13 +150,13 @@ def identify(
         raise NotAcceptedError(f"not accepted: {'; '.join(unmet)}")
 
 
-def _limits(stated: list[str]) -> dict[str, float | None]:
-    """NAME=UM as limits in m."""
+def limits_of(stated: list[str], names: tuple[str, ...] = ()) -> dict[str, float | None]:
+    """NAME=UM as limits in m, NAME one of `names`, by default of all."""
     from elastocal.cell.work_cell import Acceptance
     from elastocal.errors import InputError, option
     from elastocal.text import listed
 
-    names = tuple(vars(Acceptance()))
+    names = names or tuple(vars(Acceptance()))
     limits: dict[str, float | None] = {}
     for text in stated:
         name, _, number = text.partition("=")

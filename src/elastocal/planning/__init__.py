@@ -16,6 +16,7 @@ ROOMS = {
     "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
     "checkpoint": "Checkpoint Stage key_of",
     "design": "DesignOptions DesignSearch Effort Selection ordered",
+    "doubts": "in_doubt missing usual_sizes",
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
     "drift": "Alias Drifting",
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",
@@ -23,7 +24,7 @@ ROOMS = {
     "information": "Estimable LoadStates PoseInformation load_states measured next_number rows_of",
     "moves": "Blockers Unreachable",
     "plan": (
-        "Certificate Chance Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
+        "Certificate Chance Gain Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
         "write_plan_json"
     ),
     "polish": (

@@ -145,6 +145,22 @@ class RemainingError(TraceCriterion):
 
 
 @dataclass(frozen=True)
+class RobustError(RemainingError):
+    """Φ = tr(C M⁻¹) as of test_pose, with the effects that the model may lack among the parameters.
+
+    Each of their parameters has mean 0 and the variance π s²: the probability π that the effect is
+    missing, its typical size s.  `reported`: √Φ in µm, the error at the test poses of one who
+    reckons with them.  It serves the parameters and shows what may be missing, as far as it matters
+    at the test poses.
+    Source: DuMouchel & Jones 1994, Technometrics 36, 37–47.
+    """
+
+    name = "robust"
+    title = "position error at the test poses, effects that the model may lack included, rms"
+    needs = ("test_poses", "doubts")
+
+
+@dataclass(frozen=True)
 class PredictionVariance(TraceCriterion):
     """Φ = (1/T) Σ_t tr(A_t V A_tᵀ), V = M⁻¹, in m²: the mean over a region's T points.
 
@@ -636,6 +652,7 @@ CRITERIA: dict[str, type[ScenarioCriterion]] = {
     criterion.name: criterion
     for criterion in (
         RemainingError,
+        RobustError,
         DeterminantCriterion,
         ParameterVariance,
         EigenvalueCriterion,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Literal, get_args
@@ -19,6 +20,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.checkpoint import Checkpoint, Stage, State
 from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
 from elastocal.planning.drift import Alias
 from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import (
@@ -60,13 +62,13 @@ from elastocal.units import Array, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
 
-Effort = Literal["quick", "normal", "thorough"]
+Effort = Literal["quick", "normal", "thorough", "batch"]
 
 
 @dataclass(frozen=True)
 class DesignSearch:
     """`rounds` of polishing and of poses from the continuum added to the pool; `starts` of the
-    exchange; new `points` per level and `ascents` when the continuum is searched."""
+    exchange; new `points` per level and `ascents` when the continuum is searched, if it is."""
 
     rounds: int
     starts: int
@@ -75,6 +77,7 @@ class DesignSearch:
 
 
 EFFORTS: dict[str, DesignSearch] = {
+    "batch": DesignSearch(rounds=0, starts=2, points=0, ascents=0),
     "quick": DesignSearch(rounds=0, starts=4, points=4096, ascents=2),
     "normal": DesignSearch(rounds=1, starts=10, points=16_384, ascents=4),
     "thorough": DesignSearch(rounds=3, starts=30, points=65_536, ascents=10),
@@ -86,7 +89,8 @@ class DesignOptions:
     """`fixed`: parameters, places or effects held; `prior`: what is known of parameters;
     `done`: measurements that the plan adds to; `curve`: numbers of poses to compare; `notes`:
     sentences on how these came about, for the plan's warnings; `pins`: poses that stay or are
-    struck out."""
+    struck out; `doubts`: probability that an effect is missing at a place, for a criterion that
+    asks."""
 
     effort: Effort = "normal"
     seed: int = 0
@@ -97,6 +101,7 @@ class DesignOptions:
     curve: tuple[int, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
     pins: Pins | None = None
+    doubts: Mapping[Place, float] | None = None
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
@@ -297,6 +302,8 @@ class _Rounds:
     def certificate(self, pool: FeasiblePool, relaxed: Relaxed | None, value: float) -> Certificate:
         if relaxed is None:
             return Certificate(len(pool), None, None)
+        if not EFFORTS[self.options.effort].points:
+            return Certificate(len(pool), relaxed.bound, efficiency(value, relaxed.bound))
         found = [self._continuum(pool, relaxed, 0)]
         # The tangent of the pool's optimum says little of poses far better than the pool's: they
         # join it, and that of the new optimum says more.
@@ -495,15 +502,17 @@ class _Design:
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
-        done = None
+        model, known = self.model, Known(options.fixed, options.prior)
+        if "doubts" in CRITERIA[self.cell.design.criterion].needs:
+            model, known = in_doubt(model, known, self.states, q, load, options.doubts)
         if options.done is not None:
             progress("information of the measurements done")
-            done = measured(self.model, options.done, options.fixed)
+            done = measured(self.model, options.done, options.fixed, model)
+            known = replace(known, done=done)
             self.warnings.append(f"B is taken at {done.note}")
-        known = Known(options.fixed, options.prior, done)
         progress("information of the candidates")
         setup = set_up(
-            self.model,
+            model,
             self.states,
             q,
             load,
@@ -530,7 +539,9 @@ class _Design:
         found = select(search, pool, shares, searches, options, self.checkpoint, progress, begun)
         progress("random plans beside it")
         drawn = random_information(search.problem(pool, shares), options.seed)
-        return self._plan(setup, found, shares, counts, targets.source, curve, done, drawn, pinned)
+        return self._plan(
+            setup, found, shares, counts, targets.source, curve, known.done, drawn, pinned
+        )
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
@@ -653,7 +664,7 @@ class _Design:
         self.warnings += told
         pool, chosen = found.pool, found.chosen
         q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
-        spec = self.cell.design
+        spec, model = self.cell.design, setup.information.model
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
         phi = np.sort(np.asarray(setup.criterion.value(drawn), dtype=np.float64))
@@ -677,9 +688,11 @@ class _Design:
             execution=execution,
             candidates=counts,
             certificate=found.certificate,
-            predicted=predicted(self.model, setup.found, M, numbers),
+            predicted=tuple(
+                p for p in predicted(model, setup.found, M, numbers) if p.name in self.model.names
+            ),
             reasons=reasons(
-                self.model, setup.found, blocks[0], setup.prior[0],
+                model, setup.found, blocks[0], setup.prior[0],
                 values_without(problem, chosen), found.value,
             ),
             targets=targets,
@@ -693,6 +706,7 @@ class _Design:
             chance=Chance.of(phi, found.value, setup.criterion),
             everywhere=self._everywhere(setup, M, drawn[:, 0]),
             seen=None if seen.all() else seen,
+            gain=gain_of(setup, done, M, self.model.names, self.options.seed),
         )  # fmt: skip
 
     def _names(self, found: Selection) -> tuple[str, ...]:
@@ -712,9 +726,6 @@ class _Design:
         if own is None or elsewhere is None:
             return None
         return Everywhere.of(own, elsewhere, M, random, setup.share, self.cell.design.cap)
-
-
-OPEN = frozenset({"time", "temperature", "approach"})
 
 
 def _without(

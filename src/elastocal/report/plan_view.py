@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from elastocal.errors import option
 from elastocal.planning.bodies import mounting_plane
@@ -21,6 +21,9 @@ from elastocal.report.formatting import (
     significant,
 )
 from elastocal.text import printable
+
+if TYPE_CHECKING:
+    from elastocal.diagnosis.next_poses import NextPoses
 
 TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "serves (standard deviation without it)"
@@ -349,6 +352,42 @@ def _drift_lines(plan: Plan) -> list[tuple[str, str]]:
     if d.bias < d.shortest:
         text += f" (in the shortest order {other})"
     return [("Drift", f"{text}.")]
+
+
+def next_lines(found: NextPoses) -> list[tuple[str, str]]:
+    """Whether to measure more, what it brings, and what may be missing, as (label, sentence)."""
+    g, n = found.gain, counted(found.batch, "pose")
+    limit = "" if found.required is None else f" (required: {found.required * 1e6:.3g} µm)"
+    verdicts = {
+        "measure": f"measure {n} more; then ask again with all readings in one table",
+        "enough": "no further pose is needed: the required error is kept with 95 %",
+        "no_gain": f"no {n} lower the error by a hundredth: more of them do not pay; what does is "
+        "more repeats, a better instrument, or another kind of measurement",
+    }
+    now = "not known yet, as the measurements leave parameters open"
+    if math.isfinite(found.reached):
+        now = f"with 95 % at most {found.reached * 1e6:.3g} µm at new poses{limit}"
+
+    def both(before: float, after: float) -> str:
+        begun = f"{before * 1e6:.3g} µm" if math.isfinite(before) else "an unknown error"
+        return f"{begun} to {after * 1e6:.3g} µm"
+
+    lines = [("Next", verdicts[found.verdict] + "."), ("Error now", now + ".")]
+    lines.append(
+        (
+            "Gain",
+            f"{n} lower the rms error at the test poses from {both(g.before, g.after)}; were the "
+            f"model right, from {both(g.model_before, g.model_after)}.",
+        )
+    )
+    named = [f"{f.effect} at {f.where} ({f.probability:.2f})" for f in found.found]
+    if named:
+        text = f"{', '.join(named)}, which the model is given here; write the cell with it"
+        lines.append(("Found", printable(f"{text} (diagnose, {option('cell_out')}).")))
+    doubts = [f"{e} at {w} ({p:.2g})" for e, w, p in found.doubts[:3]]
+    if doubts:
+        lines.append(("In doubt", printable(f"likeliest {', '.join(doubts)}.")))
+    return lines
 
 
 def plan_contents(plan: Plan) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -45,11 +45,22 @@ from elastocal.report.identification_view import (
     undetermined_lines,
 )
 from elastocal.report.method_and_noise import candidate_rows, size_rows
-from elastocal.report.plan_view import curve_rows, interval_rows, plan_lines, pose_rows, reason_rows
+from elastocal.report.plan_view import (
+    curve_rows,
+    interval_rows,
+    next_lines,
+    plan_lines,
+    pose_rows,
+    reason_rows,
+)
 from elastocal.screen import safe_console
 from elastocal.text import printable
 
+if TYPE_CHECKING:
+    from elastocal.diagnosis.next_poses import NextPoses
+
 NARROW_FOR_BOTH = 96  # columns; below, a comparison tells changes alone
+
 PRINTED_WIDTH = 100  # columns of a result as plain text
 
 
@@ -280,6 +291,14 @@ def print_plan(console: Console, plan: Plan) -> None:
         console.print(table_of(title, table, whole=True))
     console.print()
     _print_lines(console, plan_lines(plan))
+
+
+def print_next(console: Console, found: NextPoses) -> None:
+    """Whether to measure more and what it brings, and the poses."""
+    if found.plan is not None:
+        print_plan(console, found.plan)
+        console.print()
+    _print_lines(console, next_lines(found))
 
 
 def _narrow_poses(console: Console, plan: Plan) -> Table:
