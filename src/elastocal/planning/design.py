@@ -28,7 +28,7 @@ from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.drift import Alias
+from elastocal.planning.drift import Alias, left_by_drift
 from elastocal.planning.exact_plan import (
     exact_plan,
     random_information,
@@ -692,6 +692,8 @@ class _Design:
         spec = self.cell.design
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
+        when = execution.times(len(q), len(self.states.forces))
+        left = left_by_drift(setup, pool, chosen, M, when)
         numbers = blocks.shape[1] * blocks.shape[2] * readings_each(self.cell)
         numbers += 0 if done is None else done.numbers
         value, unit = setup.criterion.reported(found.value)
@@ -711,7 +713,7 @@ class _Design:
             execution=execution,
             candidates=counts,
             certificate=found.certificate,
-            predicted=predicted(self.model, setup.found, M, numbers),
+            predicted=predicted(self.model, setup.found, left, numbers),
             reasons=reasons(
                 self.model, setup.found, blocks[0], setup.prior[0],
                 values_without(problem, chosen), found.value,
@@ -724,16 +726,18 @@ class _Design:
             warnings=tuple(self.warnings),
             first=next_number(self.options.done),
             chance=Chance.of(drawn, found.value, setup.criterion),
-            everywhere=self._everywhere(setup, problem, M),
+            everywhere=self._everywhere(setup, problem, M, left),
         )  # fmt: skip
 
-    def _everywhere(self, setup: Setup, problem: DesignProblem, M: Array) -> Everywhere | None:
-        """The error of the plan of information M (p, p) at the test poses and elsewhere."""
+    def _everywhere(
+        self, setup: Setup, problem: DesignProblem, M: Array, left: Array
+    ) -> Everywhere | None:
+        """The plan's errors, of M (p, p) and of what a drift leaves of it (p, p)."""
         own, elsewhere = setup.target_rows, setup.elsewhere_rows
         if own is None or elsewhere is None:
             return None
         random = random_information(problem, self.options.seed)[:, 0]
-        return Everywhere.of(own, elsewhere, M, random)
+        return Everywhere.of(own, elsewhere, M, random, left)
 
 
 OPEN = frozenset({"time", "temperature", "approach"})

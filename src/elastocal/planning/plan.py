@@ -309,16 +309,22 @@ class Chance:
 @dataclass(frozen=True)
 class Everywhere:
     """Rms position error in m after compensation, at the test poses and over all joint ranges, of
-    the plan and of the median random plan (None where that leaves parameters open)."""
+    the plan and of the median random plan (None where that leaves parameters open); and of the
+    plan with the drift that the cell states."""
 
     test_poses: float
     elsewhere: float
     random_test_poses: float | None
     random_elsewhere: float | None
+    drifting_test_poses: float
+    drifting_elsewhere: float
 
     @classmethod
-    def of(cls, own: Array, elsewhere: Array, M: Array, random: Array) -> Everywhere:
-        """Of R (r, p) at both, the plan's information M (p, p) and random plans' (n, p, p)."""
+    def of(
+        cls, own: Array, elsewhere: Array, M: Array, random: Array, drifting: Array | None = None
+    ) -> Everywhere:
+        """Of R (r, p) at both, the plan's information M (p, p), random plans' (n, p, p), and what
+        a drift leaves of the plan's."""
 
         def rms(R: Array, M: Array) -> float:
             try:
@@ -328,8 +334,11 @@ class Everywhere:
             return float(np.sqrt(max(np.sum(R.T * V), 0.0)))
 
         chance = [float(np.median([rms(R, m) for m in random])) for R in (own, elsewhere)]
-        told = [value if np.isfinite(value) else None for value in chance]
-        return cls(rms(own, M), rms(elsewhere, M), *told)
+        there, beyond = (value if np.isfinite(value) else None for value in chance)
+        left = M if drifting is None else drifting
+        return cls(
+            rms(own, M), rms(elsewhere, M), there, beyond, rms(own, left), rms(elsewhere, left)
+        )
 
 
 @dataclass(frozen=True)

@@ -239,6 +239,12 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
         f"rms error after compensation {both(e.test_poses, e.random_test_poses)} at the test "
         f"poses, {both(e.elsewhere, e.random_elsewhere)} all over the joint ranges"
     )
+    noise = plan.model.cell.noise
+    if noise.drift:
+        text += (
+            f"; with the drift of {noise.drift * 1e6:.3g} µm that [noise] states "
+            f"{e.drifting_test_poses * 1e6:.4g} and {e.drifting_elsewhere * 1e6:.4g} µm"
+        )
     if worse_elsewhere(plan):
         text += f"; {option('elsewhere', '0.2')} gives part of the weight to poses there"
     return [("Elsewhere", f"{text}.")]
