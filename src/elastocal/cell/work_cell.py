@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
-from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker
+from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.cell.file_keys import (
     TUPLE,
     File,
@@ -100,6 +100,7 @@ class Cell:
     design: DesignSpec = keyed("a table", default_factory=DesignSpec)
     require: Acceptance = keyed("a table", default_factory=Acceptance)
     plugins: Many[Text] = keyed("a table", form=PluginsTable, into=_modules, default=())
+    noise: Unsteadiness = keyed("a table", default_factory=Unsteadiness)
 
     def __post_init__(self) -> None:
         for joint, (low, high) in self.limits.items():

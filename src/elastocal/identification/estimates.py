@@ -65,7 +65,7 @@ def summarise(
         combinations=combinations,
         x=final.x,
         determined=determined,
-        covariance=covariance,
+        spread=found.intervals.covariance,
         correlations=_correlations(covariance, determined, ~model.shrunk[kept]),
         observations=observed,
         residual=final.residual,
@@ -98,9 +98,8 @@ def summarise(
         weights=solution.problem.weights,
         noise_parts=noise_parts(found),
     )
-    dofs = found.intervals.covariance.dof
     predicted = predicted_error(
-        result.arm, observed, result.excess, float(np.median(dofs)) if len(dofs) else np.inf,
+        result.arm, observed, result.excess, result.spread,
         new_poses or over_the_workspace(model.cell, model, observed.table),
         np.random.default_rng(0), _unchecked(result, solution),
     )  # fmt: skip

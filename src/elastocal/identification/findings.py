@@ -381,7 +381,8 @@ def _visits(result: Calibration) -> Iterator[Finding]:
                 "sigma_urad": tuple(_um(s.sigma) for s in joints if s.sigma is not None),
             },
             "Measure more poses rather than one pose longer, and approach each from the same side: "
-            "the joints settle anew at every visit.",
+            "the joints settle anew at every visit. The cell's [noise] joints_urad lets design and "
+            "simulate count with it.",
         )  # fmt: skip
     drifts = [s for s in sizes if s.drift and s.sigma]
     if noise.drift is not None and drifts and p.get(TIME, 1.0) < SCATTERS:
@@ -395,7 +396,8 @@ def _visits(result: Calibration) -> Iterator[Finding]:
             },
             "Measure poses and loads in random order, return to a reference pose every ten poses, "
             + ("" if seconds is not None else "record times, ")
-            + "and let arm and tracker warm up.",
+            + "and let arm and tracker warm up. The cell's [noise] drift_um lets design and "
+            "simulate count with it.",
         )  # fmt: skip
 
 

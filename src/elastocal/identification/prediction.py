@@ -25,6 +25,7 @@ from scipy import linalg, stats
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
+from elastocal.identification.covariance import Covariance
 from elastocal.identification.methods import EXACT
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
@@ -229,25 +230,31 @@ class Position:
     """Where the tool is at n poses, and how sure that is; lengths in m, in the data's frame.
 
     `position` (n, 3).  `covariance` (n, 3, 3) of the place about which visits scatter: estimates,
-    parameters left open and lack of fit; `visit` (n, 3, 3): the scatter of a single visit besides,
-    as far as the noise model has it.
+    parameters left open and lack of fit, known with `dof` (n,) degrees of freedom; `visit`
+    (n, 3, 3): the scatter of a single visit besides, as far as the noise model has it.
     """
 
     position: Array
     covariance: Array
     visit: Array
+    dof: Array
 
     def half_axes(self, level: float = 0.95, visit: bool = False) -> Array:
         """Half axes (n, 3), the longest first, of the ellipsoid that holds the tool with
-        probability `level`: √(χ²₃(level) λ) of the eigenvalues λ; with `visit` at one visit."""
-        return half_axes(self.covariance + (self.visit if visit else 0.0), level)
+        probability `level`: √(3 F_3,dof(level) λ) of the eigenvalues λ; with `visit` at one
+        visit."""
+        normal = half_axes(self.covariance + (self.visit if visit else 0.0), level)
+        return normal * np.sqrt(self._quantile(level) / stats.chi2.ppf(level, 3))[:, None]
+
+    def _quantile(self, level: float) -> Array:
+        return np.asarray(3 * stats.f.ppf(level, 3, np.minimum(self.dof, 1e9)))
 
     def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
         """Whether the regions of that `level` hold the places (n, 3)."""
         total = self.covariance + (self.visit if visit else 0.0)
         off = np.asarray(places) - self.position
         distance = np.einsum("ni,nij,nj->n", off, np.linalg.pinv(total, hermitian=True), off)
-        return np.asarray(distance <= stats.chi2.ppf(level, 3))
+        return np.asarray(distance <= self._quantile(level))
 
 
 def half_axes(covariance: Array, level: float = 0.95) -> Array:
@@ -258,8 +265,11 @@ def half_axes(covariance: Array, level: float = 0.95) -> Array:
     return np.asarray(np.sqrt(stats.chi2.ppf(level, 3) * size))
 
 
-def position_at(tool: CalibratedTool, table: Measurements, q: Array, scatter: Scatter) -> Position:
-    """The tool's position at joints q (n, joints) in the circumstances of the table (n,).
+def position_at(
+    tool: CalibratedTool, table: Measurements, q: Array, scatter: Scatter, spread: Covariance
+) -> Position:
+    """The tool's position at joints q (n, joints) in the circumstances of the table (n,); `spread`
+    is the covariance of what was determined.
 
     NaN where there is no static equilibrium.
     """
@@ -268,7 +278,10 @@ def position_at(tool: CalibratedTool, table: Measurements, q: Array, scatter: Sc
     place = tool.poses(rows, q)[0]
     J = tool.errors(rows, q, place, None)[1]
     visit = (J * scatter.joints**2) @ J.transpose(0, 2, 1) + scatter.common**2 * np.eye(3)
-    return Position(place, found.total, visit)
+    index = {name: i for i, name in enumerate(tool.calibrated.model.names)}
+    known = [index[name] for name in tool.calibrated.determined]
+    dof = spread.dof_of(tool.sensitivity(rows, q)[..., known])
+    return Position(place, found.total, visit, dof)
 
 
 @dataclass(frozen=True)
@@ -416,7 +429,7 @@ def predicted_error(
     arm: CalibratedArm,
     observed: Observations,
     excess: Excess | None,
-    dof: float,
+    spread: Covariance,
     poses: NewPoses,
     rng: np.random.Generator,
     unchecked: Array | None = None,
@@ -425,8 +438,9 @@ def predicted_error(
     `told_by_one` says how much of it is `unchecked`.
 
     e² = zᵀ G z + τ² with G = Σ_t w_t [A_K L, O S]ᵀ [A_K L, O S] and Σ = L Lᵀ: its distribution
-    by draws of z, normal, and t with `dof` degrees of freedom for what the estimates' covariance
-    holds.  None where nothing was determined, or no position follows from what was read.
+    by draws of z, normal, and t with the degrees of freedom of their mean square for what the
+    estimates' covariance holds.  None where nothing was determined, or no position follows from
+    what was read.
     """
     left = arm.left
     if left is None or not arm.determined or observed.kind == "distance":
@@ -451,6 +465,7 @@ def predicted_error(
     half = vector * np.sqrt(np.maximum(value, 0.0))
     z = rng.standard_normal((DRAWS, len(G)))
     inflated = np.ones(DRAWS) if excess is None else excess.inflated
+    dof = float(spread.dof_of((known * each).reshape(1, -1, n))[0])
     wide = _chi2(max(int(dof), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
     z[:, :n] *= np.sqrt(wide * inflated)[:, None]
     squares = ((z @ half) ** 2).sum(axis=1)

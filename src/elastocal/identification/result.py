@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from elastocal.above import Result
+from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import UnknownNameError
 from elastocal.identification import scrutiny
 from elastocal.identification.constrained import ActiveConstraint
+from elastocal.identification.covariance import Covariance
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outliers import Outlier
@@ -226,7 +228,7 @@ class Calibration(Result):
         combinations: Sums of parameters that the data determine although not each member.
         x: Values (parameters,) that the model uses, in SI units.
         determined: The kept parameters in order, alone or as first member of a combination.
-        covariance: (determined, determined), theirs.
+        spread: Their `Covariance`, with degrees of freedom; `covariance` is its matrix.
         correlations: Pairs of names with |ρ| over 0.9, strongest first.
         observations: The readings that were fitted, as observations.
         residual: (rows,), observed minus predicted, in m (rad).
@@ -275,7 +277,7 @@ class Calibration(Result):
     combinations: tuple[Combination, ...]
     x: Array
     determined: tuple[str, ...]
-    covariance: Array
+    spread: Covariance
     correlations: tuple[tuple[str, str, float], ...]
     observations: Observations
     residual: Array
@@ -302,6 +304,22 @@ class Calibration(Result):
     copies: tuple[int, ...] = ()
     weights: Weights | None = field(default=None, compare=False)
     noise_parts: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def covariance(self) -> Array:
+        """(determined, determined), of the parameters `determined`."""
+        return self.spread.matrix
+
+    @property
+    def unsteadiness(self) -> Unsteadiness:
+        """What the readings show of the cell's [noise]: `replace(cell, noise=fit.unsteadiness)` is
+        a cell whose plans and simulations have it."""
+        drift = next((s.sigma for s in self.noise.sizes or () if s.drift), None) or 0.0
+        lasting = None if self.noise.drift is None else self.noise.drift.seconds
+        joints = scatter_of(self.noise, self.model.chain.n_joints).joints
+        if not joints.any():
+            joints = np.zeros(1)
+        return Unsteadiness(joints, drift if lasting else 0.0, lasting or Unsteadiness.lasting)
 
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
@@ -505,7 +523,7 @@ class Calibration(Result):
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
         table = model.table(q, load)
         scatter = scatter_of(self.noise, model.chain.n_joints)
-        return position_at(tool, table, table.q, scatter)
+        return position_at(tool, table, table.q, scatter, self.spread)
 
     def combination(self, first: str) -> Combination:
         """The combination whose first member is `first`; UnknownNameError where there is none."""
@@ -576,6 +594,10 @@ class Calibration(Result):
             "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
             "open": None if self.left is None else self.left.to_json(),
             "noise": self.noise.to_json(),
+            "cell_noise": {
+                "joints_urad": (1e6 * self.unsteadiness.joints).tolist(),
+                "drift_um": _um(self.unsteadiness.drift), "lasting_s": self.unsteadiness.lasting,
+            },
             "residual_summary": (
                 None if self.residual_summary is None else self.residual_summary.to_json()
             ),

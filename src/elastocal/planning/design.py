@@ -21,7 +21,7 @@ from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.checkpoint import Checkpoint, Stage, State
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
-from elastocal.planning.drift import Alias
+from elastocal.planning.drift import Alias, left_by_drift
 from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import (
     SizedPlan,
@@ -667,6 +667,8 @@ class _Design:
         spec, model = self.cell.design, setup.information.model
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
+        when = execution.times(len(q), len(self.states.forces))
+        left = left_by_drift(setup, pool, chosen, M, when)
         phi = np.sort(np.asarray(setup.criterion.value(drawn), dtype=np.float64))
         seen = setup.information.seen(q, load)
         numbers = round(blocks.shape[1] * blocks.shape[2] * seen.mean() * readings_each(self.cell))
@@ -689,7 +691,9 @@ class _Design:
             candidates=counts,
             certificate=found.certificate,
             predicted=tuple(
-                p for p in predicted(model, setup.found, M, numbers) if p.name in self.model.names
+                p
+                for p in predicted(model, setup.found, left, numbers)
+                if p.name in self.model.names
             ),
             reasons=reasons(
                 model, setup.found, blocks[0], setup.prior[0],
@@ -704,7 +708,7 @@ class _Design:
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),
             names=self._names(found),
             chance=Chance.of(phi, found.value, setup.criterion),
-            everywhere=self._everywhere(setup, M, drawn[:, 0]),
+            everywhere=self._everywhere(setup, M, drawn[:, 0], left),
             seen=None if seen.all() else seen,
             gain=gain_of(setup, done, M, self.model.names, self.options.seed),
         )  # fmt: skip
@@ -719,13 +723,13 @@ class _Design:
         own = len(found.pool) - found.pinned
         return tuple(pins.names[i - own] if i >= own else str(next(new)) for i in found.chosen)
 
-    def _everywhere(self, setup: Setup, M: Array, random: Array) -> Everywhere | None:
-        """The error of the plan of information M (p, p), and of random plans' (n, p, p), at the
-        test poses and elsewhere."""
+    def _everywhere(self, setup: Setup, M: Array, random: Array, left: Array) -> Everywhere | None:
+        """The error at the test poses and elsewhere of the plan of information M (p, p), of random
+        plans' (n, p, p), and of what a drift leaves of the plan's (p, p)."""
         own, elsewhere = setup.target_rows, setup.elsewhere_rows
         if own is None or elsewhere is None:
             return None
-        return Everywhere.of(own, elsewhere, M, random, setup.share, self.cell.design.cap)
+        return Everywhere.of(own, elsewhere, M, random, left, setup.share, self.cell.design.cap)
 
 
 def _without(

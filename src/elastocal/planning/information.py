@@ -13,8 +13,10 @@ from scipy import linalg, sparse
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.identify import identify
+from elastocal.identification.noise_structure import VISIT, SharedEffect
 from elastocal.identification.options import Options
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
+from elastocal.identification.visit_record import visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
     stated_covariance,
@@ -139,13 +141,14 @@ def reading_covariance(model: Model, observed: Observations) -> Array:
 
 
 def pose_covariance(
-    model: Model, observed: Observations, n_poses: int, states: LoadStates
+    model: Model, observed: Observations, n_poses: int, states: LoadStates, x: Array | None = None
 ) -> Array:
     """Covariance (N, r, r) of a pose's observations, means of `[design] repeats` readings each.
 
-    Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction: deflections share their unloaded
-    reading, and what the arm does not repeat (τ, `[design] repeatability_um`) is common to the
-    markers of a visit.  A pose that is approached from both sides is visited twice.
+    Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction + J diag(s²) Jᵀ: deflections share
+    their unloaded reading; what the arm does not repeat, τ of `[design] repeatability_um` and s of
+    the joints of `[noise]`, is common to the markers of a visit.  A pose that is approached from
+    both sides is visited twice.  `x` (parameters,): where J is taken.
     """
     spec = model.cell.design
     visits = 2 if spec.motion.both_directions else 1
@@ -164,7 +167,19 @@ def pose_covariance(
         same = (force[:, None] == force[None]).all(axis=2).astype(float)
         moved = np.diag(np.arange(size) < 3).astype(float)
         covariance = covariance + spec.repeatability**2 * np.kron(same, moved)
+    if model.cell.noise.joints.any():
+        settling = settling_joints(model, observed, model.nominal if x is None else x)
+        members = np.arange(len(observed.lead)).reshape(n_poses, -1)
+        covariance = covariance + settling.product(members, settling, members).reshape(-1, r, r)
     return covariance / visits
+
+
+def settling_joints(model: Model, observed: Observations, x: Array) -> SharedEffect:
+    """What the joints' own scatter of `[noise]` puts on each visit's readings, of variance one."""
+    record = visit_record(model, observed, x)
+    assert record is not None
+    loading = record.motion * model.cell.noise.of_joints(model.chain.n_joints)
+    return SharedEffect("joints", (VISIT,), record.visit, loading, np.zeros(0))
 
 
 def readings_each(cell: Cell) -> int:
@@ -259,7 +274,7 @@ class PoseInformation:
         factors (N, r, r) of its covariance."""
         x = self.scenarios[0] if x is None else x
         observed = observe(self.rows(q, load, x), self.model.observe)
-        covariance = pose_covariance(self.model, observed, len(q), self.states)
+        covariance = pose_covariance(self.model, observed, len(q), self.states, x)
         if self.sight is not None:
             covariance = self._unread(q, load, covariance, observed.size)
         return observed, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
@@ -448,7 +463,7 @@ def measured(
         x = np.array([known.get(p.name, p.nominal) for p in whole.parameters])
         model = whole
     observed = observe(table, model.observe)
-    weights = _weights(model, observed)
+    weights = _weights(model, observed, x)
     at = model.regressor(table, x, None, observed)
     B = weights.apply(at.B)
     return Done(x, B.T @ B, B.T @ weights.apply(at.residual), len(B), note)
@@ -461,11 +476,11 @@ def next_number(labels: Iterable[str]) -> int:
     return max(numbers, default=0) + 1
 
 
-def _weights(model: Model, observed: Observations) -> Weights:
+def _weights(model: Model, observed: Observations, x: Array) -> Weights:
     """The stated noise, and with it what readings of one visit share."""
     stated = weights_for(observed, model.cell.tracker)
-    tau = model.cell.design.repeatability
-    if tau == 0 or stated.whiten is None:
+    tau, scatters = model.cell.design.repeatability, model.cell.noise.joints.any()
+    if (tau == 0 and not scatters) or stated.whiten is None:
         return stated
     inverse = sparse.linalg.inv(sparse.csc_array(stated.whiten))
     key = np.column_stack(
@@ -478,4 +493,7 @@ def _weights(model: Model, observed: Observations) -> Weights:
         shape=(observed.size, observed.size),
     )
     covariance = inverse @ inverse.T + tau**2 * sparse.kron(same @ same.T, moved)
+    if scatters:
+        Z = settling_joints(model, observed, x).columns()
+        covariance = covariance + Z @ Z.T
     return Weights(stated.kind, whitener(sparse.csr_array(covariance)), True, stated.description)

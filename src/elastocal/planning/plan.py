@@ -327,26 +327,31 @@ class Chance:
 @dataclass(frozen=True)
 class Everywhere:
     """Rms position error in m after compensation, at the test poses and over all joint ranges, of
-    the plan and of the median random plan (None where that leaves parameters open).  `share` of
-    the criterion's weight lies on the joint ranges, so that the error at the test poses is at
-    most about `cap` above the least; 0 where no such cap was asked for."""
+    the plan and of the median random plan (None where that leaves parameters open), and of the
+    plan with the drift that the cell states.  `share` of the criterion's weight lies on the joint
+    ranges, so that the error at the test poses is at most about `cap` above the least; 0 where no
+    such cap was asked for."""
 
     test_poses: float
     elsewhere: float
     random_test_poses: float | None
     random_elsewhere: float | None
+    drifting_test_poses: float
+    drifting_elsewhere: float
     share: float = 0.0
     cap: float = 0.0
 
     @classmethod
     def of(
-        cls, own: Array, elsewhere: Array, M: Array, random: Array, share: float = 0.0,
-        cap: float = 0.0,
+        cls, own: Array, elsewhere: Array, M: Array, random: Array, left: Array,
+        share: float = 0.0, cap: float = 0.0,
     ) -> Everywhere:  # fmt: skip
-        """Of R (r, p) at both, the plan's information M (p, p) and random plans' (n, p, p)."""
+        """Of R (r, p) at both, the plan's information M (p, p), random plans' (n, p, p), and
+        what a drift leaves of the plan's (p, p)."""
         chance = [float(np.median([_rms(R, m) for m in random])) for R in (own, elsewhere)]
         told = [value if np.isfinite(value) else None for value in chance]
-        return cls(_rms(own, M), _rms(elsewhere, M), told[0], told[1], share, cap)
+        drifting = _rms(own, left), _rms(elsewhere, left)
+        return cls(_rms(own, M), _rms(elsewhere, M), told[0], told[1], *drifting, share, cap)
 
 
 def _rms(R: Array, M: Array) -> float:

@@ -239,6 +239,12 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
         f"{micrometres(e.random_elsewhere)} there and {micrometres(e.random_test_poses)} at the "
         "test poses"
     )
+    noise = plan.model.cell.noise
+    if noise.drift:
+        text += (
+            f"; with the drift of {noise.drift * 1e6:.3g} µm that [noise] states "
+            f"{e.drifting_test_poses * 1e6:.4g} and {e.drifting_elsewhere * 1e6:.4g} µm"
+        )
     if e.share:
         text += f"; the joint ranges have {100 * e.share:.0f} % of the criterion's weight"
         text += f", for which ρ₀ may be {100 * e.cap:g} % above the least" if e.cap else ""
