@@ -34,7 +34,7 @@ def made(share: float) -> Setup:
 def errors(setup: Setup, chosen: np.ndarray) -> Everywhere:
     assert setup.target_rows is not None and setup.elsewhere_rows is not None
     M = setup.gathered(setup.information.blocks(Q, all_loads(Q))[:, chosen])[0]
-    return Everywhere.of(setup.target_rows, setup.elsewhere_rows, M, M[None])
+    return Everywhere.of(setup.target_rows, setup.elsewhere_rows, M, M[None], M)
 
 
 def best(setup: Setup) -> np.ndarray:
