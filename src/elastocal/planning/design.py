@@ -25,6 +25,7 @@ from elastocal.planning.exact_plan import (
     SizedPlan,
     exact_plan,
     random_information,
+    repaired,
     size_curve,
 )
 from elastocal.planning.execution import Execution, schedule
@@ -163,7 +164,7 @@ class Selection:
         pool = self.pool.take(kept)
         left = np.searchsorted(kept, np.setdiff1d(self.chosen, lost))
         problem = setup.problem(pool, shares)
-        state = stage.finished(lambda: {"chosen": exact_plan(problem, warm=left, starts=1).chosen})
+        state = stage.finished(lambda: {"chosen": repaired(problem, left)})
         chosen = state["chosen"]
         value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
         c = self.certificate

@@ -18,6 +18,7 @@ from elastocal.planning.selection import (
     TIE,
     DesignProblem,
     Exchanged,
+    balanced,
     check_enough,
     exchange,
     fitted,
@@ -54,8 +55,9 @@ def random_information(problem: DesignProblem, seed: int, n: int = DRAWN) -> Arr
 # for one seed however the work is spread or interrupted.
 
 ProblemOf = Callable[[int], DesignProblem]
-# Candidates of a group that the search looks at per pose of its share, before all of them.
-NEAR_PER_POSE = 50
+# Candidates of a group that the search looks at before all of them: so many per pose of its share,
+# of many poses fewer, but no less than NEAR_AT_LEAST where the first would be more.
+NEAR_PER_POSE, NEAR_PER_MANY, NEAR_AT_LEAST = 50, 12, 240
 # A better plan must be better by more than rounding: relative slack of what is ruled out.
 SLACK = 1e-9
 # A candidate without weight counts as this share of the smallest weight of its group: it is used
@@ -110,6 +112,7 @@ def exact_plan(
     require(starts >= 1, f"an exact plan needs at least one start, got {starts}")
     require(jobs != 0, "jobs is the number of processes, or -1 for all cores; got 0")
     check_enough(problem)
+    problem, tangent = balanced(problem, tangent)
     seeds = np.random.SeedSequence(seed).spawn(starts)
     done = load_finished(checkpoint, problem, seed, starts)
 
@@ -232,6 +235,13 @@ def _best(problem: DesignProblem, done: list[Exchanged]) -> ExactPlan:
     return ExactPlan(final.chosen, final.value, len(done), passes, values)
 
 
+def repaired(problem: DesignProblem, left: IntArray) -> IntArray:
+    """The plan `left`, sorted, brought to the shares of the problem, and no exchange betters it."""
+    problem, _ = balanced(problem, None)
+    chosen = regular_plan(problem, fitted(problem, left), np.random.default_rng(0))
+    return exchange(problem, chosen).chosen
+
+
 def restrict(problem: DesignProblem, kept: IntArray) -> DesignProblem:
     """The same problem with the candidates `kept` (k,), sorted, alone."""
     if len(kept) == problem.n_candidates:
@@ -274,7 +284,7 @@ class Prices:
         return np.flatnonzero(self.upper > (1 - SLACK) / value)
 
     def near(self, problem: DesignProblem) -> IntArray:
-        """The dearest candidates of every group, NEAR_PER_POSE for each pose of its share.
+        """The dearest candidates of every group, as many as its share asks for.
 
         The K of the KL exchange (Atkinson & Donev 1989, Applied Statistics 38, 515–526).
         """
@@ -282,7 +292,8 @@ class Prices:
         for label, share in enumerate(problem.shares):
             members = np.flatnonzero(problem.group == label)
             order = np.argsort(-self.d[members], kind="stable")
-            kept.append(members[order[: NEAR_PER_POSE * share]])
+            near = min(NEAR_PER_POSE * share, max(NEAR_PER_MANY * share, NEAR_AT_LEAST))
+            kept.append(members[order[:near]])
         return np.sort(np.concatenate(kept))
 
 

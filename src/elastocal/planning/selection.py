@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from elastocal.planning.criterion import (
     Criterion,
     Gradient,
     factorise,
+    trustworthy,
 )
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -119,10 +120,42 @@ class DesignProblem:
         return {name: value for name, value in self.__dict__.items() if name != "packed"}
 
 
+@lru_cache
 def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
     """Rows, columns (k,) of the upper triangle of (p, p), and √2 off its diagonal, else 1."""
     rows, columns = np.triu_indices(p)
     return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
+
+
+def balanced(
+    problem: DesignProblem, tangent: Gradient | None
+) -> tuple[DesignProblem, Gradient | None]:
+    """The problem, and a tangent of it, for other parameters: those whose information at even
+    weights is 1.  The same plans have the same Φ.
+
+    Where base, markers and geometry are identified together, information is conditioned so badly
+    that no update of Φ by one pose keeps its digits, and each candidate would need a new inverse.
+    Left as it is where that is not so, or where the criterion belongs to its parameters.
+    """
+    size = np.bincount(problem.group, minlength=len(problem.shares))
+    even = (problem.shares / np.maximum(size, 1))[problem.group]
+    factor = factorise(problem.information(even))
+    if trustworthy(factor) or not factor.regular.all():
+        return problem, tangent
+    T, L = factor.inverse.swapaxes(-1, -2), factor.L
+    criterion = problem.criterion.turned(T)
+    if criterion is None:
+        return problem, tangent
+    prior = factor.inverse @ problem.prior @ T
+    turned = replace(
+        problem,
+        blocks=problem.blocks @ T[:, None],
+        prior=(prior + prior.swapaxes(-1, -2)) / 2,
+        criterion=criterion,
+    )
+    if tangent is not None:
+        tangent = Gradient(tangent.value, L.swapaxes(-1, -2) @ tangent.G @ L)
+    return turned, tangent
 
 
 # How good the best plan can be at most: a lower bound on Φ from the concavity of 1/Φ.
