@@ -33,7 +33,8 @@ class DesignProblem:
     `blocks` (S, N, r, p): whitened, scaled B of candidate i under scenario s of the arm;
     M_s(w) = prior_s + Σ_i w_i B_siᵀ B_si with `prior` (S, p, p) from prior knowledge and from
     measurements already done.  `group` (N,) in 0 … L−1 and `shares` (L,) the numbers of poses.
-    `most`: how often one candidate may be measured in a plan.
+    `most`: how often one candidate may be measured in a plan.  `looks`: how many candidates an
+    exchange evaluates at most, the most promising; None: as many as may be the best.
     """
 
     blocks: Array
@@ -42,6 +43,7 @@ class DesignProblem:
     shares: IntArray
     criterion: Criterion
     most: int = 1
+    looks: int | None = None
 
     def __post_init__(self) -> None:
         S, N, _, p = self.blocks.shape
@@ -330,6 +332,8 @@ def best_addition(
     candidates, upper = candidates[order], upper[order]
     values = np.empty(0)
     best, size = below * (1 - IMPROVEMENT), FIRST
+    if problem.looks is not None and len(upper) and np.isfinite(upper[0]):
+        candidates, upper = candidates[: problem.looks], upper[: problem.looks]
     while len(values) < len(candidates) and upper[len(values)] * best > 1 - TIE:
         part = candidates[len(values) : len(values) + size]
         added = problem.criterion.after_adding(M, problem.blocks[:, part])
