@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import (
     MOST_BYTES,
@@ -300,6 +300,8 @@ def _wrong_count(header: Sequence[str], family: Family) -> str:
 
 # Reading
 
+READING = re.compile("[xyz]_|d[xyz]_|dist")  # headers of what is measured
+
 
 def read_measurements(
     path: str | Path,
@@ -321,6 +323,12 @@ def read_measurements(
     """
 
     def choose(header: Sequence[str]) -> Layout:
+        planned = {"configuration", "level", "order"} <= set(header)
+        if planned and observe not in ("plan", "targets") and not any(map(READING.match, header)):
+            raise InputError(
+                f"{path}: this is a plan, which has no readings yet; give the measurements of its "
+                f"poses (a new plan takes poses of this one by {option('keep')})"
+            )
         return layout_of(str(path), header, joint_kinds, observe)
 
     raw = read_table(path, choose, text=text)

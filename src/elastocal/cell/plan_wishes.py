@@ -216,7 +216,7 @@ class DesignSpec:
     elsewhere_cap: NonNegative | None = keyed("a number >= 0, as in 0.05", default=None)
     robust: Literal["none", "average", "worst"] = keyed(default="none")
     robust_samples: Count = keyed("a whole number >= 1", default=8)
-    candidates: Count = keyed("a whole number >= 1", default=20_000)
+    candidates: Count | None = keyed("a whole number >= 1", default=None)
     target: Positive | None = keyed("a positive number in µm", "target_um", default=None)
     test_poses: Many[TargetPose] = keyed(
         "tables, each headed [[design.test_pose]]", "test_pose", default=()

@@ -108,6 +108,12 @@ class TraceCriterion(ScenarioCriterion):
     def each_after_adding(self, M: Array, blocks: Array) -> Array:
         return np.asarray(self.variances.after_adding(M, blocks)[..., 0])
 
+    def turned(self, T: Array) -> TraceCriterion | None:
+        if type(self).each is not TraceCriterion.each:
+            return None
+        C = T.swapaxes(-1, -2) @ self.C @ T
+        return replace(self, C=(C + C.swapaxes(-1, -2)) / 2)
+
     def figure(self, value: float) -> float:
         return self.scale * float(np.sqrt(value))
 
@@ -274,6 +280,9 @@ class GCriterion(ScenarioCriterion):
 
     def each_after_adding(self, M: Array, blocks: Array) -> Array:
         return power_mean(self.variances.after_adding(M, blocks), self.order)
+
+    def turned(self, T: Array) -> GCriterion:
+        return replace(self, A=self.A @ T[:, None])
 
     def softened(self, order: float) -> GCriterion:
         return GCriterion(self.A, order)

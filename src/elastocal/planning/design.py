@@ -27,6 +27,7 @@ from elastocal.planning.exact_plan import (
     SizedPlan,
     exact_plan,
     random_information,
+    repaired,
     size_curve,
 )
 from elastocal.planning.execution import Execution, schedule
@@ -68,17 +69,20 @@ Effort = Literal["quick", "normal", "thorough", "batch"]
 @dataclass(frozen=True)
 class DesignSearch:
     """`rounds` of polishing and of poses from the continuum added to the pool; `starts` of the
-    exchange; new `points` per level and `ascents` when the continuum is searched, if it is."""
+    exchange; new `points` per level and `ascents` when the continuum is searched, if it is;
+    `candidates` where the cell asks for no number, and how many of them an exchange `looks` at."""
 
     rounds: int
     starts: int
     points: int
     ascents: int
+    candidates: int = 20_000
+    looks: int | None = None
 
 
 EFFORTS: dict[str, DesignSearch] = {
     "batch": DesignSearch(rounds=0, starts=2, points=0, ascents=0),
-    "quick": DesignSearch(rounds=0, starts=4, points=4096, ascents=2),
+    "quick": DesignSearch(rounds=0, starts=2, points=4096, ascents=2, candidates=5000, looks=64),
     "normal": DesignSearch(rounds=1, starts=10, points=16_384, ascents=4),
     "thorough": DesignSearch(rounds=3, starts=30, points=65_536, ascents=10),
 }
@@ -168,7 +172,7 @@ class Selection:
         pool = self.pool.take(kept)
         left = np.searchsorted(kept, np.setdiff1d(self.chosen, lost))
         problem = setup.problem(pool, shares)
-        state = stage.finished(lambda: {"chosen": exact_plan(problem, warm=left, starts=1).chosen})
+        state = stage.finished(lambda: {"chosen": repaired(problem, left)})
         chosen = state["chosen"]
         value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
         c = self.certificate
@@ -203,7 +207,8 @@ def select(
     first = len(pool)
     search = _Rounds(setup, searches, shares, options, checkpoint, progress)
     relaxed = search.relax(pool) if begun is None else begun.relaxed
-    chosen = search.exchange(pool, relaxed, None, 0) if begun is None else begun.plan.chosen
+    found = None if begun is None else begun.plan.chosen
+    chosen = search.exchange(pool, relaxed, None, 0, found)
     effort = EFFORTS[options.effort]
     for k in range(1, effort.rounds + 1):
         grown, chosen = search.polish(pool, chosen, k)
@@ -241,20 +246,24 @@ class _Rounds:
         return self.last[0][1]
 
     def exchange(
-        self, pool: FeasiblePool, relaxed: Relaxed | None, warm: IntArray | None, k: int
-    ) -> IntArray:
-        found = exact_plan(
+        self, pool: FeasiblePool, relaxed: Relaxed | None, warm: IntArray | None, k: int,
+        found: IntArray | None = None,
+    ) -> IntArray:  # fmt: skip
+        effort = EFFORTS[self.options.effort]
+        best = exact_plan(
             self.problem(pool),
             relaxed_weights=None if relaxed is None else relaxed.weights,
             tangent=None if relaxed is None else relaxed.tangent,
             warm=warm,
-            starts=EFFORTS[self.options.effort].starts,
+            starts=effort.starts,
             seed=self.options.seed,
             jobs=self.options.jobs,
+            looks=effort.looks,
+            found=found,
             checkpoint=self.checkpoint.stage(f"exchange{k}"),
             progress=self.progress,
         )
-        return found.chosen
+        return best.chosen
 
     def polish(self, pool: FeasiblePool, chosen: IntArray, k: int) -> tuple[FeasiblePool, IntArray]:
         """The pool with the polished poses, and the polished plan in it."""
@@ -402,6 +411,7 @@ def _warnings(lost: int, execution: Execution) -> list[str]:
 # The course of a design.
 
 MOST_POSES = 100  # that a target is sought with
+FEWER = 4  # times: starts of a size that is compared only
 
 
 def design(
@@ -436,6 +446,9 @@ class _Design:
             self.warnings.append(
                 "torques of poses that are not measured yet are computed from load and weights"
             )
+        if cell.design.candidates is None:
+            drawn = EFFORTS[options.effort].candidates
+            cell = replace(cell, design=replace(cell.design, candidates=drawn))
         self.checkpoint, self.progress = checkpoint, progress
         self.model = Model(cell, options.done.marker_names if options.done else ())
         if self.model.shrunk.any():
@@ -567,7 +580,7 @@ class _Design:
         self.progress("drawing candidates")
         drawn = draw(
             self.cell, self.chain, self.states, self.feasibility,
-            self.cell.design.candidates, self.options.seed, self.options.jobs, self.progress,
+            self.cell.design.candidates or 1, self.options.seed, self.options.jobs, self.progress,
         )  # fmt: skip
         return {
             "q": drawn.q,
@@ -613,6 +626,7 @@ class _Design:
     ) -> dict[str, NDArray]:  # fmt: skip
         """As `size_curve`: bounds NaN where there are none, `smallest` 0 where none meets; what
         was found of `smallest`, without a target of `shares` where these were among them."""
+        effort = EFFORTS[self.options.effort]
         found = size_curve(
             lambda n: setup.problem(pool, self._shares(n)),
             numbers,
@@ -621,9 +635,11 @@ class _Design:
                 max(pool.n_groups, int(self.pinned.sum()) + 1),
                 most_poses(self.cell, np.bincount(pool.group), MOST_POSES),
             ),
-            starts=EFFORTS[self.options.effort].starts,
+            # That of the size that is planned gets its other starts then.
+            starts=max(effort.starts // FEWER, 1),
             seed=self.options.seed,
             jobs=self.options.jobs,
+            looks=effort.looks,
             progress=self.progress,
         )
         n = found.smallest or 0

@@ -13,7 +13,7 @@ from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, joint_index
 from elastocal.model.manipulator import Model
-from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.feasibility import Feasibility, Struck
 from elastocal.planning.information import ALL_LOADS, LoadStates
 from elastocal.planning.setup import shares_of
 from elastocal.text import did_you_mean, listed, quoted
@@ -85,8 +85,8 @@ class Pins:
         """
         load = np.full(len(self.q), ALL_LOADS)
         group = np.zeros(len(self.q), dtype=np.int64)
-        for k, (name, q, force) in enumerate(zip(self.names, self.q, self.force, strict=True)):
-            where = f"{cell.path or cell.name}: pose {quoted(name)}, which is to be kept,"
+        for k, (label, q, force) in enumerate(zip(self.names, self.q, self.force, strict=True)):
+            where = f"{cell.path or cell.name}: pose {quoted(label)}, which is to be kept,"
             if states.chosen:
                 off = np.abs(states.forces - force).max(axis=1)
                 load[k] = int(off.argmin())
@@ -97,7 +97,9 @@ class Pins:
                 require(away.min() < LEVEL_SLACK, f"{where} is at no level of {joint}")
             for state in states.of(int(load[k])):
                 verdict = rules.check(q, states.forces[state])
-                broken = [rule for rule, n in verdict.removed_by.items() if n]
+                # That it stands near one struck out is the user's choice.
+                rules_of = zip(verdict.rules, verdict.broken[0], strict=True)
+                broken = [name for name, hit in rules_of if hit and name != Struck.name]
                 if broken:
                     raise InputError(
                         f"{where} breaks {broken[0]}; strike it ({option('strike')}), or relax the "

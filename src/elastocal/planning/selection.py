@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from elastocal.planning.criterion import (
     Criterion,
     Gradient,
     factorise,
+    trustworthy,
 )
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -32,7 +33,8 @@ class DesignProblem:
     `blocks` (S, N, r, p): whitened, scaled B of candidate i under scenario s of the arm;
     M_s(w) = prior_s + Σ_i w_i B_siᵀ B_si with `prior` (S, p, p) from prior knowledge and from
     measurements already done.  `group` (N,) in 0 … L−1 and `shares` (L,) the numbers of poses.
-    `most`: how often one candidate may be measured in a plan.
+    `most`: how often one candidate may be measured in a plan.  `looks`: how many candidates an
+    exchange evaluates at most, the most promising; None: as many as may be the best.
     """
 
     blocks: Array
@@ -41,6 +43,7 @@ class DesignProblem:
     shares: IntArray
     criterion: Criterion
     most: int = 1
+    looks: int | None = None
 
     def __post_init__(self) -> None:
         S, N, _, p = self.blocks.shape
@@ -119,10 +122,42 @@ class DesignProblem:
         return {name: value for name, value in self.__dict__.items() if name != "packed"}
 
 
+@lru_cache
 def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
     """Rows, columns (k,) of the upper triangle of (p, p), and √2 off its diagonal, else 1."""
     rows, columns = np.triu_indices(p)
     return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
+
+
+def balanced(
+    problem: DesignProblem, tangent: Gradient | None
+) -> tuple[DesignProblem, Gradient | None]:
+    """The problem, and a tangent of it, for other parameters: those whose information at even
+    weights is 1.  The same plans have the same Φ.
+
+    Where base, markers and geometry are identified together, information is conditioned so badly
+    that no update of Φ by one pose keeps its digits, and each candidate would need a new inverse.
+    Left as it is where that is not so, or where the criterion belongs to its parameters.
+    """
+    size = np.bincount(problem.group, minlength=len(problem.shares))
+    even = (problem.shares / np.maximum(size, 1))[problem.group]
+    factor = factorise(problem.information(even))
+    if trustworthy(factor) or not factor.regular.all():
+        return problem, tangent
+    T, L = factor.inverse.swapaxes(-1, -2), factor.L
+    criterion = problem.criterion.turned(T)
+    if criterion is None:
+        return problem, tangent
+    prior = factor.inverse @ problem.prior @ T
+    turned = replace(
+        problem,
+        blocks=problem.blocks @ T[:, None],
+        prior=(prior + prior.swapaxes(-1, -2)) / 2,
+        criterion=criterion,
+    )
+    if tangent is not None:
+        tangent = Gradient(tangent.value, L.swapaxes(-1, -2) @ tangent.G @ L)
+    return turned, tangent
 
 
 # How good the best plan can be at most: a lower bound on Φ from the concavity of 1/Φ.
@@ -297,6 +332,8 @@ def best_addition(
     candidates, upper = candidates[order], upper[order]
     values = np.empty(0)
     best, size = below * (1 - IMPROVEMENT), FIRST
+    if problem.looks is not None and len(upper) and np.isfinite(upper[0]):
+        candidates, upper = candidates[: problem.looks], upper[: problem.looks]
     while len(values) < len(candidates) and upper[len(values)] * best > 1 - TIE:
         part = candidates[len(values) : len(values) + size]
         added = problem.criterion.after_adding(M, problem.blocks[:, part])

@@ -80,7 +80,7 @@ def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
     short = np.flatnonzero(available < shares)
     if not len(short):
         return
-    k, drawn = int(short[0]), cell.design.candidates
+    k, drawn = int(short[0]), cell.design.candidates or int(available.sum())
     level = f" takes {shares[k]} at level {k + 1} of {next(iter(cell.design.levels), '')}"
     where = f"{cell.path or cell.name}: a plan of {int(shares.sum())} poses"
     where += level if len(shares) > 1 else ""

@@ -135,6 +135,7 @@ def stop_rows(plan: Plan) -> ShownTable:
 
 
 CLOSE = 0.95  # efficiency from which a plan is called near the best
+VAIN = 0.1  # below which the bound says nothing: so few poses cannot be spread as its weights are
 
 
 def plan_lead(plan: Plan) -> str:
@@ -155,7 +156,7 @@ def plan_headline(plan: Plan) -> str:
     else:
         text = f"{n} reach {plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     found = plan.certificate.efficiency_pool
-    if found is None:
+    if found is None or found < VAIN:
         return f"{text}; how far that is from the best, no bound says."
     away = 100 * (1 - found)
     text += "; no plan from these candidates is "
@@ -296,11 +297,17 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
     lines = [
         (
             "Certificate",
-            f"certified on the pool: efficiency {c.efficiency_pool:.4f} against the best plan "
+            f"certified on the pool: efficiency {_share(c.efficiency_pool)} against the best plan "
             f"of these shares from {c.pool} candidates, each in it once"
             f"{told.replace(' )', ')')}.",
         )
     ]
+    if c.efficiency_pool < VAIN:
+        text = (
+            "the bound spreads weights over many candidates, which so few poses cannot follow: "
+            "they leave parameters to what was known before; it says nothing here"
+        )
+        return [*lines, ("Certificate", f"{text}.")]
     if c.efficiency_continuum is not None:
         lines.append(
             (
@@ -311,6 +318,10 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
             )
         )
     return lines
+
+
+def _share(value: float) -> str:
+    return f"{value:.4f}" if value >= VAIN else f"{value:.1g}"
 
 
 def _execution_line(plan: Plan) -> tuple[str, str]:
