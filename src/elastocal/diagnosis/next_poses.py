@@ -160,11 +160,7 @@ def next_poses(
     gain = plan.gain
     assert gain is not None  # the criterion has test poses
     reached = math.inf if predicted is None else max(gain.sure, predicted.ci95[1])
-    verdict: NextVerdict = "measure"
-    if required is not None and reached <= required:
-        verdict = "enough"
-    elif np.isfinite(gain.before) and gain.after > (1 - PAYS) * gain.before:
-        verdict = "no_gain"
+    verdict = verdict_of(gain, reached, required)
     likeliest = sorted(chances.items(), key=lambda item: -item[1])
     return NextPoses(
         verdict=verdict,
@@ -176,6 +172,14 @@ def next_poses(
         found=() if why is None else why.effects,
         doubts=tuple((*key, p) for key, p in likeliest),
     )
+
+
+def verdict_of(gain: Gain, reached: float, required: float | None) -> NextVerdict:
+    """Whether to measure a batch with this gain, where `reached` is kept and `required` asked."""
+    if required is not None and reached <= required:
+        return "enough"
+    pays = not np.isfinite(gain.before) or gain.after < (1 - PAYS) * gain.before
+    return "measure" if pays else "no_gain"
 
 
 def with_effects_of(model: Model, why: Diagnosis) -> Model:

@@ -61,6 +61,8 @@ def in_doubt(
         of_each = Counter(name for name, _ in places)
         probability = {key: SOMETHING / (len(of_each) * of_each[key[0]]) for key in places}
     places = [key for key in places if probability.get(key, 0.0) > 0]
+    if not places:
+        return model, known
     whole = model.with_effects((*model.cell.model.effects, *(EffectChoice(*key) for key in places)))
     every = np.arange(len(whole.parameters))
     information = PoseInformation(whole, states, whole.nominal[None], every, np.ones(len(every)))
