@@ -117,6 +117,10 @@ def design(
     picture: Annotated[
         Path | None, typer.Option(help="Picture of the poses to write (PNG, SVG).")
     ] = None,
+    cell_out: Annotated[
+        Path | None,
+        typer.Option(help="Cell file to write, with what [design.choose] has chosen."),
+    ] = None,
     report: ReportFile = None,
     jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
     seed: Seed = 0,
@@ -132,7 +136,7 @@ def design(
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
     from elastocal.files import together
-    from elastocal.planning.design import Checkpoint, key_of
+    from elastocal.planning.checkpoint import Checkpoint, key_of
     from elastocal.planning.design import design as run
     from elastocal.verbs import design_request
 
@@ -140,7 +144,7 @@ def design(
     require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
     programs = program or []
     _check_suffixes(programs, picture)
-    written = check_outputs(output, summary, *programs, picture, report)
+    written = check_outputs(output, summary, *programs, picture, report, cell_out)
     asked: dict[str, Any] = {
         "poses": poses,
         "criterion": criterion,
@@ -162,6 +166,10 @@ def design(
             curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
         )  # fmt: skip
         _check_programs(wanted, programs)
+        require(
+            cell_out is None or wanted.design.choose is not None,
+            f"--cell-out {cell_out}: nothing is chosen; state [design.choose] in {cell}",
+        )
         files = [p for p in (cell, augment, knowledge, *files_of(wanted)) if p is not None]
         check_apart(written, files)
         told = asked | {"fix": fix, "curve": curve, "effort": effort}
@@ -179,6 +187,12 @@ def design(
         interrupts.check()
         with together(written):
             _write_all(plan, output, programs, picture)
+            if cell_out is not None:
+                from elastocal.diagnosis.diagnose import write_extended_cell
+
+                write_extended_cell(
+                    cell, cell_out, (), keys=plan.chosen.keys if plan.chosen else {}
+                )
             if report is not None:
                 from elastocal.report.page import write_page
 

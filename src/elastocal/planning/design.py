@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import shutil
-import zipfile
-import zlib
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal import __version__
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.files import atomic_write_bytes, open_input
+from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
+from elastocal.planning.checkpoint import Checkpoint, Stage, State
+from elastocal.planning.choices import Choice
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.drift import Alias
 from elastocal.planning.exact_plan import (
@@ -61,7 +52,7 @@ from elastocal.planning.setup import (
     set_up,
     shares_of,
 )
-from elastocal.planning.test_poses import check_cell, everywhere, test_poses
+from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
@@ -118,104 +109,6 @@ class DesignOptions:
         require(
             all(n >= 1 for n in self.curve), f"a curve takes numbers of poses, found {self.curve}"
         )
-
-
-# Where a design stands, on disk: an interrupted run goes on where it was.
-
-State = Mapping[str, NDArray]
-
-
-def key_of(files: Iterable[Path], **options: object) -> str:
-    """A hash of everything a design depends on: input files, options, the version."""
-    digest = hashlib.sha256(__version__.encode())
-    for path in files:
-        with open_input(path, "input file") as handle:
-            digest.update(path.name.encode(errors="surrogateescape") + b"\0")
-            digest.update(hashlib.file_digest(handle, "sha256").digest())  # type: ignore[arg-type]
-    digest.update(json.dumps(options, sort_keys=True, default=str).encode())
-    return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class Stage:
-    """What one stage of a design has finished so far; nowhere kept if `path` is None.
-
-    `check` is called before anything is kept: it raises where the work was interrupted.
-    """
-
-    path: Path | None
-    check: Callable[[], None] = lambda: None
-
-    def load(self) -> dict[str, NDArray] | None:
-        """What was saved last, None if nothing (readable) was."""
-        if self.path is None or not self.path.is_file():
-            return None
-        try:
-            with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as saved:
-                return {name: saved[name] for name in saved.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-            return None
-
-    def finished(self, make: Callable[[], State]) -> State:
-        """What was saved, or else what `make` returns, saved."""
-        saved = self.load()
-        if saved is not None:
-            return saved
-        self.save(made := make())
-        return made
-
-    def save(self, state: State) -> None:
-        """Keep `state`, whole or not at all."""
-        self.check()
-        if self.path is None:
-            return
-        text = io.BytesIO()
-        np.savez(text, allow_pickle=False, **{k: np.asarray(v) for k, v in state.items()})
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            atomic_write_bytes(self.path, text.getvalue())
-        except InputError:
-            if self.path.parent.is_dir():
-                raise
-            # Another run of the same design has ended, and cleared the folder that both used.
-            self.save(state)
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """The stages of one design, in a folder beside its output; nowhere if `folder` is None."""
-
-    folder: Path | None = None
-    check: Callable[[], None] = lambda: None
-
-    @classmethod
-    def beside(cls, output: Path, key: str, check: Callable[[], None] = lambda: None) -> Checkpoint:
-        """In the folder `OUTPUT.resume`, apart from what other input or options left there.
-
-        Nothing is written, nor anything of another design thrown away, before a stage is saved.
-        """
-        return cls(output.with_name(output.name + ".resume") / key[:32], check)
-
-    @property
-    def begun(self) -> bool:
-        """Is there anything to go on from?"""
-        return self.folder is not None and any(self.folder.glob("*.npz"))
-
-    def stage(self, name: str) -> Stage:
-        path = None if self.folder is None else self.folder / f"{name}.npz"
-        return Stage(path, self.check)
-
-    def drop(self) -> None:
-        """This design ends without a plan: nothing to resume, but perhaps of another one."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            with suppress(OSError):
-                self.folder.parent.rmdir()
-
-    def clear(self) -> None:
-        """The output is written: nothing to resume, whatever else was begun for it."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder.parent, ignore_errors=True)
 
 
 # Choosing the poses: relaxation, exchange, polish, and new candidates from the continuum.
@@ -481,15 +374,23 @@ def design(
     InsufficientDataError where no pose is feasible, or a parameter that the criterion needs cannot
     be seen.
     """
-    return _Design(cell, options or DesignOptions(), checkpoint or Checkpoint(), progress).run()
+    rest = options or DesignOptions(), checkpoint or Checkpoint(), progress
+    whole = _Design(cell, *rest)
+    if cell.design.choose is None:
+        return whole.run()
+    targets, region = whole.targets()
+    known = Known(whole.options.fixed, whole.options.prior)
+    chosen = Choice(whole.model, targets, region, known, rest[0].seed, progress).best()
+    return replace(_Design(chosen.applied(cell), *rest, whole.model).run(), chosen=chosen)
 
 
 class _Design:
     """The course of a design; what each step needs of the steps before it."""
 
     def __init__(
-        self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
-    ) -> None:
+        self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress,
+        work: Model | None = None,
+    ) -> None:  # fmt: skip
         self.warnings = list(options.notes)
         if cell.model.torque == "measured":
             cell = replace(cell, model=replace(cell.model, torque="computed"))
@@ -501,6 +402,7 @@ class _Design:
         if self.model.shrunk.any():
             self.model, options = self._without_functions(options)
         self.model, self.options = self._without_conditions(options)
+        self.work = work or self.model
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
@@ -547,13 +449,7 @@ class _Design:
         shares = shares_of(self.cell)
         planned = [shares_of(self.cell, n) for n in options.curve]
         planned += [shares] if self.cell.design.target is None else []
-        # At the test poses the arm works, and the tracker need not see it.
-        workspace = replace(self.cell.workspace, visibility=None, load=None)
-        at_work = Feasibility(replace(self.cell, workspace=workspace), self.chain)
-        targets = test_poses(self.cell, self.chain, at_work, options.seed)
-        region = None
-        if "test_poses" in CRITERIA[self.cell.design.criterion].needs:
-            region = everywhere(self.cell, self.chain, at_work, options.seed)
+        targets, region = self.targets()
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
@@ -575,6 +471,7 @@ class _Design:
             options.seed,
             region,
             self.feasibility.seen if self.feasibility.partial else None,
+            self.work,
         )
         self.warnings += setup.warnings
         pool = setup.pool(q, load, group)
@@ -584,6 +481,17 @@ class _Design:
         progress("random plans beside it")
         drawn = random_plans(setup.problem(pool, shares), options.seed)
         return self._plan(setup, found, shares, counts, targets.source, curve, done, drawn)
+
+    def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
+        """The test poses of the cell as it stands, and the rest of the joint ranges."""
+        cell, seed = self.work.cell, self.options.seed
+        # There the arm works, and the tracker need not see it.
+        workspace = replace(cell.workspace, visibility=None, load=None)
+        at_work = Feasibility(replace(cell, workspace=workspace), self.chain)
+        targets = test_poses(cell, self.chain, at_work, seed)
+        if "test_poses" not in CRITERIA[cell.design.criterion].needs:
+            return targets, None
+        return targets, everywhere(cell, self.chain, at_work, seed)
 
     def _candidates(self) -> tuple[Array, IntArray, IntArray, CandidateCounts]:
         state = self.checkpoint.stage("candidates").finished(self._drawn)

@@ -15,6 +15,7 @@ from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
+from elastocal.planning.choices import Chosen
 from elastocal.planning.criterion import Criterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
@@ -387,6 +388,7 @@ class Plan(Result):
         chance: What as many random poses would reach.
         everywhere: The error at the test poses and over all joint ranges, in m.
         seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
+        chosen: What was chosen besides the poses, where [design.choose] asks for it.
 
     Examples:
         >>> plan = ec.design(
@@ -425,6 +427,7 @@ class Plan(Result):
     chance: Chance | None = None
     everywhere: Everywhere | None = None
     seen: BoolArray | None = None
+    chosen: Chosen | None = None
 
     def __repr__(self) -> str:
         sure = self.certificate.efficiency_pool
@@ -515,6 +518,7 @@ class Plan(Result):
             },
             "random_plans": None if self.chance is None else asdict(self.chance),
             "everywhere": None if self.everywhere is None else asdict(self.everywhere),
+            "chosen": None if self.chosen is None else self.chosen.to_json(),
             "drift": None if self.execution.drift is None else asdict(self.execution.drift),
             "predicted": [
                 {

@@ -187,11 +187,13 @@ def set_up(
     seed: int,
     region: TargetPoses | None = None,
     sight: Sight | None = None,
+    work: Model | None = None,
 ) -> Setup:
     """The parameters that the candidates q (N, n) show, and the criterion on them.
 
     `region`: poses all over the joint ranges, which count for the criterion with the share
     `[design] elsewhere`.  `sight` as of `PoseInformation`.
+    `work`: the model at the test poses, where its tool is not the one to measure with.
 
     Raises InsufficientDataError where no pose shows a parameter that the criterion needs, named
     with what it is combined with; InputError for unknown names.
@@ -217,7 +219,9 @@ def set_up(
     if "test_poses" in criterion_named(spec.criterion).needs:
         T = len(targets.q)
         both = targets if region is None else joined(targets, region, spec.elsewhere)
-        rows = np.stack([prediction_rows(information, both, x) for x in scenarios])
+        at_work = information if work is None else replace(information, model=work)
+        moved = at_work.model.nominal - model.nominal
+        rows = np.stack([prediction_rows(at_work, both, x + moved) for x in scenarios])
         if region is not None:
             elsewhere = _rms_rows(model, rows[:1, T:], region.weight, found)
         if not spec.elsewhere:
