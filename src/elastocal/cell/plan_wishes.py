@@ -176,9 +176,8 @@ class Freedom:
     loads: Count | None = keyed("a whole number >= 1", default=None)
 
     def __post_init__(self) -> None:
-        boxes = {f"markers_m.{name}": box for name, box in self.markers.items()}
-        boxes |= {"load_point_m": self.load_point, "tracker_m": self.tracker}
-        for name, box in boxes.items():
+        boxes = [(f"markers_m.{name}", box) for name, box in self.markers.items()]
+        for name, box in (*boxes, ("load_point_m", self.load_point), ("tracker_m", self.tracker)):
             require(
                 box is None or bool((box[0] <= box[1]).all()),
                 f"{header(('design', 'choose'))} {name} takes the lower corner and then the upper; "
