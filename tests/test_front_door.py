@@ -323,7 +323,18 @@ OF_FILES = {
     "cell_out",
     "truth",
 }
-OF_TEXT = {"json", "quiet", "help", "set", "no_noise", "target", "partial", "poses", "fix", "details"}
+OF_TEXT = {
+    "json",
+    "quiet",
+    "help",
+    "set",
+    "no_noise",
+    "target",
+    "partial",
+    "poses",
+    "fix",
+    "details",
+}
 OF_A_TABLE = {"table", "grid", "box", "rotation"}
 
 

@@ -159,6 +159,33 @@ class Motion:
         return {"degrees": any(degrees)}
 
 
+Box = Annotated[Array, matrix(2, 3)]
+BOX = "two corners in m, as in [[0.1, -0.2, 0.1], [0.3, 0.2, 0.3]]"
+
+
+@record
+class Freedom:
+    """What may still be chosen before measuring: boxes (2, 3) m, lower and upper corner, for
+    `markers` by name and the `load_point` (flange frame) and for the `tracker` (data's frame), and
+    how many of the design's `loads` that are not zero will hang."""
+
+    markers: dict[str, Box] = keyed(
+        f"per marker {BOX}", "markers_m", form=dict[str, Box], default_factory=dict
+    )
+    load_point: Box | None = keyed(BOX, "load_point_m", default=None)
+    tracker: Box | None = keyed(BOX, "tracker_m", default=None)
+    loads: Count | None = keyed("a whole number >= 1", default=None)
+
+    def __post_init__(self) -> None:
+        boxes = [(f"markers_m.{name}", box) for name, box in self.markers.items()]
+        for name, box in (*boxes, ("load_point_m", self.load_point), ("tracker_m", self.tracker)):
+            require(
+                box is None or bool((box[0] <= box[1]).all()),
+                f"{header(('design', 'choose'))} {name} takes the lower corner and then the upper; "
+                "swap or correct them",
+            )
+
+
 class LevelsTable(Table):
     """One joint's levels under a key such as joint2_deg, and how many poses each gets."""
 
@@ -224,6 +251,7 @@ class DesignSpec:
     test_path: TargetPath | None = keyed("a table headed [design.test_path]", default=None)
     test_box: TargetBox | None = keyed("a table headed [design.test_box]", default=None)
     motion: Motion = keyed("a table headed [design.motion]", default_factory=Motion)
+    choose: Freedom | None = keyed("a table headed [design.choose]", default=None)
 
     def __post_init__(self) -> None:
         joints = " and ".join(self.levels)

@@ -153,6 +153,8 @@ class Cell:
             f"{listed(self.tool.markers) or 'none'}; ask for fewer",
         )
         self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
+        freedom = self.design.choose
+        self._check_markers(("design", "choose", "markers_m"), freedom.markers if freedom else ())
         require(
             not self.workspace.urdf_geometry or self.robot.urdf is not None,
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '

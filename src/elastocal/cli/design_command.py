@@ -137,6 +137,10 @@ def design(
     picture: Annotated[
         Path | None, typer.Option(help="Picture of the poses to write (PNG, SVG).")
     ] = None,
+    cell_out: Annotated[
+        Path | None,
+        typer.Option(help="Cell file to write, with what [design.choose] has chosen."),
+    ] = None,
     report: ReportFile = None,
     jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
     seed: Seed = 0,
@@ -161,7 +165,7 @@ def design(
     require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
     programs = program or []
     _check_suffixes(programs, picture)
-    written = check_outputs(output, summary, *programs, picture, report)
+    written = check_outputs(output, summary, *programs, picture, report, cell_out)
     asked: dict[str, Any] = {
         "poses": poses,
         "criterion": criterion,
@@ -184,6 +188,10 @@ def design(
             keep=keep, strike=strike, curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
         )  # fmt: skip
         _check_programs(wanted, programs)
+        require(
+            cell_out is None or wanted.design.choose is not None,
+            f"--cell-out {cell_out}: nothing is chosen; state [design.choose] in {cell}",
+        )
         pinned = [plan_and_names(text)[0] for text in (keep, strike) if text]
         given = (cell, augment, knowledge, *pinned, *files_of(wanted))
         files = [p for p in given if p is not None]
@@ -204,6 +212,12 @@ def design(
         interrupts.check()
         with together(written):
             _write_all(plan, output, programs, picture)
+            if cell_out is not None:
+                from elastocal.diagnosis.diagnose import write_extended_cell
+
+                write_extended_cell(
+                    cell, cell_out, (), keys=plan.chosen.keys if plan.chosen else {}
+                )
             if report is not None:
                 from elastocal.report.page import write_page
 

@@ -74,6 +74,7 @@ def write_extended_cell(
     target: str | Path,
     found: Sequence[FoundEffect],
     model_keys: Mapping[str, str] | None = None,
+    keys: Mapping[str, Any] | None = None,
 ) -> Cell:
     """Write the cell file `source` to `target` with the effects `found` switched on; read it back.
 
@@ -81,8 +82,9 @@ def write_extended_cell(
     `[model.nominal.settings]`, the sizes of its parameters, where they were estimated,
     `[model.nominal.sizes]`.  Relative paths are rewritten so that they lead from `target`'s folder
     to the same files; a cell without a name keeps the one that its old file gave it.
-    `model_keys` join [model] as they are.  Comments are not carried over.  Without effects the
-    model is the one that was read.
+    `model_keys` join [model] as they are; with `keys`, which join the whole file by table, nothing
+    is left to be chosen for a plan.  Comments are not carried over.  Without effects the model is
+    the one that was read.
 
     Raises InputError where `source` is no valid cell file or `target` cannot be written.
     """
@@ -93,11 +95,23 @@ def write_extended_cell(
     if found:
         _switch_on(data.setdefault("model", {}), found)
         data["model"] |= dict(model_keys or {})
+    if keys:
+        data.get("design", {}).pop("choose", None)
+        _join(data, keys)
     with atomic_writer(target) as handle:
         handle.write(tomli_w.dumps(data))
         handle.flush()
         # Read before it appears: a cell that cannot be read is not left behind.
         return replace(read_cell(handle.name), path=target)
+
+
+def _join(data: dict[str, Any], keys: Mapping[str, Any]) -> None:
+    """`keys` into `data`, table by table."""
+    for name, value in keys.items():
+        if isinstance(value, Mapping):
+            _join(data.setdefault(name, {}), value)
+        else:
+            data[name] = value
 
 
 def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:

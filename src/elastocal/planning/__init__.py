@@ -8,13 +8,14 @@ ROOMS = {
         "rotation_to support touches"
     ),
     "candidates": "Candidates JointSpace draw feasible joint_space sobol",
+    "checkpoint": "Checkpoint Stage key_of",
+    "choices": "Choice Chosen",
     "collision": "Collisions Kinematics MotionBound StaticTorque arm_configuration arm_model",
     "criteria": (
         "DeterminantCriterion GCriterion SpectralCriterion TraceCriterion criterion_named "
         "make_criterion register"
     ),
     "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
-    "checkpoint": "Checkpoint Stage key_of",
     "design": "DesignOptions DesignSearch Effort Selection ordered",
     "doubts": "in_doubt missing usual_sizes",
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",

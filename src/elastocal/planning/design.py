@@ -19,6 +19,7 @@ from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.checkpoint import Checkpoint, Stage, State
+from elastocal.planning.choices import Choice
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
 from elastocal.planning.drift import Alias, left_by_drift
@@ -57,7 +58,7 @@ from elastocal.planning.setup import (
     set_up,
     shares_of,
 )
-from elastocal.planning.test_poses import check_cell, everywhere, test_poses
+from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
@@ -431,15 +432,23 @@ def design(
     InsufficientDataError where no pose is feasible, or a parameter that the criterion needs cannot
     be seen.
     """
-    return _Design(cell, options or DesignOptions(), checkpoint or Checkpoint(), progress).run()
+    rest = options or DesignOptions(), checkpoint or Checkpoint(), progress
+    whole = _Design(cell, *rest)
+    if cell.design.choose is None:
+        return whole.run()
+    targets, region = whole.targets()
+    known = Known(whole.options.fixed, whole.options.prior)
+    chosen = Choice(whole.model, targets, region, known, rest[0].seed, progress).best()
+    return replace(_Design(chosen.applied(cell), *rest, whole.model).run(), chosen=chosen)
 
 
 class _Design:
     """The course of a design; what each step needs of the steps before it."""
 
     def __init__(
-        self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
-    ) -> None:
+        self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress,
+        work: Model | None = None,
+    ) -> None:  # fmt: skip
         self.warnings = list(options.notes)
         if cell.model.torque == "measured":
             cell = replace(cell, model=replace(cell.model, torque="computed"))
@@ -454,6 +463,7 @@ class _Design:
         if self.model.shrunk.any():
             self.model, options = self._without_functions(options)
         self.model, self.options = self._without_conditions(options)
+        self.work = work or self.model
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
@@ -505,13 +515,7 @@ class _Design:
         shares = self._shares()
         planned = [self._shares(n) for n in options.curve]
         planned += [shares] if self.cell.design.target is None else []
-        # At the test poses the arm works, and the tracker need not see it.
-        workspace = replace(self.cell.workspace, visibility=None, load=None)
-        at_work = Feasibility(replace(self.cell, workspace=workspace), self.chain)
-        targets = test_poses(self.cell, self.chain, at_work, options.seed)
-        region = None
-        if "test_poses" in CRITERIA[self.cell.design.criterion].needs:
-            region = everywhere(self.cell, self.chain, at_work, options.seed)
+        targets, region = self.targets()
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
@@ -535,6 +539,7 @@ class _Design:
             options.seed,
             region,
             self.feasibility.seen if self.feasibility.partial else None,
+            model if self.work is self.model else self.work.with_effects(model.cell.model.effects),
         )
         self.warnings += setup.warnings
         pool, pinned = setup.pool(q, load, group), None
@@ -567,6 +572,17 @@ class _Design:
             f"{' with their shares of the levels' if len(shares) > 1 else ''}; ask for more poses",
         )
         return shares
+
+    def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
+        """The test poses of the cell as it stands, and the rest of the joint ranges."""
+        cell, seed = self.work.cell, self.options.seed
+        # There the arm works, and the tracker need not see it.
+        workspace = replace(cell.workspace, visibility=None, load=None)
+        at_work = Feasibility(replace(cell, workspace=workspace), self.chain)
+        targets = test_poses(cell, self.chain, at_work, seed)
+        if "test_poses" not in CRITERIA[cell.design.criterion].needs:
+            return targets, None
+        return targets, everywhere(cell, self.chain, at_work, seed)
 
     def _candidates(self) -> tuple[Array, IntArray, IntArray, CandidateCounts]:
         state = self.checkpoint.stage("candidates").finished(self._drawn)

@@ -252,7 +252,9 @@ class PoseInformation:
         those in which a pose is not measured."""
         markers, forces = len(self.model.cell.tool.markers), self.states.forces
         found = np.ones((len(q), len(forces), markers), dtype=bool)
-        for state, force in enumerate(forces) if self.sight is not None else ():
+        if self.sight is None:
+            return found
+        for state, force in enumerate(forces):
             rows = np.flatnonzero((load == ALL_LOADS) | (load == state))
             found[rows, state] = self.sight(q[rows], force)
         if not self.states.observed.all():  # a difference takes both of its readings

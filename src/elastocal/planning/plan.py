@@ -15,6 +15,7 @@ from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
+from elastocal.planning.choices import Chosen
 from elastocal.planning.criterion import Criterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
@@ -443,6 +444,7 @@ class Plan(Result):
         seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
         names: Of the configurations, where poses of an earlier plan were kept.
         gain: What the plan adds to measurements done, where it does.
+        chosen: What was chosen besides the poses, where [design.choose] asks for it.
 
     Examples:
         >>> plan = ec.design(
@@ -483,6 +485,7 @@ class Plan(Result):
     seen: BoolArray | None = None
     names: tuple[str, ...] = ()
     gain: Gain | None = None
+    chosen: Chosen | None = None
 
     def __repr__(self) -> str:
         sure = self.certificate.efficiency_pool
@@ -574,6 +577,7 @@ class Plan(Result):
             "random_plans": None if self.chance is None else asdict(self.chance),
             "everywhere": None if self.everywhere is None else asdict(self.everywhere),
             "gain": None if self.gain is None else asdict(self.gain),
+            "chosen": None if self.chosen is None else self.chosen.to_json(),
             "drift": None if self.execution.drift is None else asdict(self.execution.drift),
             "predicted": [
                 {

@@ -201,11 +201,13 @@ def set_up(
     seed: int,
     region: TargetPoses | None = None,
     sight: Sight | None = None,
+    work: Model | None = None,
 ) -> Setup:
     """The parameters that the candidates q (N, n) show, and the criterion on them.
 
     `region`: poses all over the joint ranges, which count for the criterion with the share
     `[design] elsewhere`.  `sight` as of `PoseInformation`.
+    `work`: the model at the test poses, where its tool is not the one to measure with.
 
     Raises InsufficientDataError where no pose shows a parameter that the criterion needs, named
     with what it is combined with; InputError for unknown names.
@@ -231,7 +233,9 @@ def set_up(
     if "test_poses" in criterion_named(spec.criterion).needs:
         T, share = len(targets.q), spec.elsewhere or 0.0
         both = targets if region is None else joined(targets, region, share)
-        rows = np.stack([prediction_rows(information, both, x) for x in scenarios])
+        at_work = information if work is None else replace(information, model=work)
+        moved = at_work.model.nominal - model.nominal
+        rows = np.stack([prediction_rows(at_work, both, x + moved) for x in scenarios])
         A = on_kept(model, rows[:, :T], found)
         if region is not None:
             # None where no plan could make the position at all of them certain.

@@ -205,7 +205,8 @@ def plan_steps(plan: Plan) -> list[str]:
 
 def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     """What the plan is worth, as (label, sentence)."""
-    lines = [_criterion_line(plan), *_everywhere_lines(plan), *_chance_lines(plan)]
+    lines = [*_chosen_lines(plan), _criterion_line(plan)]
+    lines += [*_everywhere_lines(plan), *_chance_lines(plan)]
     lines.append(_candidate_line(plan))
     lines += _certificate_lines(plan)
     lines += [_execution_line(plan), *_drift_lines(plan)]
@@ -213,6 +214,31 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
         text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
         lines.append(("Polish", f"{text} candidates."))
     return lines + [("Warning", printable(text)) for text in plan.warnings]
+
+
+def _chosen_lines(plan: Plan) -> list[tuple[str, str]]:
+    """What was chosen besides the poses, and what it is worth."""
+    c = plan.chosen
+    if c is None:
+        return []
+
+    def at(place: Any) -> str:
+        return f"[{', '.join(f'{v:.4g}' for v in place)}]"
+
+    told = [
+        f"{printable(name)} at {at(after)} m instead of {at(before)}"
+        for name, (before, after) in c.places.items()
+    ]
+    if c.loads is not None:
+        told.append(f"loads {', '.join(at(load) for load in c.loads)} N")
+    stood = "no plan" if c.before is None else f"{c.before:.4g}"
+    seen = "none" if c.share[0] is None else f"{100 * c.share[0]:.1f} %"
+    worth = (
+        f"the best that any plan can reach goes from {stood} to {c.after:.4g} {c.unit}".rstrip()
+        + f" (relaxed, {c.candidates} candidates each), feasible poses from {seen} to "
+        f"{100 * c.share[1]:.1f} %"
+    )
+    return [("Chosen", f"{'; '.join(told)}."), ("Chosen", f"{worth}.")]
 
 
 def _criterion_line(plan: Plan) -> tuple[str, str]:
