@@ -374,5 +374,8 @@ def uncertainty_budget(
     if table is not None:
         own, left = mean_squares(arm, fit.model.regressor(table, fit.x).B, size)
         at = table.source
-    squares = (own, left, parts.get("visits", 0.0), parts.get("readings", 0.0), lack)
-    return UncertaintyBudget(*(float(np.sqrt(v)) for v in squares), at)
+    visits, readings = parts.get("visits", 0.0), parts.get("readings", 0.0)
+    parameters, open_, shared, single, beyond = np.sqrt(
+        [own, left, visits, readings, lack]
+    ).tolist()
+    return UncertaintyBudget(parameters, open_, shared, single, beyond, at)
