@@ -40,19 +40,18 @@ class Covariance:
         return np.where(self.dof > 0, np.sqrt(np.diag(self.matrix)), np.inf)
 
     def dof_of(self, rows: Array) -> Array:
-        """Degrees of freedom (n,) of the mean variance of the combinations rows (n, k, p).
+        """Degrees of freedom (n,) of `variance_of` the combinations rows (n, k, p).
 
         Satterthwaite's 2 v²/var(v̂): what a typical parameter has, and what models differ by.
         """
-
-        def mean(matrix: Array) -> Array:
-            return np.asarray(np.einsum("nkp,pq,nkq->n", rows, matrix, rows, optimize=True))
-
         typical = float(np.median(self.dof)) if len(self.dof) else np.inf
         if not self.among:
             return np.full(len(rows), typical)
-        v = np.maximum(mean(self.matrix), 1e-300)
-        between = sum((w * (mean(matrix) - v) ** 2 for w, matrix in self.among), np.zeros(len(v)))
+        v = np.maximum(variance_of(rows, self.matrix), 1e-300)
+        between = sum(
+            (w * (variance_of(rows, matrix) - v) ** 2 for w, matrix in self.among),
+            np.zeros(len(v)),
+        )
         return np.asarray(1 / (1 / max(typical, 1e-300) + between / (2 * v**2)))
 
     def interval(self, x: Array, level: float = 0.95) -> Array:
@@ -67,6 +66,11 @@ class Covariance:
         )
         half = t_quantile(level, self.dof) * self.std
         return np.column_stack([x - half, x + half])
+
+
+def variance_of(rows: Array, covariance: Array) -> Array:
+    """tr(A_i C A_iᵀ) (n,), the variances of all combinations A_i of rows (n, k, p) together."""
+    return np.asarray(((rows @ covariance) * rows).sum(axis=(1, 2)))
 
 
 def t_quantile(level: float, dof: Array) -> Array:

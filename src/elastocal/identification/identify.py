@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
+from elastocal.identification.covariance import variance_of
 from elastocal.identification.estimates import leverage_of, summarise
 from elastocal.identification.findings import judged
 from elastocal.identification.methods import (
@@ -197,8 +198,8 @@ def _uncertainty(result: Calibration, observed: Observations, left: Array | floa
     model = result.model
     columns = np.array([model.names.index(name) for name in result.determined], dtype=np.int64)
     B = model.regressor(observed.table, result.x, columns, observed).B
-    variance = np.maximum(((B @ result.covariance) * B).sum(axis=1), 0.0) / left
-    each = variance.reshape(-1, observed.size)[:, :3].sum(axis=1)
+    B = (B.T / np.sqrt(left)).T.reshape(-1, observed.size, len(columns))
+    each = variance_of(B[:, :3], result.covariance)
     _, code = np.unique(observed.configuration, return_inverse=True)
     return np.asarray(np.sqrt(np.bincount(code.ravel(), each) / np.bincount(code.ravel())))
 

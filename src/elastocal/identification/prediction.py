@@ -25,7 +25,7 @@ from scipy import linalg, stats
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
-from elastocal.identification.covariance import Covariance
+from elastocal.identification.covariance import Covariance, variance_of
 from elastocal.identification.methods import EXACT
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
@@ -114,6 +114,15 @@ def _moves(arm: CalibratedArm, left: OpenParameters, A: Array) -> tuple[Array, A
     size = np.abs(move).max(axis=(0, 1), initial=0.0)
     off[np.abs(off) <= OUTSIDE * np.maximum(size, np.abs(move).max(initial=0.0))] = 0.0
     return known, off
+
+
+def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]:
+    """Mean squares in m² of the position error of readings of B (n·size, parameters): by what the
+    estimates leave uncertain, and by typical deviations of parameters left open."""
+    left = arm.left or OpenParameters((), np.zeros((len(arm.determined), 0)), np.zeros(0))
+    known, off = _moves(arm, left, B.reshape(-1, size, B.shape[1])[:, :3])
+    own = variance_of(known, arm.covariance)
+    return float(own.mean()), float((off**2).sum(axis=(1, 2)).mean())
 
 
 def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:

@@ -442,7 +442,7 @@ class Calibration(Result):
         columns = np.array([self.model.names.index(name) for name in self.determined])
         return scrutiny.Looked(
             self.model, self.observations, self.weights, self.x, self.B, columns.astype(np.int64),
-            self.covariance, self.residual, self.held_out, self.dof,
+            self.residual, self.held_out, self.dof,
         )  # fmt: skip
 
     def influence(self) -> tuple[scrutiny.Influence, ...]:
@@ -466,7 +466,7 @@ class Calibration(Result):
         fitted; None for tables too large to look again."""
         if self._looked is None:
             return None
-        return scrutiny.uncertainty_budget(self._looked, self.noise_parts, table)
+        return scrutiny.uncertainty_budget(self._looked, self.arm, self.noise_parts, table)
 
     @cached_property
     def autocorrelation(self) -> scrutiny.Autocorrelation | None:

@@ -624,6 +624,7 @@ def _signed(metres: float) -> str:
 
 SOURCES = {
     "parameters": "parameters: what the estimates leave uncertain",
+    "open_parameters": "parameters left open, by their typical deviations",
     "repeatability": "repeatability: what readings of a visit have in common",
     "instrument": "instrument: single readings",
     "lack_of_fit": "lack of fit: what the held-out error has beyond these",
