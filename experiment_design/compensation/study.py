@@ -19,6 +19,7 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
+from elastic_arm import MujocoArm
 from joblib import Parallel, delayed
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -28,7 +29,6 @@ from elastocal.compensation import nominal_flanges, read_targets, tool_point
 from elastocal.compensation.compensate import compensate
 from elastocal.measurements import Measurements, write_measurements
 from elastocal.model import Chain, joint_limits, load_chain, read_calibrated
-from elastocal.simulation import MujocoArm
 
 HERE = Path(__file__).resolve().parent
 NOISE = 20e-6  # m per axis

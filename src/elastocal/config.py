@@ -44,9 +44,9 @@ class Table(BaseModel):
 TableType = TypeVar("TableType", bound=Table)
 
 
-def key(takes: str) -> Any:
+def key(takes: str, default: Any = None) -> Any:
     """An optional key; `takes` completes the sentence 'key … takes …' in messages."""
-    return Field(default=None, description=takes)
+    return Field(default=default, description=takes)
 
 
 def required(takes: str) -> Any:

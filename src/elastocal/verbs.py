@@ -20,7 +20,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
-from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.calibrated import CalibratedArm, given_arm
 from elastocal.model.choice import cell_of
 from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed, quoted
@@ -622,15 +622,8 @@ def compensate(
         (True, True)
     """
     from elastocal.compensation.compensate import compensate as run
-    from elastocal.identification.result import Calibration
 
-    if isinstance(arm, Calibration):
-        arm = arm.arm
-    if not isinstance(arm, CalibratedArm):
-        raise InputError(
-            f"{option('arm')} takes a calibrated arm, as fit.arm or what read_calibrated gives; "
-            f"found {type(arm).__name__}"
-        )
+    arm = given_arm("arm", arm)
     force = given_force(load)
     check_frame(frame)
     chain = arm.model.chain

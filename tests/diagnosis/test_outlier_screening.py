@@ -18,8 +18,8 @@ from elastocal.diagnosis import (
     diagnosis_data_of,
     fit_baseline,
     fit_noise,
+    left_out_errors,
     project,
-    reading_errors,
     screen_outliers,
 )
 from elastocal.measurements import Measurements
@@ -99,7 +99,7 @@ def test_the_error_of_a_reading_is_against_the_fit_to_all_others() -> None:
     dataset = clean()
     _, _, noise = screened(dataset)
     at = project(dataset.data, noise)
-    found = reading_errors(dataset, at)
+    found = left_out_errors(dataset, at, ~dataset.data.faulty)[0]
 
     def squares(at_data) -> float:
         p = project(at_data, noise)
@@ -112,7 +112,8 @@ def test_the_error_of_a_reading_is_against_the_fit_to_all_others() -> None:
 
 
 def test_errors_of_good_readings_follow_chi_squared() -> None:
-    found = reading_errors(clean(), project(clean().data, screened(clean())[2]))
+    at = project(clean().data, screened(clean())[2])
+    found = left_out_errors(clean(), at, ~clean().data.faulty)[0]
     assert found.mean() == pytest.approx(3.0, rel=0.15)
 
 

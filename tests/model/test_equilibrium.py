@@ -26,6 +26,7 @@ from support.cells import (
     random_poses,
     table_of,
 )
+from support.elastic_arms import MujocoArm
 from support.robots import KR270
 
 from elastocal.cell.arm_description import Nominal
@@ -33,7 +34,6 @@ from elastocal.errors import ElastocalError
 from elastocal.model import Chain, Joint, LinkMass, Model
 from elastocal.model import symbolic as equilibrium
 from elastocal.model.effects.compliances import transverse_axes
-from elastocal.simulation import MujocoArm
 from elastocal.units import Array
 
 K = np.array(COMPLIANCE)

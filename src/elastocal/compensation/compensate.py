@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 
 from elastocal.above import Result
 from elastocal.cell.work_cell import Cell
-from elastocal.compensation.commands import (
-    Commanding,
-    Goals,
-    Solved,
-    jumps,
-    nominal_path,
-)
+from elastocal.compensation.commands import Commanding, Goals, Solved, jumps, nominal_path
 from elastocal.compensation.targets import Targets
 from elastocal.errors import InsufficientDataError, option
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
@@ -386,11 +380,7 @@ def check_reached(result: Compensation) -> None:
 
 
 def check_status(
-    what: str,
-    rows: Sequence[str],
-    status: Sequence[str],
-    good: str,
-    remedies: Mapping[str, str],
+    what: str, rows: Sequence[str], status: Sequence[str], good: str, remedies: Mapping[str, str]
 ) -> None:
     """Raise InsufficientDataError for rows of another status than `good`; `what` counts them."""
     lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]

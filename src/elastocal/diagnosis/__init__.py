@@ -37,7 +37,7 @@ ROOMS = {
         "NoiseValues NoisyData Weighted covariance fit_noise likelihood log_prior noise_draws "
         "posterior project"
     ),
-    "reading_faults": "OutlierScreening left_out_errors reading_errors screen_outliers",
+    "reading_faults": "OutlierScreening left_out_errors screen_outliers",
     "rivals": "RivalSet Suspects alternatives with_neighbours",
     "shrinkage": (
         "Change Confirmation PosteriorDraw blocks_of_time left_out_residual new_pose_table "

@@ -29,7 +29,7 @@ from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
-from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.calibrated import CalibratedArm, given_arm
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.model.valued import Conditions, Valued, part_of, random_table, unstated_needs
@@ -182,13 +182,7 @@ def compare(
         >>> ec.compare(fit, fit).verdict
         'no_change_shown'
     """
-    before, after = (arm.arm if isinstance(arm, Calibration) else arm for arm in (old, new))
-    for name, arm in (("old", before), ("new", after)):
-        if not isinstance(arm, CalibratedArm):
-            raise InputError(
-                f"{option(name)} takes a calibrated arm, as fit.arm or what read_calibrated gives; "
-                f"found {type(arm).__name__}"
-            )
+    before, after = given_arm("old", old), given_arm("new", new)
     for name, count, least in (("poses", poses, 2), ("seed", seed, 0)):
         whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
         require(whole and count >= least, f"{option(name)} takes a whole number, {least} or more")

@@ -417,7 +417,10 @@ class SumAnswer:
             elif isinstance(c.effect, JointCurve):
                 settings |= {"curve_size_rad": size, "curve_length_rad": length}
             elif c.effect.sized_by:
-                settings[c.effect.sized_by] = size * self._stated(c)
+                # The value that is stated is where the columns are of typical size.
+                model = self.dataset.base.model
+                stated = c.effect.stated(c.where, model.chain, model.cell)
+                settings[c.effect.sized_by] = size * stated[c.effect.sized_by]
         families = [k for k in members if isinstance(self.found.components[k].effect, GearSpectrum)]
         lines = [line for k in families for line in self._lines(k)]
         if lines:
@@ -428,14 +431,6 @@ class SumAnswer:
             for n, (order, sd, _) in enumerate(sorted(lines), start=1):
                 settings |= {f"order_{n}": order, f"order_sd_{n}": sd}
         return settings
-
-    def _stated(self, c: Component) -> float:
-        """Of an effect that one setting sizes its value where the columns are of typical size."""
-        model = self.dataset.base.model
-        settings = c.effect.settings(c.where, model.chain, model.cell)
-        default = next(s.default for s in settings if s.key == c.effect.sized_by)
-        given = model.cell.model.nominal.settings.get(c.where, {})
-        return float(given.get(c.effect.sized_by, default))  # type: ignore[arg-type]
 
     def _lines(self, k: int) -> list[tuple[float, float, float]]:
         """Order, its standard deviation and prior size in rad of each line of a family."""

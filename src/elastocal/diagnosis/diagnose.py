@@ -17,7 +17,7 @@ from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import SumAnswer
 from elastocal.diagnosis.component_search import compared_score, search_components
-from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Gap, Untested
+from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Gap, StructureTest
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
@@ -229,36 +229,27 @@ def diagnose(
     few = max(found.chosen.score, found.nothing.score)
     answer_of_sum = SumAnswer(dataset, full, total, hidden, rng)
     gained = compared_score(full, total, found.chosen) - few
-    if gained > CLEARLY and answer_of_sum.n_causes >= MANY:
-        return _diagnosis_of_sum(
-            answer_of_sum, dataset, found, screened, untested, left_out, given, source
-        )
-    found = search.settled(found)
-    answer = judge(found)
-    gap, steps = budget(dataset, found, rng)
-    findings = _findings(found, answer, base, gap, rng)
-    tests = structure_tests(found.first)
+    many = gained > CLEARLY and answer_of_sum.n_causes >= MANY
+    found = found if many else search.settled(found)
+    tests, judged = structure_tests(found.first), judge(found)
+    if many:
+        answers = _of_sum(answer_of_sum, dataset, found, tests)
+    else:
+        answers = _of_few(answer_of_sum, dataset, found, judged, tests)
+    there = {(f.effect, f.where) for f in answers["effects"]} if many else ()
+    small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
     p_first = exceedance(found.first.flipped, found.first.odds)
     return Diagnosis(
-        verdict=answer.verdict,
-        gap=gap,
-        budget=steps,
-        effects=findings,
-        candidates=candidates(dataset, found, answer),
-        indistinguishable=answer.indistinguishable,
-        location=location(found, tests),
-        noise=noise_floor(found.dataset, found.chosen.data, found.chosen.noise),
+        **answers,
+        candidates=candidates(dataset, found, judged),
         structure=tests,
         probability_nothing=found.slots[0].probabilities()[1],
-        probability_unknown=_unknown(found),
         p_value=found.p_values[0] if found.p_values else p_first,
-        curves=curves_of(found.dataset, found.chosen),
-        fields=answer_of_sum.without_names if answer.verdict == "unknown_effect" else (),
-        untested=(*untested, *too_small(dataset, found)),
+        untested=(*untested, *small),
         warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
-        model_keys=model_keys(base.model, findings),
+        model_keys=model_keys(base.model, answers["effects"]),
         model=given,
         data=source,
         calibrated=base,
@@ -271,19 +262,33 @@ CLEARLY = 10.0
 MANY = 3
 
 
-def _diagnosis_of_sum(
-    answer: SumAnswer,
-    dataset: DiagnosisData,
-    found: SelectedEffects,
-    screened: OutlierScreening,
-    untested: list[Untested],
-    left_out: str | None,
-    given: Model,
-    source: str,
-) -> Diagnosis:
-    """The diagnosis where many causes act at once; candidates are those of the forward search."""
-    rng, base, data = answer.rng, dataset.base, answer.found.data
-    first = first_steps(dataset, found.nothing, None, rng)
+def _of_few(
+    answer_of_sum: SumAnswer, dataset: DiagnosisData, found: SelectedEffects, answer: Answer,
+    tests: tuple[StructureTest, ...],
+) -> dict[str, Any]:  # fmt: skip
+    """What a diagnosis says of what the forward search found."""
+    gap, steps = budget(dataset, found, answer_of_sum.rng)
+    return {
+        "verdict": answer.verdict,
+        "gap": gap,
+        "budget": steps,
+        "effects": _findings(found, answer, dataset.base, gap, answer_of_sum.rng),
+        "indistinguishable": answer.indistinguishable,
+        "location": location(found, tests),
+        "noise": noise_floor(found.dataset, found.chosen.data, found.chosen.noise),
+        "probability_unknown": _unknown(found),
+        "curves": curves_of(found.dataset, found.chosen),
+        "fields": answer_of_sum.without_names if answer.verdict == "unknown_effect" else (),
+    }
+
+
+def _of_sum(
+    answer: SumAnswer, dataset: DiagnosisData, found: SelectedEffects,
+    tests: tuple[StructureTest, ...],
+) -> dict[str, Any]:  # fmt: skip
+    """What it says where many causes act at once."""
+    data = answer.found.data
+    first = first_steps(dataset, found.nothing, None, answer.rng)
     steps = answer.budget(first)
     named = [step for step in steps if not step.step.startswith("unknown")]
     best = min(step.heldout_rms for step in steps)
@@ -293,37 +298,20 @@ def _diagnosis_of_sum(
         steps[0].heldout_rms, first[-1].heldout_rms, named[-1].heldout_rms, floor,
         supported.unexplained,
     )  # fmt: skip
-    tests = structure_tests(found.first)
-    slot, rivals = found.slots[0], judge(found)
-    there = {(f.effect, f.where) for f in answer.effects}
-    small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
-    p = found.p_values[0] if found.p_values else exceedance(found.first.flipped, found.first.odds)
-    return Diagnosis(
-        verdict=answer.verdict,
-        gap=gap,
-        budget=(*steps, BudgetStep("noise_floor", floor, (floor, floor))),
-        effects=answer.effects,
-        candidates=candidates(dataset, found, rivals),
-        indistinguishable=answer.indistinguishable,
-        location=answer.location(tests),
-        noise=noise_floor(answer.dataset, data, answer.found.noise),
-        structure=tests,
-        probability_nothing=slot.probabilities()[1],
-        probability_unknown=min(1.0, answer.unnamed_probability),
-        p_value=p,
-        curves=answer.curves(),
-        components=answer.components,
-        groups=answer.groups,
-        fields=answer.fields,
-        untested=(*untested, *small),
-        warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
-        n_readings=dataset.blocks.n,
-        n_configurations=len(dataset.blocks.member),
-        model_keys=model_keys(base.model, answer.effects),
-        model=given,
-        data=source,
-        calibrated=base,
-    )
+    return {
+        "verdict": answer.verdict,
+        "gap": gap,
+        "budget": (*steps, BudgetStep("noise_floor", floor, (floor, floor))),
+        "effects": answer.effects,
+        "indistinguishable": answer.indistinguishable,
+        "location": answer.location(tests),
+        "noise": noise_floor(answer.dataset, data, answer.found.noise),
+        "probability_unknown": min(1.0, answer.unnamed_probability),
+        "curves": answer.curves(),
+        "components": answer.components,
+        "groups": answer.groups,
+        "fields": answer.fields,
+    }
 
 
 def _unknown(found: SelectedEffects) -> float:

@@ -496,13 +496,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "p_value": d.p_value,
         "probability_nothing": d.probability_nothing,
         "probability_unknown": d.probability_unknown,
-        "gap": {
-            "nominal_um": d.gap.nominal * MICRO,
-            "calibrated_um": d.gap.calibrated * MICRO,
-            "explained_um": d.gap.explained * MICRO,
-            "noise_floor_um": d.gap.noise_floor * MICRO,
-            "unexplained_um": d.gap.unexplained * MICRO,
-        },
+        "gap": {f"{name}_um": value * MICRO for name, value in vars(d.gap).items()},
         "budget": [_step(step) for step in d.budget],
         "effects": [_found(effect) for effect in d.effects],
         "components": [_component(component) for component in d.components],
@@ -561,24 +555,26 @@ def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
             for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True), 1)
         ],
         "shared": noise.shared,
-        "pure_error_um": None if noise.pure_error is None else noise.pure_error * MICRO,
-        "near_repeat_um": None if near is None else near.scatter * MICRO,
+        "pure_error_um": _um(noise.pure_error),
+        "near_repeat_um": _um(near and near.scatter),
         "near_repeats": None if near is None else _near_repeats(near),
         "faulty": [_faulty(reading) for reading in noise.faulty],
     }
 
 
+def _um(metres: float | None) -> float | None:
+    return None if metres is None else metres * MICRO
+
+
 def _near_repeats(near: NearRepeats) -> dict[str, Any]:
-    times = {"soon_um": near.soon, "later_um": near.later}
-    parts = {key: None if value is None else value * MICRO for key, value in times.items()}
+    parts = {"soon_um": _um(near.soon), "later_um": _um(near.later)}
     return {"pairs": near.pairs, "independent": near.independent} | parts
 
 
 def _faulty(reading: FaultyReading) -> dict[str, Any]:
-    return {
-        "error_um" if key == "error" else key: value * MICRO if key == "error" else value
-        for key, value in vars(reading).items()
-    }
+    names = {"error": "error_um"}
+    both = vars(reading) | {"error": reading.error * MICRO}
+    return {names.get(key, key): value for key, value in both.items()}
 
 
 def _extra(extra: ExtraPlan) -> dict[str, Any]:

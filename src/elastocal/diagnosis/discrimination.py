@@ -380,9 +380,7 @@ class Discrimination:
         delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
         beaten = norm.cdf(-(L + delta**2 / 2) / delta)
         beaten = np.where(
-            squared < TOO_NEAR**2,
-            np.maximum(beaten, 1 - TOO_NEAR_PROBABILITY),
-            beaten,
+            squared < TOO_NEAR**2, np.maximum(beaten, 1 - TOO_NEAR_PROBABILITY), beaten
         )
         lost = np.zeros(beaten.shape[:-2] + beaten.shape[-1:])
         for k in np.unique(self.classes):

@@ -280,12 +280,6 @@ def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
     return True
 
 
-def reading_errors(dataset: DiagnosisData, at: Projection) -> Array:
-    """uᵢᵀP_ii⁻¹u_i (N,) of every observation; NaN where it is left out."""
-    used = ~dataset.data.faulty
-    return np.where(used, left_out_errors(dataset, at, used)[0], np.nan)
-
-
 def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
     """Suspects (N,) that stand in a row of RUN or more readings of the same marker in time."""
     marker_of, moment = dataset.table.marker[dataset.lead], dataset.moment

@@ -29,13 +29,7 @@ from elastocal.diagnosis.model_set import (
     signal_of,
     with_items,
 )
-from elastocal.diagnosis.noise_floor import (
-    NoiseValues,
-    NoisyData,
-    Projection,
-    noise_draws,
-    project,
-)
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, noise_draws, project
 from elastocal.diagnosis.stated_floor import supported_floor
 from elastocal.identification.findings import BudgetStep, resampled_rms, stage_of
 from elastocal.measurements import Measurements, visits

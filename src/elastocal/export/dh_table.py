@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import Literal
 
-import casadi as ca
 import numpy as np
 
 from elastocal.cell.arm_description import Robot
 from elastocal.export.exportable import ExportNumbers
-from elastocal.model import rigid
+from elastocal.model import dh
 from elastocal.model.chain import Chain, Joint
-from elastocal.model.dh import FIXED, dh_number, read_dh_table
 from elastocal.model.effects.compliances import transverse_axes
 from elastocal.tables import csv_text
 from elastocal.units import Array
@@ -48,11 +46,12 @@ class DhRow:
 
     def leading(self) -> Array:
         """Rz(θ) Tz(d) (4, 4): what belongs to the joint's own axis."""
-        return _product(_turn("z", self.theta), _shift("z", self.d))
+        return dh.product(dh.rotation(dh.Z, self.theta), dh.translation(dh.Z, self.d))
 
     def trailing(self) -> Array:
         """Tx(a) Rx(α) Ry(β) (4, 4)."""
-        return _product(_shift("x", self.a), _turn("x", self.alpha), _turn("y", self.beta))
+        shift, turn = dh.translation(dh.X, self.a), dh.rotation(dh.X, self.alpha)
+        return dh.product(shift, turn, dh.rotation(dh.Y, self.beta))
 
     def transform(self) -> Array:
         """T (4, 4) of the row with its joint at zero."""
@@ -125,24 +124,6 @@ def _same_turns(row: DhRow, near: DhRow) -> DhRow:
             for k, (m, t) in enumerate(zip(mine, theirs, strict=True))
         )
     )
-
-
-AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-
-
-def _turn(axis: str, angle: float) -> ca.SX:
-    return rigid.joint_motion("revolute", AXES[axis], angle)
-
-
-def _shift(axis: str, length: float) -> ca.SX:
-    return rigid.joint_motion("prismatic", AXES[axis], length)
-
-
-def _product(*factors: ca.SX) -> Array:
-    T = ca.SX.eye(4)
-    for factor in factors:
-        T = T @ factor
-    return np.array(ca.DM(T).full())
 
 
 # The calibrated arm as a Denavit–Hartenberg table, standard or modified.
@@ -218,7 +199,7 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
         numbers = dict(zip(HEADER[2:], astuple(line.row), strict=True))
         if line.joint is not None:
             numbers |= _limits(line.joint)
-        kind = FIXED if line.joint is None else line.joint.kind
+        kind = dh.FIXED if line.joint is None else line.joint.kind
         cells = [repr(numbers[name] + 0.0) if name in numbers else "" for name in header[2:]]
         rows.append([line.name, kind, *cells])
     return csv_text(header, rows, comments)
@@ -276,13 +257,13 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Dh
     nothing: list[DhRow | None] = [None] * (chain.n_joints + 1)
     if robot.dh is None or robot.dh_convention != convention:
         return nothing
-    table = read_dh_table(robot.dh)
+    table = dh.read_dh_table(robot.dh)
     n = len(table.row)
-    if any(table.text(i, "type") == FIXED for i in range(n)):
+    if any(table.text(i, "type") == dh.FIXED for i in range(n)):
         return nothing
     stems = ("theta0", "d", "a", "alpha", "beta")
     keys = [("length" if len(stem) == 1 else "angle", stem) for stem in stems]
-    numbers = np.nan_to_num([[dh_number(table, i, *key) for key in keys] for i in range(n)])
+    numbers = np.nan_to_num([[dh.dh_number(table, i, *key) for key in keys] for i in range(n)])
     own = [DhRow(*row) for row in numbers.tolist()]
     if convention == "standard":
         return [DhRow(), *own]

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements
@@ -30,8 +32,18 @@ from elastocal.model.valued import (
     random_table,
     unstated_needs,
 )
-from elastocal.simulation.mujoco_arm import numbers
 from elastocal.units import Array
+
+
+def numbers(values: ArrayLike) -> str:
+    """Numbers separated by blanks, each with the digits that give the same double back."""
+    return " ".join(repr(float(value)) for value in np.asarray(values, dtype=float))
+
+
+def placed_body(name: str, T: Array) -> dict[str, str]:
+    """Attributes of an MJCF's body or site called `name` at T (4, 4) in its parent's frame."""
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return {"name": name, "pos": numbers(T[:3, 3]), "quat": numbers((w, x, y, z))}
 
 
 def rpy(R: Array) -> tuple[float, float, float]:
@@ -257,9 +269,9 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
         ca.vertcat(ca.SX.zeros(0, 1), *[spring.law(ca.SX(1.0)) for spring in arm.springs]),
     ]
     function = ca.Function("pieces", [*arm.inputs.values(), symbolic.p], expressions)
-    numbers = [value.full() for value in function.call([*inputs, part.x])]
+    found = [value.full() for value in function.call([*inputs, part.x])]
     n = model.chain.n_joints
-    links, (offsets, T_tracker_base), rest = numbers[:n], numbers[n : n + 2], numbers[n + 2 :]
+    links, (offsets, T_tracker_base), rest = found[:n], found[n : n + 2], found[n + 2 :]
     values = part.values
     scale, *shift = (values.get(name, 0.0) for name in PAYLOAD)
     return ExportNumbers(
@@ -278,11 +290,11 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
     )
 
 
-def _markers(arm: Arm, numbers: list[Array]) -> dict[str, Array]:
+def _markers(arm: Arm, found: list[Array]) -> dict[str, Array]:
     placed = {}
     for k, name in enumerate(arm.markers):
         T = np.eye(4)
-        T[:3, 3], T[:3, :3] = numbers[k][:, 0], numbers[len(arm.markers) + k]
+        T[:3, 3], T[:3, :3] = found[k][:, 0], found[len(arm.markers) + k]
         placed[name] = T
     return placed
 

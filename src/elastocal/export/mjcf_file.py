@@ -10,11 +10,11 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from elastocal.errors import ElastocalError, InputError
-from elastocal.export.exportable import ExportNumbers, SpringValue
+from elastocal.export.exportable import ExportNumbers, SpringValue, numbers, placed_body
 from elastocal.model.chain import LinkMass
 from elastocal.model.effects.compliances import transverse_axes
 from elastocal.model.effects.loads import STANDARD_GRAVITY
-from elastocal.simulation.mujoco_arm import NO_INERTIA, NO_MASS, numbers, placed_body
+from elastocal.model.mjcf import import_mujoco
 from elastocal.units import Array
 
 # Each joint is a hinge or slide that a position actuator drives: its control is the commanded
@@ -32,6 +32,8 @@ SETTLING = 0.02
 # after a step of its command below the 1e10 rad/s² beyond which MuJoCo gives up.
 ARMATURE, ARMATURE_PER_STIFFNESS = 0.1, 1e-8  # kg m² (kg), s²
 MOTIONS = {"revolute": "hinge", "prismatic": "slide"}
+# A moving body needs some mass and inertia in MuJoCo; these weigh 1e-13 N.
+NO_MASS, NO_INERTIA = 1e-14, 1e-12
 SHORTEST = 1e-3  # m; a shorter link is not drawn
 
 
@@ -241,13 +243,7 @@ class MujocoRest:
     """
 
     def __init__(self, mjcf: Any) -> None:
-        try:
-            import mujoco
-        except ImportError:
-            raise InputError(
-                "the check needs MuJoCo, which is not installed; run: pip install elastocal[mujoco]"
-            ) from None
-        self._mujoco = mujoco
+        self._mujoco = mujoco = import_mujoco("the check")
         try:
             text = isinstance(mjcf, str)
             self.model = mujoco.MjModel.from_xml_string(mjcf) if text else mjcf

@@ -23,19 +23,14 @@ import numpy as np
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError
-from elastocal.export.exportable import ExportNumbers, SpringValue
-from elastocal.export.mjcf_file import (
-    MOTIONS,
-    RIGID,
-    SETTLING,
-    armature,
-    springs_at,
-)
+from elastocal.export.exportable import ExportNumbers, SpringValue, numbers, placed_body
+from elastocal.export.mjcf_file import MOTIONS, RIGID, SETTLING, armature, springs_at
 from elastocal.export.urdf_file import (
     PREFIX,
     XmlText,
     as_utf8,
     comment,
+    correction_of_joint,
     element,
     error_of_link,
     nothing,
@@ -44,7 +39,6 @@ from elastocal.export.urdf_file import (
 )
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.mjcf import SPRING, MjcfArm, mjcf_bytes, parsed, strip, transform
-from elastocal.simulation.mujoco_arm import numbers, placed_body
 from elastocal.units import Array
 
 ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")
@@ -172,10 +166,7 @@ def _check_located(arm: MjcfArm, text: MjcfText) -> None:
 
 
 def _correct_joint(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers, i: int, j: int) -> None:
-    correction = pieces.offset_motion(i)
-    if i > 0:
-        correction = error_of_link(pieces, i - 1) @ correction
-    if nothing(correction):
+    if nothing(correction := correction_of_joint(pieces, i)):
         return
     body = int(arm.model.jnt_bodyid[j])
     if arm.joints_of(body)[0] != j:

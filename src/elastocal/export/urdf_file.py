@@ -12,14 +12,14 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import InputError, option
-from elastocal.export.exportable import ExportNumbers, origin_attributes
+from elastocal.export.exportable import ExportNumbers, numbers, origin_attributes
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.placements import link_ends
 from elastocal.model.urdf import Tree, UrdfJoint, check_urdf, urdf_bytes
-from elastocal.simulation.mujoco_arm import numbers
 from elastocal.units import Array
 
 # Edits of a URDF's text that leave everything else as it was, to the byte.
@@ -252,10 +252,7 @@ def _correct_joints(
     tree: Tree, text: UrdfText, pieces: ExportNumbers, moving: tuple[UrdfJoint, ...]
 ) -> None:
     for i, joint in enumerate(moving):
-        correction = pieces.offset_motion(i)
-        if i > 0:
-            correction = error_of_link(pieces, i - 1) @ correction
-        if not nothing(correction):
+        if not nothing(correction := correction_of_joint(pieces, i)):
             text.set_origin(joint.name, origin_attributes(_origin(joint) @ correction))
 
 
@@ -272,6 +269,12 @@ def _correct_flange(
     # The flange is the link that the last joint moves: a link in between takes the correction.
     text.set_child(last.name, MOUNT)
     return _fixed(tree, text, MOUNT, MOUNT, flange, error)
+
+
+def correction_of_joint(pieces: ExportNumbers, i: int) -> Array:
+    """E_{i−1} J_i(a_i) (4, 4) of joint i (0-based)."""
+    offset = pieces.offset_motion(i)
+    return offset if i == 0 else error_of_link(pieces, i - 1) @ offset
 
 
 def error_of_link(pieces: ExportNumbers, i: int) -> Array:
@@ -306,8 +309,6 @@ def _fixed(tree: Tree, text: UrdfText, new: str, parent: str, child: str, T: Arr
 
 
 def _origin(joint: UrdfJoint) -> Array:
-    from scipy.spatial.transform import Rotation
-
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("xyz", joint.rpy).as_matrix()
     T[:3, 3] = joint.xyz

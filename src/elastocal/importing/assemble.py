@@ -93,7 +93,6 @@ def forces_of(
     return np.array([known[name] for name in named])
 
 
-SAME_DEG, SAME_MM = 0.05, 0.05
 OWN_DEFAULT = {"sigma_cartesian": "um", "sigma_polar": "um"}
 WHOLE = re.compile(r"-?[0-9]{1,15}")
 LABELS = ("configuration", "repeat", "marker")
@@ -141,9 +140,7 @@ def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joine
         for k, axis in enumerate("xyz"):
             numbers[f"force_{axis}"], units[f"force_{axis}"] = forces[rows, k], "N"
     q = np.column_stack([numbers[stem] for stem in stems])
-    spread = (log or points).spread(
-        settings.same_pose_deg or SAME_DEG, settings.same_pose_mm or SAME_MM
-    )
+    spread = (log or points).spread(settings.same_pose_deg, settings.same_pose_mm)
     configuration, warnings = _configurations(points, joined, rows, q, spread)
     columns: dict[str, Sequence[str] | NDArray] = {"configuration": configuration}
     marker = points.labels.get("marker")

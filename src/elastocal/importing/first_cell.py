@@ -137,11 +137,7 @@ def first_cell(robot: Robot, folder: str | Path = ".") -> str:
         "",
         *_robot(robot, kind, path, Path(folder)),
         *_joints(chain),
-        *_tool(reach, sites),
-        *_tracker(reach),
-        *_model(chain),
-        *_workspace(chain, reach),
-        *_design(reach),
+        _rest(chain, reach, sites),
     ]
     return "\n".join(lines) + "\n"
 
@@ -209,26 +205,19 @@ def _range(joint: Joint) -> tuple[float, float, bool]:
     return low, (high if math.isfinite(high) else low + 2 * half), guessed
 
 
-def _tool(reach: float, sites: dict[str, Array]) -> Iterator[str]:
-    side = reach / 12
-    yield "[tool]                                 # all in m, in the flange frame"
-    # Off the last joint's axis, which a load on it would not turn.
-    yield f"load_point_m = {_vector([side, 0, side])}".ljust(38) + " # guess: where a load hangs"
-    yield ""
+def _markers(side: float, sites: dict[str, Array]) -> str:
+    """The table of markers: the model's sites where they may be, else a guess."""
     stub = {
         "M1": np.array([side, 0.0, side / 3]),
         "M2": np.array([-side / 2, side * 0.9, side / 2]),
         "M3": np.array([-side / 2, -side * 0.9, side]),
     }
     usable = {n: p for n, p in sites.items() if n == n.strip() == printable(n)}
+    told = "guess; fitted below"
     if 0 < len(usable) <= MOST_SITES:
-        yield "[tool.markers_m]                       # the model's sites; keep the reflectors"
-        stub = usable
-    else:
-        yield "[tool.markers_m]                       # guess; fitted below"
-    for name, place in stub.items():
-        yield f"{_key(name)} = {_vector(place)}"
-    yield ""
+        stub, told = usable, "the model's sites; keep the reflectors"
+    head = f"{'[tool.markers_m]':<38} # {told}"
+    return "\n".join([head, *(f"{_key(name)} = {_vector(at)}" for name, at in stub.items())])
 
 
 def _key(name: str) -> str:
@@ -236,65 +225,69 @@ def _key(name: str) -> str:
     return name if bare else _text(name)
 
 
-def _tracker(reach: float) -> Iterator[str]:
-    place = _vector([round(2 * reach, 1), 0.0, round(0.5 * reach, 1)])
-    yield "[tracker]"
-    yield f"position_m = {place}".ljust(38) + " # guess: where it stands, in the data's frame"
-    yield "sigma_um = 15".ljust(38) + " # guess; or range_um, range_ppm, transverse_um, …"
-    yield ""
-
-
-def _model(chain: Chain) -> Iterator[str]:
-    yield "[model]"
-    yield 'observe = "position"'.ljust(38) + " # or deflection, pose, distance"
-    yield "# What is fitted; elastocal effects lists all that can be."
-    yield "effects = ["
-    for pair in ((BaseFrame, MarkerPosition), (JointOffset, LinkGeometry)):
-        yield "    " + " ".join(f'"{effect.name}",' for effect in pair)
+def _rest(chain: Chain, reach: float, sites: dict[str, Array]) -> str:
+    """Tool, tracker, model, workspace and wishes for a plan."""
+    side, n = reach / 12, chain.n_joints
+    # Off the last joint's axis, which a load on it would not turn.
+    hook = f"load_point_m = {_vector([side, 0, side])}"
+    station = f"position_m = {_vector([round(2 * reach, 1), 0.0, round(0.5 * reach, 1)])}"
+    placed, geometry = (
+        " ".join(f'"{effect.name}",' for effect in pair)
+        for pair in ((BaseFrame, MarkerPosition), (JointOffset, LinkGeometry))
+    )
     # What hangs does not turn an upright first joint.
-    sprung = [f'"{JointCompliance.name}:joint{i}",' for i in range(2, chain.n_joints + 1)]
-    for k in range(0, len(sprung), 2):
-        yield "    " + " ".join(sprung[k : k + 2])
-    yield "]"
+    sprung = [f'"{JointCompliance.name}:joint{i}",' for i in range(2, n + 1)]
+    springs = "\n    ".join(" ".join(sprung[k : k + 2]) for k in range(0, len(sprung), 2))
     weighed = bool(chain.masses)
     told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"
-    yield f"link_gravity = {str(weighed).lower()}".ljust(38) + f" # {told}"
-    yield ""
-    yield "[model.nominal]                        # the robot's base in the data's frame"
-    yield "base_position_m = [0, 0, 0]".ljust(38) + " # guess: the data are in the base's frame"
-    yield "base_rpy_deg = [0, 0, 0]"
-    yield ""
-
-
-def _workspace(chain: Chain, reach: float) -> Iterator[str]:
     # In mm, fives; the links get thinner towards the wrist.
     thick = max(5 * round(reach * 1e3 / THICKNESS / 5), 5)
     thin = max(5 * round(thick * 0.6 / 5), 5)
-    n = chain.n_joints
     radii = [thick if i < n - 3 else thin for i in range(n)]
     # What stands on the mounting plane is no body that could strike it.
     if chain.joints[0].placement[2, 3] * 1e3 <= radii[0]:
         radii[0] = 0
-    yield "[workspace]                            # where the arm may be; design keeps to it"
-    yield f"link_radius_mm = [{', '.join(map(str, radii))}]".ljust(38) + " # guess"
-    yield f"clearance_mm = {thin}"
-    yield ""
-    yield "[[workspace.keep_out]]"
-    yield 'name = "mounting plane"'.ljust(38) + " # the arm stays above it; for a ceiling or"
-    yield "point_m = [0, 0, 0]".ljust(38) + " # a wall turn the normal, and the base above"
-    yield "normal = [0, 0, 1]"
-    yield ""
-    yield "# [[workspace.obstacle]]"
-    yield '# name = "table"'
-    yield '# shape = "box"'
-    yield "# size_m = [1.0, 0.8, 0.7]"
-    yield "# position_m = [1.2, 0.0, 0.35]"
-    yield ""
-
-
-def _design(reach: float) -> Iterator[str]:
     load = max(_one(LOAD * (reach / REACH) ** 4), 5.0)
-    yield "[design]                               # elastocal design"
-    yield f"poses = {POSES}"
-    yield f"candidates = {CANDIDATES}".ljust(38) + " # to choose from; more take longer"
-    yield f"loads_N = [[0, 0, 0], [0, 0, -{load:g}]]".ljust(38) + " # guess: without and with it"
+    return f"""\
+[tool]                                 # all in m, in the flange frame
+{hook:<38} # guess: where a load hangs
+
+{_markers(side, sites)}
+
+[tracker]
+{station:<38} # guess: where it stands, in the data's frame
+sigma_um = 15                          # guess; or range_um, range_ppm, transverse_um, …
+
+[model]
+observe = "position"                   # or deflection, pose, distance
+# What is fitted; elastocal effects lists all that can be.
+effects = [
+    {placed}
+    {geometry}
+    {springs}
+]
+{f"link_gravity = {str(weighed).lower()}":<38} # {told}
+
+[model.nominal]                        # the robot's base in the data's frame
+base_position_m = [0, 0, 0]            # guess: the data are in the base's frame
+base_rpy_deg = [0, 0, 0]
+
+[workspace]                            # where the arm may be; design keeps to it
+{f"link_radius_mm = [{', '.join(map(str, radii))}]":<38} # guess
+clearance_mm = {thin}
+
+[[workspace.keep_out]]
+name = "mounting plane"                # the arm stays above it; for a ceiling or
+point_m = [0, 0, 0]                    # a wall turn the normal, and the base above
+normal = [0, 0, 1]
+
+# [[workspace.obstacle]]
+# name = "table"
+# shape = "box"
+# size_m = [1.0, 0.8, 0.7]
+# position_m = [1.2, 0.0, 0.35]
+
+[design]                               # elastocal design
+poses = {POSES}
+{f"candidates = {CANDIDATES}":<38} # to choose from; more take longer
+{f"loads_N = [[0, 0, 0], [0, 0, -{load:g}]]":<38} # guess: without and with it"""

@@ -331,7 +331,6 @@ def groups_alike(q: Array, tolerance: Array) -> NDArray[np.int64]:
     return codes
 
 
-TOLERANCE_S, STILL_DEG, STILL_MM, STILL_S = 0.5, 0.01, 0.01, 1.0
 SHOWN = 8
 
 
@@ -391,9 +390,8 @@ def _likely_offset(points: PooledRecords, log: PooledRecords, settings: JoinTabl
     if how not in ("time", "standstill") or points.time is None or log.time is None:
         return ""
     at, clock, order = _clocks(points, log, settings, how)
-    still = log.spread(settings.still_deg or STILL_DEG, settings.still_mm or STILL_MM)
-    shortest = STILL_S if settings.still_s is None else settings.still_s
-    found = dwells(clock, log.q[order], still, shortest)
+    still = log.spread(settings.still_deg, settings.still_mm)
+    found = dwells(clock, log.q[order], still, settings.still_s)
     if not found or len(at) * len(found) > MOST_PAIRS:
         return ""
     ends = np.array([[clock[s.first], clock[s.last]] for s in found])
@@ -407,7 +405,7 @@ def _likely_offset(points: PooledRecords, log: PooledRecords, settings: JoinTabl
     best = tried[joined == joined.max()]
     if joined.max() < MOST_POINTS_JOINED * len(at) or np.ptp(best) > np.ptp(ends, axis=1).max():
         return ""
-    offset = float(np.median(best)) + (settings.offset_s or 0.0)
+    offset = float(np.median(best)) + settings.offset_s
     return (
         f"; with offset_s = {offset:.1f} in [join] {joined.max()} of {len(at)} points are measured "
         "while the arm stands still"
@@ -560,18 +558,17 @@ def _clocks(
             )
     assert points.time is not None and log.time is not None
     order = np.argsort(log.time, kind="stable")
-    return points.time, log.time[order] + (settings.offset_s or 0.0), order
+    return points.time, log.time[order] + settings.offset_s, order
 
 
 def _by_time(where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable) -> Joined:
     at, clock, order = _clocks(points, log, settings, "time")
-    tolerance = TOLERANCE_S if settings.tolerance_s is None else settings.tolerance_s
     after = np.clip(np.searchsorted(clock, at), 1, max(len(clock) - 1, 1))
     after = np.minimum(after, len(clock) - 1)
     before = np.maximum(after - 1, 0)
     nearest = np.where(np.abs(at - clock[before]) <= np.abs(clock[after] - at), before, after)
     apart = np.abs(clock[nearest] - at)
-    row = np.where(apart <= tolerance, order[nearest], -1)
+    row = np.where(apart <= settings.tolerance_s, order[nearest], -1)
     good = row >= 0
     remarks = []
     if good.any():
@@ -579,7 +576,7 @@ def _by_time(where: str, points: PooledRecords, log: PooledRecords, settings: Jo
             f"clocks differ by {apart[good].max():.3g} s at most, {np.median(apart[good]):.3g} s "
             "in the median"
         )
-        still = log.spread(settings.still_deg or STILL_DEG, settings.still_mm or STILL_MM)
+        still = log.spread(settings.still_deg, settings.still_mm)
         q = log.q[order]
         around = np.abs(q[np.minimum(nearest + 1, len(q) - 1)] - q[np.maximum(nearest - 1, 0)])
         moving = np.flatnonzero(good & (around > still).any(axis=1))
@@ -600,9 +597,7 @@ def _by_standstill(
     where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable
 ) -> Joined:
     at, clock, order = _clocks(points, log, settings, "standstill")
-    tolerance = TOLERANCE_S if settings.tolerance_s is None else settings.tolerance_s
-    still = log.spread(settings.still_deg or STILL_DEG, settings.still_mm or STILL_MM)
-    shortest = STILL_S if settings.still_s is None else settings.still_s
+    still, shortest = log.spread(settings.still_deg, settings.still_mm), settings.still_s
     found = dwells(clock, log.q[order], still, shortest)
     if not found:
         raise InputError(
@@ -614,7 +609,7 @@ def _by_standstill(
     # 0 within a dwell, else the time to its nearer end.
     best = np.array([np.argmin(np.maximum(np.maximum(first - t, t - last), 0.0)) for t in at])
     apart = np.maximum(np.maximum(first[best] - at, at - last[best]), 0.0)
-    good = apart <= tolerance
+    good = apart <= settings.tolerance_s
     q = np.array([s.q for s in found])[best]
     row = np.where(good, order[np.array([s.first for s in found])[best]], -1)
     left_out = tuple(

@@ -125,14 +125,14 @@ class JoinTable(Table):
     points_per_pose: Annotated[int, Field(ge=1)] | None = key(
         "a whole number >= 1: points measured in each pose, for order"
     )
-    tolerance_s: NonNegative | None = key("a number >= 0 in s: how far apart clocks may read")
-    offset_s: float | None = key("a number in s, added to the times of the joint log")
-    still_deg: Positive | None = key("a positive number of degrees: motion that counts as none")
-    still_mm: Positive | None = key("a positive number of mm, for prismatic joints")
-    still_s: NonNegative | None = key("a number >= 0 in s: the shortest standstill that counts")
+    tolerance_s: NonNegative = key("a number >= 0 in s: how far apart clocks may read", 0.5)
+    offset_s: float = key("a number in s, added to the times of the joint log", 0.0)
+    still_deg: Positive = key("a positive number of degrees: motion that counts as none", 0.01)
+    still_mm: Positive = key("a positive number of mm, for prismatic joints", 0.01)
+    still_s: NonNegative = key("a number >= 0 in s: the shortest standstill that counts", 1.0)
     unmatched: Literal["refuse", "leave_out"] | None = key('"refuse" or "leave_out"')
-    same_pose_deg: Positive | None = key("a positive number: joints this near are the same pose")
-    same_pose_mm: Positive | None = key("a positive number of mm, for prismatic joints")
+    same_pose_deg: Positive = key("a positive number: joints this near are the same pose", 0.05)
+    same_pose_mm: Positive = key("a positive number of mm, for prismatic joints", 0.05)
 
 
 class UnitsTable(Table):

@@ -23,13 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
-from elastocal.model.function_cache import (
-    HashedFunction,
-    content_key,
-    entry_bytes,
-    fetch,
-    store,
-)
+from elastocal.model.function_cache import HashedFunction, content_key, entry_bytes, fetch, store
 
 # The C text of a function: CasADi's generated code for one row, and a loop over rows.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.above import Saved
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.files import read_json
 from elastocal.model.chain import Chain
 from elastocal.model.choice import cell_of
@@ -122,6 +122,17 @@ class CalibratedArm(Saved):
             True
         """
         return self.model.pose(q, self.x, force)
+
+
+def given_arm(name: str, given: Any) -> CalibratedArm:
+    """The arm itself, or that of a `Calibration`, which the option `name` takes."""
+    arm = getattr(given, "arm", given)
+    if not isinstance(arm, CalibratedArm):
+        raise InputError(
+            f"{option(name)} takes a calibrated arm, as fit.arm or what read_calibrated gives; "
+            f"found {type(arm).__name__}"
+        )
+    return arm
 
 
 def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import reduce
+from operator import matmul
 from pathlib import Path
 from typing import Literal
 
@@ -135,24 +137,25 @@ def _link(table: RawTable, i: int, convention: str) -> tuple[Array, Array]:
     """T_{i-1,i}(q_i) = before · motion(q_i) · after: the two constant factors."""
     theta0, alpha, beta = (_plausible(table, i, "angle", k) for k in ("theta0", "alpha", "beta"))
     d, a = (_plausible(table, i, "length", k) for k in ("d", "a"))
-    Rz_theta, Tz_d = _rotation(Z, theta0), _translation(Z, d)
-    Tx_a, Rx_alpha = _translation(X, a), _rotation(X, alpha)
-    Ry_beta = _rotation(Y, 0.0 if math.isnan(beta) else beta)
+    Rz_theta, Tz_d = rotation(Z, theta0), translation(Z, d)
+    Tx_a, Rx_alpha = translation(X, a), rotation(X, alpha)
+    Ry_beta = rotation(Y, 0.0 if math.isnan(beta) else beta)
     if convention == "standard":
-        return _numbers(Rz_theta), _numbers(Tz_d @ Tx_a @ Rx_alpha @ Ry_beta)
-    return _numbers(Rx_alpha @ Tx_a @ Ry_beta @ Rz_theta @ Tz_d), np.eye(4)
+        return product(Rz_theta), product(Tz_d, Tx_a, Rx_alpha, Ry_beta)
+    return product(Rx_alpha, Tx_a, Ry_beta, Rz_theta, Tz_d), np.eye(4)
 
 
-def _rotation(axis: tuple[float, float, float], angle: float) -> ca.SX:
+def rotation(axis: tuple[float, float, float], angle: float) -> ca.SX:
     return rigid.joint_motion("revolute", axis, angle)
 
 
-def _translation(axis: tuple[float, float, float], length: float) -> ca.SX:
+def translation(axis: tuple[float, float, float], length: float) -> ca.SX:
     return rigid.joint_motion("prismatic", axis, length)
 
 
-def _numbers(T: ca.SX) -> Array:
-    return np.array(ca.DM(T).full())
+def product(*factors: ca.SX) -> Array:
+    """The product (4, 4) of constant transforms."""
+    return np.array(ca.DM(reduce(matmul, factors)).full())
 
 
 def _plausible(table: RawTable, i: int, family: str, stem: str) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.cell.arm_description import EffectChoice
+from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
@@ -81,10 +81,7 @@ class Model:
     """
 
     def __init__(
-        self,
-        cell: Cell | str | Path,
-        markers: Sequence[str] = (),
-        backend: str | None = None,
+        self, cell: Cell | str | Path, markers: Sequence[str] = (), backend: str | None = None
     ) -> None:
         cell = cell_of(cell)
         self._markers_stated = bool(cell.tool.markers)
@@ -231,10 +228,12 @@ class Model:
 
     def with_effects(self, effects: tuple[EffectChoice, ...]) -> Model:
         """The same arm with another choice of effects."""
-        spec = replace(self.cell.model, effects=effects)
-        return Model.assembled(
-            self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend
-        )
+        return self._with(replace(self.cell.model, effects=effects))
+
+    def _with(self, spec: ModelSpec, extra: Sequence[tuple[Effect, str]] = ()) -> Model:
+        """The same arm with another [model]."""
+        cell = replace(self.cell, model=spec)
+        return Model.assembled(self.chain, cell, extra, self._symbolic.backend)
 
     @cached_property
     def rigid(self) -> Model:
@@ -242,9 +241,7 @@ class Model:
         spec = self.cell.model
         nominal = replace(spec.nominal, base_position=None, base_rotation=None)
         spec = replace(spec, effects=(), observe="position", nominal=nominal, link_gravity=False)
-        return Model.assembled(
-            self.chain, replace(self.cell, model=spec), backend=self._symbolic.backend
-        )
+        return self._with(spec)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -299,11 +296,7 @@ class Model:
         observe = "position" if spec.observe == "deflection" else spec.observe
         spec = replace(spec, effects=placed, observe=observe, link_gravity=False)
         motion = JointMotion()
-        return Model.assembled(
-            self.chain, replace(self.cell, model=spec),
-            [(motion, place) for place in motion.places(self.chain, self.cell)],
-            backend=self._symbolic.backend,
-        )  # fmt: skip
+        return self._with(spec, [(motion, w) for w in motion.places(self.chain, self.cell)])
 
     def deflection(self, table: Measurements, x: Array | None = None) -> NDArray:
         """Elastic deflections θ at static equilibrium.
@@ -331,10 +324,7 @@ class Model:
         return self._symbolic.equilibrium.solve(inputs, x)[0]
 
     def predict(
-        self,
-        table: Measurements,
-        x: Array | None = None,
-        observations: Observations | None = None,
+        self, table: Measurements, x: Array | None = None, observations: Observations | None = None
     ) -> NDArray:
         """Predicted observations.
 

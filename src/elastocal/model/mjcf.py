@@ -317,14 +317,13 @@ def shift(position: Sequence[float] | Array) -> Array:
     return transform(position, (1.0, 0.0, 0.0, 0.0))
 
 
-def import_mujoco() -> Any:
-    """The package; InputError where it is not installed."""
+def import_mujoco(what: str = "a MuJoCo model") -> Any:
+    """The package, which `what` needs; InputError where it is not installed."""
     try:
         import mujoco
     except ImportError:
         raise InputError(
-            "a MuJoCo model needs MuJoCo, which is not installed; run: pip install "
-            "elastocal[mujoco]"
+            f"{what} needs MuJoCo, which is not installed; run: pip install elastocal[mujoco]"
         ) from None
     return mujoco
 

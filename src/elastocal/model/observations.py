@@ -108,9 +108,7 @@ def _needed(column: Array | None, table: Measurements, names: str, kind: str) ->
     return column
 
 
-def pair_loaded_with_unloaded(
-    table: Measurements,
-) -> tuple[NDArray[np.int64], sparse.csr_array]:
+def pair_loaded_with_unloaded(table: Measurements) -> tuple[NDArray[np.int64], sparse.csr_array]:
     """Pair every loaded row with its unloaded partner: same configuration, repeat and marker.
 
     Where that repeat was not measured unloaded, the mean of all unloaded repeats of the same

@@ -416,8 +416,7 @@ def _xacro(path: Path, what: str) -> str:
 def _name(path: Path, element: ET.Element, known: Mapping[str, Any]) -> str:
     tag, name = element.tag, element.get("name", "").strip()
     require(
-        bool(name),
-        f'{path}: {tag} number {len(known) + 1} has no name; write <{tag} name="…">',
+        bool(name), f'{path}: {tag} number {len(known) + 1} has no name; write <{tag} name="…">'
     )
     require(
         name not in known,
@@ -496,8 +495,7 @@ def _vector(
         return default
     words, what = text.split(), f"{where}, {tag} {attribute}"
     require(
-        len(words) == 3,
-        f"{what}: '{text}' is not three numbers; write e.g. {attribute}=\"0 0 1\"",
+        len(words) == 3, f"{what}: '{text}' is not three numbers; write e.g. {attribute}=\"0 0 1\""
     )
     x, y, z = (_number(what, word) for word in words)
     return x, y, z

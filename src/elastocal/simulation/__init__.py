@@ -1,9 +1,8 @@
-"""Simulated measurements: from the model itself, and from MuJoCo's independent arm."""
+"""Simulated measurements."""
 
 from elastocal import loaded_on_demand
 
 ROOMS = {
-    "mujoco_arm": "MujocoArm",
     "simulate": "draw_errors expand_plan values_from",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]

@@ -16,12 +16,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 from elastocal.errors import InputError, option, require
-from elastocal.files import (
-    atomic_binary_writer,
-    atomic_write_text,
-    read_json,
-    remove_abandoned,
-)
+from elastocal.files import atomic_binary_writer, atomic_write_text, read_json, remove_abandoned
 from elastocal.screen import shown
 from elastocal.studies.study_folder import Outcome, Study
 

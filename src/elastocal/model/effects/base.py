@@ -97,6 +97,8 @@ class Effect:
     at: ClassVar[str] = ""
     # Its settings, unless `settings` says more.
     constants: ClassVar[tuple[Setting, ...]] = ()
+    # Its parameters, unless `parameters` says more.
+    unknowns: ClassVar[tuple[ParameterSpec, ...]] = ()
     # What the table must say for the effect to show, of NEEDS.
     needs: ClassVar[tuple[str, ...]] = ()
 
@@ -131,7 +133,7 @@ class Effect:
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         """The parameters at one place; loads may have none."""
-        return ()
+        return self.unknowns
 
     def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
         """Values of some parameters from which to look for the others, where nominal ones say
@@ -152,6 +154,12 @@ class Effect:
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         """Constants of the expression at one place that are set or searched, not fitted."""
         return self.constants
+
+    def stated(self, place: str, chain: Chain, cell: Cell) -> dict[str, float]:
+        """The values of its settings at a place by key: the cell's, else the default, else 0."""
+        given = cell.model.nominal.settings.get(place, {})
+        settings = self.settings(place, chain, cell)
+        return {s.key: float(given.get(s.key, s.default or 0.0)) for s in settings}
 
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
         """The smooth functions that its shrunk parameters at one place make up, if they do."""

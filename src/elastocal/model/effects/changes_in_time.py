@@ -40,9 +40,9 @@ def after(arm: Arm, moment: ca.SX) -> ca.SX:
     return arm.input("time", 1) >= moment
 
 
-def pose_change(prefix: str, length: float, angle: float) -> tuple[ParameterSpec, ...]:
-    """`prefix`_x … `prefix`_rz with typical sizes `length` in m and `angle` in rad."""
-    units, sizes = ["m"] * 3 + ["rad"] * 3, [length] * 3 + [angle] * 3
+def pose_change(prefix: str, length: float) -> tuple[ParameterSpec, ...]:
+    """`prefix`_x … `prefix`_rz with typical sizes `length` in m and 50 µrad."""
+    units, sizes = ["m"] * 3 + ["rad"] * 3, [length] * 3 + [5e-5] * 3
     return tuple(
         ParameterSpec(f"{prefix}_{k}", unit, 0.0, size)
         for k, unit, size in zip(KEYS, units, sizes, strict=True)
@@ -106,9 +106,7 @@ class BaseDrift(DrivenEffect):
     remedy = MEASURE_MONUMENTS
     needs = ("time",)
     entry = BaseMotion()
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return pose_change("drift", 5e-5, 5e-5)
+    unknowns = pose_change("drift", 5e-5)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         return ca.vertcat(*[p[f"drift_{k}"] for k in KEYS]) * warm_up(arm, p)
@@ -129,9 +127,7 @@ class FrameJump(DrivenEffect):
     remedy = MEASURE_MONUMENTS
     needs = ("time",)
     entry = BaseMotion()
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return pose_change("jump", 1e-4, 5e-5)
+    unknowns = pose_change("jump", 1e-4)
 
     def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
         return ("base",)
@@ -152,13 +148,11 @@ class MarkerSlip(DrivenEffect):
     constants = (change_time("slip_time_s"),)
     needs = ("time",)
     entry = MarkerMotion()
+    unknowns = tuple(ParameterSpec(f"slip_{k}", "m", 0.0, 1.5e-4) for k in "xyz")
 
     @property
     def of_the_measurement(self) -> bool:
         return True  # the marker slipped during one campaign
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(ParameterSpec(f"slip_{k}", "m", 0.0, 1.5e-4) for k in "xyz")
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         slip = ca.vertcat(*[p[f"slip_{k}"] for k in "xyz"])

@@ -11,12 +11,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.model.arm import Arm, ParameterSpec, Spring
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import (
-    STIFFNESS,
-    Effect,
-    Symbols,
-    index,
-)
+from elastocal.model.effects.base import STIFFNESS, Effect, Symbols, index
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import SHORTEST, link_ends
 from elastocal.units import Array

@@ -10,14 +10,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import (
-    OFFSET,
-    Effect,
-    Symbols,
-    index,
-    joints,
-    motion_unit,
-)
+from elastocal.model.effects.base import OFFSET, Effect, Symbols, index, joints, motion_unit
 from elastocal.model.effects.driven import DrivenEffect, JointMotion
 
 
@@ -43,9 +36,7 @@ class EncoderScale(DrivenEffect):
     name = "encoder_scale"
     stage = "transmission"
     entry = JointMotion()
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (ParameterSpec("encoder_scale", "1", 0.0, 3e-4),)
+    unknowns = (ParameterSpec("encoder_scale", "1", 0.0, 3e-4),)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         return p["encoder_scale"] * arm.q_commanded[index(place)]
@@ -178,15 +169,12 @@ class GearSpectrum(DrivenEffect):
 
     def lines(self, place: str, chain: Chain, cell: Cell) -> dict[int, float]:
         """Numbers of the lines that there are, and how uncertain their orders are."""
-        settings = self.settings(place, chain, cell)
-        stated = cell.model.nominal.settings.get(place, {})
-        given = {s.key: float(stated.get(s.key, s.default or 0.0)) for s in settings}
+        given = self.stated(place, chain, cell)
         known = range(1, MOST_LINES + 1)
         return {k: given[f"order_sd_{k}"] for k in known if given.get(f"order_{k}", 0.0) > 0}
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        stated = cell.model.nominal.settings.get(place, {})
-        size = float(stated.get("spectrum_size_rad", 5e-5))
+        size = self.stated(place, chain, cell)[self.sized_by]
         specs = []
         for k, sd in self.lines(place, chain, cell).items():
             parts = [("sin", size), ("cos", size)]
@@ -218,13 +206,11 @@ class WristCoupling(DrivenEffect):
     name = "wrist_coupling"
     stage = "transmission"
     entry = JointMotion()
+    unknowns = tuple(ParameterSpec(f"coupling_{k}", "1", 0.0, 2e-4) for k in "abc")
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         turning = chain.n_joints >= 6 and set(chain.kinds[-3:]) == {"revolute"}
         return ("wrist",) if turning else ()
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(ParameterSpec(f"coupling_{k}", "1", 0.0, 2e-4) for k in "abc")
 
     def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
         return joints(chain)[-2:]

@@ -34,13 +34,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain, Joint, finite_ranges
-from elastocal.model.effects.base import (
-    REVOLUTE,
-    Effect,
-    Symbols,
-    index,
-    links,
-)
+from elastocal.model.effects.base import REVOLUTE, Effect, Symbols, index, links
 from elastocal.model.effects.compliances import transverse_axes
 from elastocal.model.effects.driven import DrivenEffect, JointMotion
 from elastocal.model.effects.loads import STANDARD_GRAVITY
@@ -121,9 +115,9 @@ class GravitySag(DrivenEffect):
     entry = JointMotion()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = cell.model.nominal.settings.get(place, {}).get("sag_size_rad", 2e-4)
+        size = self.stated(place, chain, cell)[self.sized_by]
         return tuple(
-            ParameterSpec(f"sag_{k + 1}", "rad", 0.0, float(size), shrunk=True)
+            ParameterSpec(f"sag_{k + 1}", "rad", 0.0, size, shrunk=True)
             for k in range(len(independent(chain, index(place))[0]))
         )
 
@@ -174,9 +168,7 @@ class LinkWeights(Effect):
         return (Setting(self.sized_by, "range", density, 1e-9, 1e9),)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        (setting,) = self.settings(place, chain, cell)
-        stated = cell.model.nominal.settings.get(place, {})
-        density = float(stated.get(setting.key, setting.default))  # type: ignore[arg-type]
+        density = self.stated(place, chain, cell)[self.sized_by]
         found: list[ParameterSpec] = []
         described = zip(links(chain), chain.kinds, lengths_carried(chain).tolist(), strict=True)
         for link, kind, length in described:

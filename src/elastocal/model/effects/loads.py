@@ -62,12 +62,10 @@ class PayloadError(Effect):
     formats = ("elastic",)
     remedy = WEIGH_LOAD
     needs = ("load",)
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (
-            ParameterSpec("payload_scale", "1", 0.0, 0.02),
-            *(ParameterSpec(f"load_point_{k}", "m", 0.0, 0.01) for k in "xyz"),
-        )
+    unknowns = (
+        ParameterSpec("payload_scale", "1", 0.0, 0.02),
+        *(ParameterSpec(f"load_point_{k}", "m", 0.0, 0.01) for k in "xyz"),
+    )
 
     def load(self, arm: Arm, place: str, p: Symbols) -> None:
         force, T = arm.input("force", 3), arm.T_tracker_flange

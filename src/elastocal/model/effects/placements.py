@@ -39,13 +39,9 @@ class BaseFrame(Effect):
         position = np.zeros(3) if nominal.base_position is None else nominal.base_position
         rotation = np.eye(3) if nominal.base_rotation is None else nominal.base_rotation
         vector = Rotation.from_matrix(rotation).as_rotvec()
-        values = [*position, *vector]
-        sizes = [3e-3] * 3 + [3e-3] * 3
         units = ["m"] * 3 + ["rad"] * 3
-        return tuple(
-            ParameterSpec(k, u, float(v), s)
-            for k, u, v, s in zip(KEYS, units, values, sizes, strict=True)
-        )
+        known = zip(KEYS, units, [*position, *vector], strict=True)
+        return tuple(ParameterSpec(k, u, float(v), 3e-3) for k, u, v in known)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         position = ca.vertcat(p["x"], p["y"], p["z"])
@@ -78,11 +74,10 @@ class LinkGeometry(Effect):
     at = "links"
     rank = LINK
     formats = ("rigid", "elastic")
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        lengths = [ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")]
-        angles = [ParameterSpec(k, "rad", 0.0, 1e-3) for k in ("rx", "ry", "rz")]
-        return (*lengths, *angles)
+    unknowns = (
+        *(ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")),
+        *(ParameterSpec(k, "rad", 0.0, 1e-3) for k in ("rx", "ry", "rz")),
+    )
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         i = index(place)
@@ -123,12 +118,10 @@ class MarkerOrientation(Effect):
     registered = True
     rank = MARKER
     formats = ("rigid", "elastic")
+    unknowns = tuple(ParameterSpec(k, "rad", 0.0, 3e-3) for k in ("rx", "ry", "rz"))
 
     def may_be_missing(self, cell: Cell) -> bool:
         return cell.model.observe == "pose"
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(ParameterSpec(k, "rad", 0.0, 3e-3) for k in ("rx", "ry", "rz"))
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         vector = ca.vertcat(p["rx"], p["ry"], p["rz"])

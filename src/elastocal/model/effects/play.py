@@ -45,13 +45,11 @@ class Backlash(TorqueEffect):
     name = "backlash"
     stage = "transmission"
     at = "turning joints"
+    unknowns = (ParameterSpec("backlash", "rad", 0.0, 2e-4, lower=0.0),)
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
         sided = cell.model.play_side == "load_and_approach" and cell.model.approach != BY_ORDER
         return (*super().needed(cell), "approach") if sided else super().needed(cell)
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (ParameterSpec("backlash", "rad", 0.0, 2e-4, lower=0.0),)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         i = index(place)
@@ -124,12 +122,10 @@ class MoveLag(DrivenEffect):
     together = True
     family = "move"
     entry = JointMotion()
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (
-            ParameterSpec("move_lag", "rad", 0.0, 1e-4),
-            ParameterSpec("move_lag_sign", "rad", 0.0, 5e-5),
-        )
+    unknowns = (
+        ParameterSpec("move_lag", "rad", 0.0, 1e-4),
+        ParameterSpec("move_lag_sign", "rad", 0.0, 5e-5),
+    )
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         move = arm.input("move", arm.chain.n_joints)

@@ -131,12 +131,6 @@ class Course:
         return arm.input("time", 1) if not self.turns else arm.q_commanded[index(self.name)]
 
 
-def _given(cell: Cell, place: str, settings: tuple[Setting, ...]) -> dict[str, float]:
-    """The values of settings that decide how many parameters there are."""
-    stated = cell.model.nominal.settings.get(place, {})
-    return {s.key: float(stated.get(s.key, s.default or 0.0)) for s in settings}
-
-
 class JointCurve(DrivenEffect):
     """δq = f(q), f a smooth function of the commanded joint angle q (see the module).
 
@@ -153,19 +147,15 @@ class JointCurve(DrivenEffect):
     family = "angle"
     sized_by = "curve_size_rad"
     entry = JointMotion()
-
-    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (
-            Setting("curve_size_rad", "range", 2e-4, 0.0, 1.0),
-            Setting("curve_length_rad", "range", 0.3, 1e-3, 100.0),
-            Setting("curve_low_rad", "range", -math.pi, -100.0, 100.0),
-            Setting("curve_high_rad", "range", math.pi, -100.0, 100.0),
-        )
+    constants = (
+        Setting("curve_size_rad", "range", 2e-4, 0.0, 1.0),
+        Setting("curve_length_rad", "range", 0.3, 1e-3, 100.0),
+        Setting("curve_low_rad", "range", -math.pi, -100.0, 100.0),
+        Setting("curve_high_rad", "range", math.pi, -100.0, 100.0),
+    )
 
     def course(self, place: str, chain: Chain, cell: Cell) -> Course:
-        given = _given(cell, place, self.settings(place, chain, cell))
-        keys = ("size", "length", "low", "high")
-        return Course(place, *(given[f"curve_{key}_rad"] for key in keys))
+        return Course(place, *self.stated(place, chain, cell).values())
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         course = self.course(place, chain, cell)
@@ -229,7 +219,7 @@ class ResidualField(DrivenEffect):
 
     def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
         """What the field follows at this place."""
-        given = _given(cell, place, self.settings(place, chain, cell))
+        given = self.stated(place, chain, cell)
         keys = ("size", "length", "low", "high")
         found = (
             Course(name, *(given[f"field_{name}_{key}"] for key in keys))

@@ -21,14 +21,6 @@ from elastocal.model.effects.driven import DrivenEffect, JointMotion, LinkFrame
 from elastocal.model.effects.placements import link_ends
 from elastocal.units import Array
 
-COUPLING = Setting("coupling_rad_per_Nm", "range", 3e-7, 1e-15, 1.0)
-TILT = Setting("tilt_rad_per_Nm", "range", 3e-7, 1e-15, 1.0)
-
-
-def _size(setting: Setting, place: str, cell: Cell) -> float:
-    stated = cell.model.nominal.settings.get(place, {})
-    return float(stated.get(setting.key, setting.default))  # type: ignore[arg-type]
-
 
 class TorqueCoupling(DrivenEffect):
     """δq_j = Σ_{i≠j} k_i τ_i with the recorded torques τ_i of the other joints; k_i in rad/(N m).
@@ -40,7 +32,7 @@ class TorqueCoupling(DrivenEffect):
     name = "torque_coupling"
     stage = "transmission"
     at = "joints"
-    constants = (COUPLING,)
+    constants = (Setting("coupling_rad_per_Nm", "range", 3e-7, 1e-15, 1.0),)
     together = True
     family = "torque"
     sized_by = "coupling_rad_per_Nm"
@@ -48,7 +40,8 @@ class TorqueCoupling(DrivenEffect):
     entry = JointMotion()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size, unit = _size(COUPLING, place, cell), motion_unit(place, chain)
+        size = self.stated(place, chain, cell)[self.sized_by]
+        unit = motion_unit(place, chain)
         return tuple(
             ParameterSpec(f"coupling_{other}", f"{unit}/(N*m)", 0.0, size, shrunk=True)
             for other in turning_joints(chain)
@@ -83,7 +76,7 @@ class TorqueTilt(DrivenEffect):
 
     name = "torque_tilt"
     stage = "geometry"
-    constants = (TILT,)
+    constants = (Setting("tilt_rad_per_Nm", "range", 3e-7, 1e-15, 1.0),)
     together = True
     family = "torque"
     sized_by = "tilt_rad_per_Nm"
@@ -94,7 +87,7 @@ class TorqueTilt(DrivenEffect):
         return tuple(link for link in links(chain) if tilt_axes(chain, index(link)))
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = _size(TILT, place, cell)
+        size = self.stated(place, chain, cell)[self.sized_by]
         return tuple(
             ParameterSpec(f"tilt_{key}", "rad/(N*m)", 0.0, size, shrunk=True)
             for key in tilt_axes(chain, index(place))

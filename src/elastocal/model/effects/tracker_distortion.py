@@ -30,16 +30,14 @@ class TrackerDistortion(Effect):
     name = "tracker_distortion"
     stage = "tracker"
     remedy = MEASURE_SCALE
+    unknowns = (
+        ParameterSpec("scale", "1", 0.0, 2e-5),
+        ParameterSpec("refraction", "1/m", 0.0, 1e-6),
+        *(ParameterSpec(key, "rad", 0.0, 2e-5) for key in ENCODERS),
+    )
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return () if cell.model.observe == "distance" else ("tracker",)
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (
-            ParameterSpec("scale", "1", 0.0, 2e-5),
-            ParameterSpec("refraction", "1/m", 0.0, 1e-6),
-            *(ParameterSpec(key, "rad", 0.0, 2e-5) for key in ENCODERS),
-        )
 
     def read(self, arm: Arm, place: str, p: Symbols) -> None:
         station = rigid.constant(arm.cell.tracker.position)
