@@ -213,7 +213,7 @@ def diagnose(
     progress("confirming")
     rng = np.random.default_rng(options.seed)
     few = max(found.chosen.score, found.nothing.score)
-    answer_of_sum = SumAnswer(dataset, full, total, hidden, rng)
+    answer_of_sum = SumAnswer(dataset, full, total, hidden, rng).decided
     gained = compared_score(full, total, found.chosen) - few
     if gained > CLEARLY and answer_of_sum.n_causes >= MANY:
         return _diagnosis_of_sum(
