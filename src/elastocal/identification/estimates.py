@@ -23,7 +23,9 @@ from elastocal.identification.residuals import ResidualSummary, rms_3d, summaris
 from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.model.arm import Parameter
+from elastocal.model.calibrated import ShownPoses
 from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray
 
 CORRELATED = 0.9
@@ -92,6 +94,7 @@ def summarise(
         weights=solution.problem.weights,
         noise_parts=noise_parts(found),
     )
+    result = replace(result, shown=_shown(solution, covariance, found.leverage))
     dofs = found.intervals.covariance.dof
     predicted = predicted_error(
         result.arm, observed, result.excess, float(np.median(dofs)) if len(dofs) else np.inf,
@@ -124,6 +127,34 @@ def leverage_of(solution: Solution, known: Array | None) -> Array | None:
     R = fit.r_factor.R[: len(fit.columns)]
     Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
     return np.minimum((Q**2).sum(axis=0), 1.0)
+
+
+def uncertainty_of(
+    observed: Observations, B: Array, covariance: Array, left: Array | float = 1.0
+) -> Array:
+    """Standard deviation (configurations,) in m that the fit's own uncertainty gives a predicted
+    position, mean square over a configuration's readings; B (rows, determined).
+
+    A row that the fit holds with leverage h is known with variance v there, with v/(1 − h) by the
+    fit to the others; `left` (rows,) are 1 − h.
+    """
+    variance = np.maximum(((B @ covariance) * B).sum(axis=1), 0.0) / left
+    each = variance.reshape(-1, observed.size)[:, :3].sum(axis=1)
+    _, code = np.unique(observed.configuration, return_inverse=True)
+    return np.asarray(np.sqrt(np.bincount(code.ravel(), each) / np.bincount(code.ravel())))
+
+
+SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it
+
+
+def _shown(solution: Solution, covariance: Array, known: Array | None) -> ShownPoses | None:
+    """How sure the fit is where it was measured; None where the table is too large to say."""
+    observed, leverage = solution.problem.observations, leverage_of(solution, known)
+    if solution.problem.large or leverage is None or not np.isfinite(covariance).all():
+        return None
+    left = np.maximum(1 - leverage, SEEN_BY_OTHERS)
+    std = uncertainty_of(observed, solution.fit.B, covariance, left)
+    return ShownPoses(float(std.max()), len(std))
 
 
 def _estimates(
