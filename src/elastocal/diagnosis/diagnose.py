@@ -227,7 +227,7 @@ def diagnose(
     progress("confirming")
     rng = np.random.default_rng(options.seed)
     few = max(found.chosen.score, found.nothing.score)
-    answer_of_sum = SumAnswer(dataset, full, total, hidden, rng)
+    answer_of_sum = SumAnswer(dataset, full, total, hidden, rng).decided
     gained = compared_score(full, total, found.chosen) - few
     many = gained > CLEARLY and answer_of_sum.n_causes >= MANY
     found = found if many else search.settled(found)

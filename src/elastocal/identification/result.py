@@ -34,7 +34,12 @@ from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
-from elastocal.model.calibrated import CalibratedArm, OpenParameters, nominal_flange_rows
+from elastocal.model.calibrated import (
+    CalibratedArm,
+    OpenParameters,
+    ShownPoses,
+    nominal_flange_rows,
+)
 from elastocal.model.calibrated_tool import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
@@ -256,6 +261,7 @@ class Calibration(Result):
         weights: Those of the fit.
         noise_parts: Mean square 3-D noise (m²) of single "readings", and what readings of
             "visits" have in common.
+        shown: How sure the fit is where it was measured; None of a large table.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -304,6 +310,7 @@ class Calibration(Result):
     copies: tuple[int, ...] = ()
     weights: Weights | None = field(default=None, compare=False)
     noise_parts: dict[str, float] = field(default_factory=dict)
+    shown: ShownPoses | None = None
 
     @property
     def covariance(self) -> Array:
@@ -486,6 +493,7 @@ class Calibration(Result):
             self.left,
             0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean())),
             measured_loads(self.observations),
+            self.shown,
         )
 
     @cached_property
@@ -592,6 +600,7 @@ class Calibration(Result):
             "test_max_um": None if self.test is None else _um(self.test.maximum),
             "verdict": self.verdict.to_json(),
             "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
+            "measured_poses": None if self.shown is None else self.shown.to_json(),
             "open": None if self.left is None else self.left.to_json(),
             "noise": self.noise.to_json(),
             "cell_noise": {

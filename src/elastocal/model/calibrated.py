@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -53,6 +54,25 @@ class OpenParameters:
         }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class ShownPoses:
+    """How sure a fit is where it was measured: of each of `configurations` the standard deviation
+    in m of the place predicted from the others is `most` at most."""
+
+    most: float
+    configurations: int
+
+    def chance(self, beyond: int, n: int) -> float:
+        """Probability that so many of n poses or more are less sure than all that were measured,
+        were they drawn alike: Π (n − i)/(n + m − i), i < beyond, of any exchangeable numbers."""
+        i = np.arange(beyond)
+        return float(np.prod((n - i) / (n + self.configurations - i)))
+
+    def to_json(self) -> dict[str, float]:
+        """JSON-ready."""
+        return {"largest_std_um": self.most * 1e6, "configurations": self.configurations}
+
+
 @dataclass(frozen=True, repr=False)
 class CalibratedArm(Saved):
     """A calibrated arm: a model and the parameter values that it predicts with.
@@ -71,6 +91,7 @@ class CalibratedArm(Saved):
         left: The parameters that the data left open; None in results that do not say.
         lacking: 3-D rms in m of what the model may lack, as far as the readings told.
         loads: (L, 3) N, the forces under which it was measured; none in results that do not say.
+        shown: How sure the fit is where it was measured; None in results that do not say.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -89,6 +110,7 @@ class CalibratedArm(Saved):
     left: OpenParameters | None = None
     lacking: float = 0.0
     loads: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    shown: ShownPoses | None = None
 
     def __repr__(self) -> str:
         return (
@@ -158,6 +180,7 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
         None if arm.left is None else replace(arm.left, mixing=arm.left.mixing[kept]),
         arm.lacking,
         arm.loads,
+        arm.shown,
     ), tuple(gone)  # fmt: skip
 
 
@@ -203,6 +226,7 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
         _left_open(result.get("open"), held, determined, result_path),
         _lacking(result.get("predicted_new_poses_um")),
         _loads(result.get("loads_N", []), result_path),
+        _shown(result.get("measured_poses")),
     )
 
 
@@ -330,6 +354,14 @@ def _loads(stated: Any, path: str | Path) -> Array:
             "identify"
         )
     return loads
+
+
+def _shown(stated: Any) -> ShownPoses | None:
+    try:
+        found = ShownPoses(float(stated["largest_std_um"]) * 1e-6, int(stated["configurations"]))
+    except (TypeError, KeyError, ValueError, OverflowError):
+        return None
+    return found if math.isfinite(found.most) and found.configurations > 0 else None
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:
