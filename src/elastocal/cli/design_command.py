@@ -200,7 +200,8 @@ def _what_next(cell: Path, plan: Path, augment: Path | None) -> str:
     """What to do with the plan."""
     added = "" if augment is None else f" (add them to {augment})"
     return (
-        f"Next: measure {plan} in its order, a row with x_mm, y_mm, z_mm for each marker{added}; then\n"
+        f"Next: measure {plan} in its order, a row with x_mm, y_mm, z_mm for each marker{added}; "
+        "then\n"
         f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html\n"
         f"To try it without an arm: elastocal simulate {cell} {plan} -o data.csv --draw 1"
     )

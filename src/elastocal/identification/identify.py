@@ -171,7 +171,7 @@ def _test_errors(
     error = residual_at(model, parts, result.x)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     rms = rms_3d(error, observed.size)
-    errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length))
+    errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length), errors=length)
     leverage = None if found is None else leverage_of(found.solution, found.leverage)
     if leverage is None or not np.isfinite(result.covariance).all():
         return errors
