@@ -41,6 +41,9 @@ def identify(
         Path | None, typer.Option(help="Measurements never fitted, to test the result on.")
     ] = None,
     report: ReportFile = None,
+    certificate: Annotated[
+        Path | None, typer.Option(help="Write a calibration certificate (one HTML page).")
+    ] = None,
     residuals: Annotated[
         Path | None, typer.Option(help="Write residuals of every reading as CSV.")
     ] = None,
@@ -124,7 +127,7 @@ def identify(
     from elastocal.measurements import read_matrix
     from elastocal.model.choice import cell_of
 
-    written = check_outputs(output, report, residuals)
+    written = check_outputs(output, report, residuals, certificate)
     limits = limits_of(require or [])
     inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
     known = cell_of(cell)  # its plug-ins may have the noise model
@@ -137,7 +140,9 @@ def identify(
             bounded=bounded, physical=physical, knowledge=knowledge, seed=seed, jobs=jobs,
             progress=progress,
         )  # fmt: skip
-        write_results(result, output, report, residuals, inputs, seed=seed)
+        write_results(
+            result, output, report, residuals, inputs, seed=seed, certificate=certificate
+        )  # fmt: skip
     if as_json:
         say(json_text(result.to_json()))
     else:
@@ -182,6 +187,7 @@ def write_results(
     seed: int,
     truth: Truth | None = None,
     published: Published | None = None,
+    certificate: Path | None = None,
 ) -> None:
     """Write what was asked for, all of it or nothing.
 
@@ -191,7 +197,7 @@ def write_results(
     from elastocal.files import together
     from elastocal.saving import save_residuals, write_json
 
-    with together(path for path in (output, residuals, report) if path is not None):
+    with together(p for p in (output, residuals, report, certificate) if p is not None):
         if output is not None:
             write_json(output, result.to_json())
         if residuals is not None:
@@ -200,3 +206,7 @@ def write_results(
             from elastocal.report.page import write_page
 
             write_page(result, report, inputs, repeated(), seed, truth=truth, published=published)
+        if certificate is not None:
+            from elastocal.report.page import write_page
+
+            write_page(result, certificate, inputs, repeated(), seed, certificate=True)

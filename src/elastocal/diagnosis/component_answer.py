@@ -30,7 +30,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, left_out_residual, rms_with_interval
-from elastocal.identification.findings import BudgetStep
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.model.effects.base import Stage, index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve

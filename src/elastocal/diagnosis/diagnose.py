@@ -46,7 +46,7 @@ from elastocal.diagnosis.verdict import (
 )
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_writer
-from elastocal.identification.findings import BudgetStep
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements

@@ -5,7 +5,7 @@ from elastocal import loaded_on_demand
 ROOMS = {
     "dh_table": "split",
     "export": "Exported Wish flanges to_yaml",
-    "exportable": "cost_of evaluate_pieces keep rpy",
+    "exportable": "Conditions cost_of evaluate_pieces keep random_table rpy",
     "mjcf_file": "MujocoRest",
     "urdf_file": "Frames read_urdf_text",
 }

@@ -167,7 +167,7 @@ def _test_errors(model: Model, result: Calibration, table: Measurements) -> Test
     error = residual_at(model, parts, result.x)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     rms = rms_3d(error, observed.size)
-    errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length))
+    errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length), errors=length)
     if result.shown is None:
         return errors
     columns = np.array([model.names.index(name) for name in result.determined], dtype=np.int64)

@@ -130,7 +130,7 @@ class TestErrors:
     Of the fit's own uncertainty there `std` is the rms in m, `most_fitted` the largest of any
     configuration fitted, predicted from the others; so many of the test `configurations` lie
     beyond it (`far`), as they would by chance with probability `p_far`.  NaN and 1 where the table
-    is too large to say.
+    is too large to say.  `errors` (n,) are all of them.
     """
 
     __test__ = False  # not a pytest class
@@ -143,6 +143,7 @@ class TestErrors:
     far: int = 0
     configurations: int = 0
     p_far: float = 1.0
+    errors: Array = field(default_factory=lambda: np.zeros(0), compare=False)
 
     def to_json(self) -> dict[str, float | None]:
         known = math.isfinite(self.std)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import option
+from elastocal.identification.error_budget import ErrorBudget, pose_accuracy
 from elastocal.identification.findings import (
     ABSORBED,
     ALONE,
@@ -17,11 +18,9 @@ from elastocal.identification.findings import (
     FIXED,
     INVISIBLE,
     WEAK,
-    ErrorBudget,
-    stage_of,
     standings,
 )
-from elastocal.identification.prediction import PredictedError
+from elastocal.identification.prediction import PredictedError, measured_loads
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import (
     LOPSIDED,
@@ -30,6 +29,7 @@ from elastocal.identification.result import (
     Estimate,
     deviation,
 )
+from elastocal.identification.scrutiny import stage_of
 from elastocal.report.formatting import (
     ShownTable,
     capital,
@@ -66,6 +66,7 @@ from elastocal.report.method_and_noise import (
 )
 from elastocal.report.smooth_view import counted_functions, smooth_lines, smooth_table
 from elastocal.text import listed, printable
+from elastocal.units import Array
 
 LARGEST_TERMS = 4
 Truth = dict[str, float]
@@ -490,6 +491,69 @@ def budget_table(result: Calibration, budget: ErrorBudget) -> ShownTable:
     return gap_table(budget_steps(result, budget), floor)
 
 
+def before_and_after(
+    result: Calibration, budget: ErrorBudget | None, by_place: bool = False
+) -> dict[str, Array]:
+    """Length (n,) in m of the errors by name: of the nominal arm and of the calibrated one in poses
+    that were not fitted, and on test data; `by_place` of the mean of what was read at one place."""
+    found = {}
+    if budget is not None and len(budget.steps) > 1:
+        ends = {nominal_arm_held_out(result): budget.steps[0], "calibrated": budget.steps[-1]}
+        for name, step in ends.items():
+            found[name] = np.linalg.norm(step.errors, axis=1)
+            if by_place:
+                found[name] = pose_accuracy(result.observations, step.errors)
+    if result.test is not None and len(result.test.errors) and not by_place:
+        found["calibrated, test data"] = result.test.errors
+    return found
+
+
+def spread_table(found: dict[str, Array], count: str = "readings") -> ShownTable:
+    """Mean, standard deviation, 95 % quantile and maximum of lengths (n,) in m, by name."""
+    rows = []
+    for name, e in found.items():
+        sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())
+        rows.append((name, str(len(e)), *(length(float(size)) for size in sizes)))
+    return ShownTable(("error of the position", count, "mean", "std", "95 %", "max"), rows)
+
+
+def _newtons(force: Array) -> str:
+    return f"({', '.join(f'{v:g}' for v in force)}) N"
+
+
+def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dict[str, Any]:
+    """Words and tables of the calibration certificate."""
+    tracker = result.model.cell.tracker
+    noise = (
+        "none stated"
+        if tracker.noise is None
+        else ", ".join(
+            f"{name.replace('_', ' ')} {', '.join(length(float(v)) for v in np.atleast_1d(value))}"
+            + (" per m" if name.endswith("per_m") else "")
+            for name, value in vars(tracker.noise).items()
+        )
+    )
+    facts = [
+        ("Robot", printable(result.model.chain.name)),
+        ("Instrument, standard deviations", noise),
+        ("Readings", readings(result)),
+        ("Loads", "; ".join(_newtons(f) for f in measured_loads(result.observations))),
+        ("Identified", what_was_identified(result)),
+        ("Method", _sentence(method_and_weights(result))),
+    ]
+    if result.predicted is not None:
+        facts.append(("Expected where nobody measured", at_new_poses(result.predicted)))
+    if result.test is not None:
+        t = result.test
+        told = f"{length(t.mean)} mean, {length(t.maximum)} at most of {counted(t.n, 'reading')}"
+        facts.append(("Test data", told))
+    return {
+        "judgement": judgement(result),
+        "facts": facts,
+        "accuracy": spread_table(before_and_after(result, budget, by_place=True), "places"),
+    }
+
+
 def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str, str]:
     """Value, half width or both ends, unit and true value; "–" for what is not determined."""
     if e.value is None or e.ci95 is None:
@@ -696,6 +760,7 @@ def identification_contents(
         "error_line": _sentence(error_line(result)),
         "warnings": [printable(w) for w in result.warnings],
         "budget": None if budget is None else budget_table(result, budget),
+        "spread": spread_table(before_and_after(result, budget)),
         "floor": "Nothing says how large the noise alone is."
         if budget is None or budget.floor is None
         else f"The dashed line is what noise alone gives ({budget.floor_name}).",
