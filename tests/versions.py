@@ -75,14 +75,16 @@ def main() -> int:
         for name in ("pyproject.toml", "README.md", "LICENSE"):
             shutil.copyfile(ROOT / name, source / name)
         for version in asked.versions[::-1] if asked.one else asked.versions:
-            begun, python = time.monotonic(), interpreter(version)
+            begun, python = (time.monotonic(), os.times()), interpreter(version)
             if python is None:
                 print(f"Python {version}: left out, there is none on this machine", flush=True)
                 continue
             folder = Path(place, version)
             folder.mkdir()
             try:
-                print(f"{tried(python, source, folder)}, {time.monotonic() - begun:.0f} s")
+                told = tried(python, source, folder)
+                spent = sum(os.times()[2:4]) - sum(begun[1][2:4])
+                print(f"{told}; {time.monotonic() - begun[0]:.0f} s, {spent:.0f} of processor time")
             except (subprocess.CalledProcessError, AssertionError) as error:
                 failed += 1
                 print(f"Python {version}: {error}")
