@@ -5,6 +5,7 @@ PYTHON ?= python3
 CONSTRAINTS ?= constraints.txt
 WORKERS ?= 2
 PYTEST_ARGS ?=
+VERSIONS_ARGS ?=
 BENCH_ARGS ?=
 
 VENV := .venv
@@ -30,7 +31,7 @@ help:
 	@echo "make demo       set up .venv if needed, then calibrate a simulated arm"
 	@echo "make test       the test suite              (PYTEST_ARGS=\"tests/model -x\", WORKERS=2)"
 	@echo "make test-long  the long studies among the tests"
-	@echo "make test-versions  the wheel with every other supported Python that is found"
+	@echo "make test-versions  the wheel with every other supported Python that is found (VERSIONS_ARGS=--one)"
 	@echo "make bench      the benchmarks, to benchmarks/result.md      (BENCH_ARGS=--full: all sizes)"
 	@echo "make lint       ruff check, ruff format --check, mypy"
 	@echo "make docs       the documentation as pages in site/ (strict: a broken link is an error)"
@@ -47,6 +48,8 @@ demo: $(RUN_TIME)
 test test-long: export OPENBLAS_NUM_THREADS = 1
 test test-long: export OMP_NUM_THREADS = 1
 test test-long: export MKL_NUM_THREADS = 1
+# What is compiled to bytecode is kept: the tests start some hundred processes.
+test test-long: export PYTHONDONTWRITEBYTECODE =
 # What the tests compile stays with them.
 test test-long: export ELASTOCAL_CACHE = $(CURDIR)/$(VENV)/cache
 
@@ -57,7 +60,7 @@ test-long: $(TEST_TOOLS)
 	$(PYTEST) -m long $(PYTEST_ARGS)
 
 test-versions: $(RUN_TIME)
-	$(BIN)/python tests/versions.py
+	$(BIN)/python tests/versions.py $(VERSIONS_ARGS)
 
 bench: $(RUN_TIME)
 	$(BIN)/python benchmarks/run.py $(BENCH_ARGS)

@@ -37,6 +37,7 @@ def whole(tmp_path_factory):
     for seed in (0, 1):
         assert design(cell, "--seed", seed).exit_code == 0
         plans[seed] = (folder / "plan.csv").read_bytes()
+    assert plans[0] != plans[1]
     return plans
 
 

@@ -26,7 +26,8 @@ PROGRAM = (
 SUMMARY = """
 
 def summary(frame):
-    return f"\x1b[31mrows: {len(frame)}, tasks in order: {list(frame.task.unique()) == sorted(frame.task)}"
+    sorted_too = list(frame.task.unique()) == sorted(frame.task)
+    return f"\x1b[31mrows: {len(frame)}, tasks in order: {sorted_too}"
 """
 SLOW = "import time\n" + SCRIPT.replace("    x = rng", "    time.sleep({sleep})\n    x = rng")
 

@@ -94,14 +94,18 @@ def case(model: Model, table: Measurements, disturbed: bool = True) -> Case:
 
 
 @lru_cache
-def everything(observed: str, deflection_model: str, disturbed: bool = True) -> Case:
-    """All effects together, so that each acts on the others' derivatives."""
+def with_everything(observed: str, deflection_model: str) -> Model:
     effects = [second(name) for name in with_parameters(observed)]
     effects += [f"joint_compliance:joint{i}" for i in (1, 3, 4, 5, 6)]
     cell = full_cell(effects, observed, deflection_model=deflection_model)
-    return case(
-        Model.assembled(kr270_chain(), cell), random_table(kr270_chain(), 4, seed=3), disturbed
-    )
+    return Model.assembled(kr270_chain(), cell)
+
+
+@lru_cache
+def everything(observed: str, deflection_model: str, disturbed: bool = True) -> Case:
+    """All effects together, so that each acts on the others' derivatives."""
+    table = random_table(kr270_chain(), 4, seed=3)
+    return case(with_everything(observed, deflection_model), table, disturbed)
 
 
 def complex_step(c: Case, k: int) -> NDArray:
@@ -151,6 +155,14 @@ def largest_excess(c: Case, columns: Sequence[int]) -> float:
     return worst
 
 
+def spread(columns: list[int], most: int) -> list[int]:
+    """At most so many of the columns: curves and spectra have hundreds of one form, and all of
+    one place are looked at where values are nominal."""
+    return columns if len(columns) <= most else [
+        columns[k] for k in np.unique(np.linspace(0, len(columns) - 1, most).astype(int))
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("deflection_model", ["equilibrium", "linear"])
 @pytest.mark.parametrize(
     "effect, observed", [(effect, o) for o in OBSERVED for effect in with_parameters(o)]
@@ -160,7 +172,7 @@ def test_of_every_effect_at_every_observation(
 ) -> None:
     c = everything(observed, deflection_model)
     assert c.columns(effect)
-    assert largest_excess(c, c.columns(effect)) <= 1
+    assert largest_excess(c, spread(c.columns(effect), 20)) <= 1
 
 
 @pytest.mark.parametrize("effect", with_parameters())
@@ -186,7 +198,7 @@ def test_at_all_places(effect: str) -> None:
     chain = kr270_chain()
     cell = full_cell({"joint_compliance", effect})
     c = case(Model.assembled(chain, cell), random_table(chain, 3, seed=5))
-    assert largest_excess(c, c.columns(effect)) <= 1
+    assert largest_excess(c, spread(c.columns(effect), 60)) <= 1
 
 
 @pytest.mark.parametrize("observed", OBSERVED)
@@ -235,9 +247,8 @@ def test_with_a_compliance_per_level(observed: str, deflection_model: str) -> No
     np.testing.assert_array_equal(moved, level[lead][:, None] == np.arange(3))
 
 
-@pytest.mark.parametrize("deflection_model", ["equilibrium", "linear"])
 @pytest.mark.parametrize("observed", OBSERVED)
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed, deflection_model", [(1, "equilibrium"), (4, "linear")])
 def test_of_chains_with_sliding_joints(
     seed: int, observed: str, deflection_model: str, tmp_path: Path
 ) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy import linalg
@@ -205,24 +207,29 @@ class VisitTimes:
         ring = np.array([0, *tour, 0])
         return float(self.travel[ring[:-1], ring[1:]].sum())
 
-    def _errors(self, tour: list[int]) -> Array:
-        """(m·3,) error per m of drift in x, y, z, counted from the readings' mean time."""
-        there = np.array(tour)
-        before = np.concatenate([[0], there[:-1]])
-        step = self.travel[before, there] + self.change[before, there] + self.visit
-        time = np.cumsum(step)
+    @cached_property
+    def _step(self) -> Array:
+        return self.travel + self.change + self.visit
+
+    def _errors(self, ring: IntArray) -> Array:
+        """(m·3,) error per m of drift in x, y, z, counted from the readings' mean time; the visits
+        with a node 0 before and after them."""
+        there = ring[1:-1]
+        time = self._step[ring[:-2], there].cumsum()
         span = max(float(time[-1] - time[0]), 1e-300)
-        return np.asarray((time - time.mean()) / span @ self.share[there - 1])
+        return np.asarray((time - np.add.reduce(time) / len(time)) / span @ self.share[there - 1])
 
     def bias(self, tour: list[int]) -> float:
         """Error per m of drift in its worst direction."""
-        return float(np.linalg.norm(self._errors(tour).reshape(-1, 3), ord=2))
+        ring = np.array([0, *tour, 0])
+        return float(np.linalg.norm(self._errors(ring).reshape(-1, 3), ord=2))
 
     def price(self, tour: list[int]) -> float:
         """What annealing makes small: bias beyond `enough`, travel beyond `longest`, travel."""
-        errors = self._errors(tour)
-        bias = float(np.sqrt(errors @ errors)) / self.enough
-        driving = self.driving(tour) / self.longest
+        ring = np.array([0, *tour, 0])
+        errors = self._errors(ring)
+        bias = math.sqrt(errors @ errors) / self.enough
+        driving = float(np.add.reduce(self.travel[ring[:-1], ring[1:]])) / self.longest
         return max(bias - 1, 0.0) + 100 * max(driving - 1, 0.0) + 0.1 * driving
 
 
@@ -236,27 +243,28 @@ def balanced(
     rng = np.random.default_rng(seed)
     here, price = list(tour), clock.price(tour)
     best, least = here, price
-    draws = rng.random((steps, 4))
+    draws = rng.random((steps, 4)).tolist()
+    loads = [-1, *load.tolist()]  # by node
     cooling = (COLD / hot) ** (1 / steps)
     temperature = hot
     for kind, a, b, luck in draws:
         temperature *= cooling
-        new = _moved(here, load, kind, int(a * len(here)), int(b * len(here)))
+        new = _moved(here, loads, kind, int(a * len(here)), int(b * len(here)))
         if new is None:
             continue
         found = clock.price(new)
-        if found <= price or luck < np.exp((price - found) / temperature):
+        if found <= price or luck < math.exp((price - found) / temperature):
             here, price = new, found
             if price < least:
                 best, least = here, price
     return best
 
 
-def _moved(tour: list[int], load: IntArray, kind: float, i: int, j: int) -> list[int] | None:
+def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> list[int] | None:
     """Visits i and j exchanged, i put beside j, or what lies between them turned round; None
-    where that would change the blocks."""
-    state = load[np.array(tour) - 1]
-    if i == j or state[i] != state[j]:
+    where that would change the blocks of equal `load` by node."""
+    here = load[tour[i]]
+    if i == j or here != load[tour[j]]:
         return None
     new = tour.copy()
     if kind < 0.5:
@@ -264,18 +272,21 @@ def _moved(tour: list[int], load: IntArray, kind: float, i: int, j: int) -> list
         return new
     low, high = min(i, j), max(i, j)
     if kind < 0.7:
-        if (state[low : high + 1] != state[low]).any():
+        if any(load[node] != here for node in tour[low : high + 1]):
             return None
         new[low : high + 1] = new[low : high + 1][::-1]
         return new
-    alone = (i == 0 or state[i - 1] != state[i]) and (
-        i + 1 == len(tour) or state[i + 1] != state[i]
+    alone = (i == 0 or load[tour[i - 1]] != here) and (
+        i + 1 == len(tour) or load[tour[i + 1]] != here
     )
     if alone:
         return None  # its block would be gone
     new.insert(j, new.pop(i))
-    after = load[np.array(new) - 1]
-    return new if len(list(groupby(after))) <= len(list(groupby(state))) else None
+    return new if _blocks(new, load) <= _blocks(tour, load) else None
+
+
+def _blocks(tour: list[int], load: list[int]) -> int:
+    return sum(load[a] != load[b] for a, b in pairwise([0, *tour]))
 
 
 # Reference poses: the same pose again and again, which shows a drift by itself.
