@@ -11,7 +11,7 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell, setup_of
 
 from elastocal.planning import Certificate, Feasibility, Selection, Unreachable, ordered
-from elastocal.planning.design import MOST_REPLACED
+from elastocal.planning.arrangement import MOST_REPLACED
 
 CHAIN = kr270_chain()
 CELL = plan_cell(("joint_compliance",), loads=DOWN[None])

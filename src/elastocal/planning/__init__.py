@@ -16,7 +16,8 @@ ROOMS = {
         "make_criterion register"
     ),
     "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
-    "design": "DesignOptions DesignSearch Effort Selection ordered",
+    "arrangement": "Selection ordered",
+    "design": "DesignOptions DesignSearch Effort",
     "doubts": "in_doubt missing usual_sizes",
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
     "drift": "Alias Drifting",

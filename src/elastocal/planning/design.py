@@ -14,27 +14,25 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
-from elastocal.model.chain import joint_limits
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
+from elastocal.planning.arrangement import Selection, ordered
 from elastocal.planning.candidates import draw, joint_space
-from elastocal.planning.checkpoint import Checkpoint, Stage, State
+from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
-from elastocal.planning.drift import Alias, left_by_drift
+from elastocal.planning.drift import left_by_drift
 from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import (
     SizedPlan,
     exact_plan,
     random_information,
-    repaired,
     size_curve,
 )
-from elastocal.planning.execution import Execution, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Done, load_states, measured, next_number, readings_each
-from elastocal.planning.moves import Blockers, Unreachable
+from elastocal.planning.moves import Blockers
 from elastocal.planning.pins import Pins
 from elastocal.planning.plan import (
     CandidateCounts,
@@ -130,62 +128,6 @@ class DesignOptions:
 NEAR = 0.97  # of the bound on the pool: a continuum as near as that is not searched again
 REFINED = 4  # times at most
 ROUND = 1000  # added to the seed of each of them, beyond the rounds of polishing
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The plan as indices `chosen` (k,) into the `pool`, which has grown; Φ `value`.
-
-    From index `first` on the pool holds what came from local searches and the continuum, at its
-    end, once the plan is `whole`, the `pinned` poses that stay.
-    """
-
-    pool: FeasiblePool
-    chosen: IntArray
-    value: float
-    certificate: Certificate
-    first: int
-    pinned: int = 0
-
-    @property
-    def polished(self) -> int:
-        """Poses of the plan that are not candidates of the first pool."""
-        own = self.chosen < len(self.pool) - self.pinned
-        return int((own & (self.chosen >= self.first)).sum())
-
-    def whole(self, pinned: FeasiblePool | None) -> Selection:
-        """With the poses that stay, in the order of the levels, so that the table reads like
-        Table 2; of a level those that stay come first."""
-        pool, chosen, n = self.pool, np.sort(self.chosen), 0
-        if pinned is not None:
-            pool, n = pool.joined(pinned), len(pinned)
-            chosen = np.append(np.arange(len(self.pool), len(pool)), chosen)
-        chosen = chosen[np.argsort(pool.group[chosen], kind="stable")]
-        return replace(self, pool=pool, chosen=chosen, pinned=n)
-
-    def without(self, lost: IntArray, setup: Setup, shares: IntArray, stage: Stage) -> Selection:
-        """The best plan found without the candidates `lost`, from what is left of this one; what
-        `stage` has finished is taken from there.
-
-        The bounds hold: those of a pool are those of every part of it.
-        """
-        kept = np.setdiff1d(np.arange(len(self.pool)), lost)
-        pool = self.pool.take(kept)
-        left = np.searchsorted(kept, np.setdiff1d(self.chosen, lost))
-        problem = setup.problem(pool, shares)
-        state = stage.finished(lambda: {"chosen": repaired(problem, left)})
-        chosen = state["chosen"]
-        value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
-        c = self.certificate
-        of_pool, of_continuum = (
-            None if share is None else share * (self.value / value)
-            for share in (c.efficiency_pool, c.efficiency_continuum)
-        )
-        certificate = replace(
-            c, pool=len(pool), efficiency_pool=of_pool, efficiency_continuum=of_continuum
-        )
-        first = self.first - int((lost < self.first).sum())
-        return Selection(pool, chosen, value, certificate, first)
 
 
 def select(
@@ -335,78 +277,6 @@ class _Rounds:
             searched=sum(c.searched for c in found),
             ascents=sum(c.ascents for c in found),
         )
-
-
-# The order of execution of a selection, and what becomes of poses that no move reaches.
-
-MOST_REPLACED = 50  # poses that cannot be reached, before that is said instead
-VIA = 200  # candidates through which a blocked move may go
-
-
-def ordered(
-    setup: Setup,
-    found: Selection,
-    shares: IntArray,
-    feasibility: Feasibility,
-    seed: int,
-    progress: Progress,
-    checkpoint: Checkpoint | None = None,
-    pinned: FeasiblePool | None = None,
-) -> tuple[Selection, Execution, list[str]]:
-    """The selection in the order of its levels, its execution, and warnings.
-
-    Poses that no chain of free moves reaches are replaced by the best others, unless they are
-    `pinned`.  Raises InsufficientDataError where that does not end.
-    """
-    lost = 0
-    while True:
-        plan = found.whole(pinned)
-        chosen = plan.chosen
-        try:
-            execution = _execution(setup, plan.pool, chosen, feasibility, seed, progress)
-        except Unreachable as error:
-            own = len(found.pool)
-            if lost >= MOST_REPLACED or (chosen[error.poses] >= own).any():
-                raise
-            lost += len(error.poses)
-            progress(f"{lost} poses that no free move reaches are replaced by the best others")
-            stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
-            gone = np.unique(chosen[error.poses])
-            found = found.without(gone, setup.having(pinned), shares, stage)
-            continue
-        return plan, execution, _warnings(lost, execution)
-
-
-def _execution(
-    setup: Setup,
-    pool: FeasiblePool,
-    chosen: IntArray,
-    feasibility: Feasibility,
-    seed: int,
-    progress: Progress,
-) -> Execution:
-    cell, states = feasibility.cell, setup.information.states
-    return schedule(
-        pool.q[chosen], cell.design.motion, feasibility,
-        loads=states.forces,
-        load=pool.load[chosen] if states.chosen else None,
-        limits=joint_limits(cell, feasibility.chain),
-        via=pool.q[:: max(len(pool) // VIA, 1)],
-        blockers=Blockers(feasibility),
-        alias=Alias.of(setup, pool, chosen),
-        paired=not states.observed.all(),
-        seed=seed, progress=progress,
-    )  # fmt: skip
-
-
-def _warnings(lost: int, execution: Execution) -> list[str]:
-    warnings = []
-    if lost:
-        warnings.append(f"{lost} better poses were left out, as no free move reaches them")
-    if execution.one_sided:
-        told = ", ".join(str(k + 1) for k in execution.one_sided)
-        warnings.append(f"approached from one side only, as the other is blocked: {told}")
-    return warnings
 
 
 # The course of a design.

@@ -19,8 +19,8 @@ from elastocal.units import IntArray, Progress
 # s = 0, where Φ_test is least, it rises with the square of u = s/(1 − s).
 
 FIRST, MOST = 0.3, 0.9  # shares tried first, and at most
-TRIES = 5
-CLOSE = 0.004  # of Φ at the test poses under the limit: a better share would not be noticed
+TRIES = 8
+CLOSE = 0.05  # of the price under the limit: a better share would not be noticed
 LOOSE = 1e-3  # gap of the relaxations
 SOME = 4000  # candidates that tell the share: it hangs on where poses are, not on each of them
 
@@ -44,11 +44,12 @@ def share_within(
         value = float(own.value(problem.information(weights)))
         if value <= limit:
             low = share
-            if share == MOST or value > (1 - CLOSE) * limit:
+            if share == MOST or limit - value < CLOSE * (limit - least):
                 break
         else:
             high = share
-        u = share / (1 - share) * np.sqrt((limit - least) / max(value - least, 1e-3 * least))
+        aim = (1 - CLOSE / 2) * (limit - least)
+        u = share / (1 - share) * np.sqrt(aim / max(value - least, 1e-3 * least))
         share = u / (1 + u)
         if not low < share < high:
             share = high if high == MOST and low else (low + high) / 2

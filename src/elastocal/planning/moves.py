@@ -425,11 +425,12 @@ def check_reachable(moves: Moves, blockers: BlockersOf | None) -> None:
             needed.insert(0, moves.home)
         if len(needed) < 2:
             continue
-        _, *lost = roadmap.parts(needed)
+        most, *lost = roadmap.parts(needed)
         if lost:
             every = [point for part in lost for point in part]
-            alone = lost[0] if moves.home in every else every
-            raise _unreachable(moves, roadmap, alone, blockers)
+            # Where most hang together, all others are told at once.
+            clear = len(most) > len(every) and moves.home not in every
+            raise _unreachable(moves, roadmap, every if clear else lost[0], blockers)
 
 
 def _check_approaches(

@@ -16,10 +16,11 @@ from elastocal.planning.selection import balanced
 
 def skewed(name: str = "test_pose", scenarios: int = 1) -> DesignProblem:
     """A problem whose parameters nearly do the same, as base and markers do."""
-    problem = random_problem(name, n=60, scenarios=scenarios)
+    robust = "none" if scenarios == 1 else "average"
+    problem = random_problem(name, n=60, scenarios=scenarios, robust=robust)
     p = problem.blocks.shape[-1]
     rng = np.random.default_rng(0)
-    mixed = np.ones((p, p)) + 1e-4 * rng.standard_normal((p, p))
+    mixed = np.ones((p, p)) + 2e-3 * rng.standard_normal((p, p))
     turned = problem.criterion.turned(np.repeat(mixed[None], scenarios, axis=0))
     assert turned is not None
     prior = mixed.T @ problem.prior @ mixed
@@ -43,7 +44,7 @@ def test_plans_keep_their_value_and_tangents_their_bound(name: str) -> None:
         ]
         assert values[0] == pytest.approx(values[1], rel=1e-5)
     assert even.sensitivity(tangent.G) == pytest.approx(
-        problem.sensitivity(relaxed.tangent.G), rel=1e-5
+        problem.sensitivity(relaxed.tangent.G), rel=1e-3
     )
 
 
