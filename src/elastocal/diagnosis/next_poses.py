@@ -33,7 +33,7 @@ from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import where_used
 from elastocal.units import Progress
 
-CRITERION, EFFORT = "robust", "batch"
+CRITERION = "robust"
 PAYS = 0.01  # share of the error by which a batch has to lower it
 
 NextVerdict = Literal["measure", "enough", "no_gain"]
@@ -155,7 +155,7 @@ def next_poses(
         levels=spec.levels or model.cell.model.compliance_levels,
     )  # fmt: skip
     cell = replace(model.cell, design=spec)
-    options = DesignOptions(EFFORT, seed, jobs, done=table, doubts=chances)
+    options = DesignOptions("batch", seed, jobs, done=table, doubts=chances)
     plan = design(cell, options, progress=progress)
     gain = plan.gain
     assert gain is not None  # the criterion has test poses

@@ -19,7 +19,7 @@ from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
-from typing import Any, Self, TypeVar, get_args
+from typing import Any, ClassVar, Self, TypeVar, get_args
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from elastocal.planning.criterion import (
     Criterion,
     CriterionInputs,
     Interest,
+    Need,
     Robust,
     ScenarioCriterion,
     SpectralTerm,
@@ -141,7 +142,7 @@ class RemainingError(TraceCriterion):
     title = "position error ρ₀ that remains at the test poses after compensation, rms"
     unit = "µm"
     scale = 1e6
-    needs = ("test_poses",)
+    needs: ClassVar[tuple[Need, ...]] = ("test_poses",)
 
     @classmethod
     def of(cls, inputs: CriterionInputs) -> Self:

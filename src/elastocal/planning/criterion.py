@@ -269,7 +269,7 @@ class Variances:
 # What a criterion is, and what the relaxation needs of it.
 
 Robust = Literal["none", "average", "worst"]
-Need = Literal["test_poses", "combination"]
+Need = Literal["test_poses", "combination", "doubts"]
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,9 @@ def usual_sizes(specs: Sequence[Parameter | ParameterSpec], columns: Array) -> A
     )
 
 
-def gain_of(setup: Setup, done: Done, after: Array, names: Sequence[str], seed: int) -> Gain | None:
+def gain_of(
+    setup: Setup, done: Done | None, after: Array, names: Sequence[str], seed: int
+) -> Gain | None:
     """What a plan that leads to the information `after` (p, p) adds to the measurements done;
     parameters that are not among `names` are in doubt.  None without any, or without test poses."""
     if done is None or setup.target_rows is None:

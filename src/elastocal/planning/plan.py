@@ -392,17 +392,17 @@ class Gain:
         The arm is N(V pull, V) away from the model, V the inverse of `before`: what it may lack,
         as far as the readings show it, and what they leave possible.
         """
-        of_model = np.ix_(own, own)
-        rms = [_rms(R, M) for M in (before, after)]
-        rms += [_rms(R[:, own], M[of_model]) for M in (before, after)]
+        part = np.ix_(own, own)
+        rms = _rms(R, before), _rms(R, after)
+        right = _rms(R[:, own], before[part]), _rms(R[:, own], after[part])
         if not np.isfinite(rms[0]):
-            return cls(*rms, np.inf)
+            return cls(*rms, *right, np.inf)
         factor = linalg.cho_factor(before, lower=True)
         bias = R @ linalg.cho_solve(factor, pull)
         root = linalg.solve_triangular(factor[0], R.T, lower=True).T
         z = np.random.default_rng(seed).standard_normal((len(pull), DRAWS))
         errors = np.linalg.norm(bias[:, None] + root @ z, axis=0)
-        return cls(*rms, float(np.quantile(errors, 0.95)))
+        return cls(*rms, *right, float(np.quantile(errors, 0.95)))
 
 
 @dataclass(frozen=True)
