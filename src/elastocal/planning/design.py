@@ -53,6 +53,7 @@ from elastocal.planning.setup import (
     shares_of,
 )
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
+from elastocal.planning.time_budget import at_stops, within
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
@@ -330,7 +331,7 @@ def _execution(
 ) -> Execution:
     cell, states = feasibility.cell, setup.information.states
     return schedule(
-        pool.q[chosen], cell.design.motion, feasibility,
+        pool.q[chosen], at_stops(cell), feasibility,
         loads=states.forces,
         load=pool.load[chosen] if states.chosen else None,
         limits=joint_limits(cell, feasibility.chain),
@@ -376,12 +377,21 @@ def design(
     """
     rest = options or DesignOptions(), checkpoint or Checkpoint(), progress
     whole = _Design(cell, *rest)
-    if cell.design.choose is None:
+    spec = cell.design
+    if spec.choose is None and spec.minutes is None:
         return whole.run()
-    targets, region = whole.targets()
-    known = Known(whole.options.fixed, whole.options.prior)
-    chosen = Choice(whole.model, targets, region, known, rest[0].seed, progress).best()
-    return replace(_Design(chosen.applied(cell), *rest, whole.model).run(), chosen=chosen)
+    choice = Choice(whole.model, *whole.targets(), whole.known(), rest[0].seed, progress)
+    chosen = None if spec.choose is None else choice.best()
+    placed = cell if chosen is None else chosen.applied(cell)
+
+    def plan_of(cell: Cell) -> Plan:
+        folder, own = rest[1].folder, rest[1]
+        if folder is not None and spec.minutes:  # poses come in several numbers
+            own = replace(own, folder=folder / f"{cell.design.poses}x{cell.design.repeats}")
+        made = _Design(cell, rest[0], own, progress, whole.model)
+        return replace(made.run(), chosen=chosen)
+
+    return plan_of(placed) if not spec.minutes else within(choice, placed, plan_of, spec.minutes)
 
 
 class _Design:
@@ -453,12 +463,7 @@ class _Design:
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
-        done = None
-        if options.done is not None:
-            progress("information of the measurements done")
-            done = measured(self.model, options.done, options.fixed)
-            self.warnings.append(f"B is taken at {done.note}")
-        known = Known(options.fixed, options.prior, done)
+        known = self.known()
         progress("information of the candidates")
         setup = set_up(
             self.model,
@@ -480,7 +485,16 @@ class _Design:
         found = select(setup, pool, shares, searches, options, self.checkpoint, progress, begun)
         progress("random plans beside it")
         drawn = random_plans(setup.problem(pool, shares), options.seed)
-        return self._plan(setup, found, shares, counts, targets.source, curve, done, drawn)
+        return self._plan(setup, found, shares, counts, targets.source, curve, known.done, drawn)
+
+    def known(self) -> Known:
+        """What is known before."""
+        options, done = self.options, None
+        if options.done is not None:
+            self.progress("information of the measurements done")
+            done = measured(self.model, options.done, options.fixed)
+            self.warnings.append(f"B is taken at {done.note}")
+        return Known(options.fixed, options.prior, done)
 
     def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
         """The test poses of the cell as it stands, and the rest of the joint ranges."""

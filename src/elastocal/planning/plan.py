@@ -360,6 +360,17 @@ class PlanSize:
     bound: float | None
 
 
+@dataclass(frozen=True)
+class TimedSize:
+    """`poses` with `repeats` readings of each marker in each load state take about `minutes` and
+    reach `value`, the criterion in the plan's unit, on few candidates."""
+
+    poses: int
+    repeats: int
+    minutes: float
+    value: float
+
+
 @dataclass(frozen=True, repr=False)
 class Plan(Result):
     """A measurement plan: poses in their order, what they promise, how far from the best they are.
@@ -389,6 +400,7 @@ class Plan(Result):
         everywhere: The error at the test poses and over all joint ranges, in m.
         seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
         chosen: What was chosen besides the poses, where [design.choose] asks for it.
+        timed: Numbers of poses and readings that a time allows, where one was given.
 
     Examples:
         >>> plan = ec.design(
@@ -428,6 +440,7 @@ class Plan(Result):
     everywhere: Everywhere | None = None
     seen: BoolArray | None = None
     chosen: Chosen | None = None
+    timed: tuple[TimedSize, ...] = ()
 
     def __repr__(self) -> str:
         sure = self.certificate.efficiency_pool
@@ -542,6 +555,8 @@ class Plan(Result):
                 }
                 for k, r in enumerate(self.reasons)
             ],
+            "timed": [asdict(size) for size in self.timed],
+            "minutes": self.execution.total / 60,
             "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
             "warnings": list(self.warnings),
             "seed": self.seed,

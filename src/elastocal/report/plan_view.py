@@ -96,6 +96,16 @@ def curve_rows(plan: Plan) -> ShownTable:
     return ShownTable(heads, rows, ())
 
 
+def timed_rows(plan: Plan) -> ShownTable:
+    """The criterion against numbers of poses and of readings that the time allows."""
+    heads = ("poses", "readings each", "minutes", f"{plan.criterion} {plan.unit}".strip())
+    return ShownTable(
+        heads,
+        [(str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed],
+        (),
+    )
+
+
 def removed(plan: Plan) -> list[tuple[str, int]]:
     """How many candidates each rule of the cell removed, the hardest rule first."""
     items = sorted(plan.candidates.removed_by.items(), key=lambda item: -item[1])
@@ -207,6 +217,10 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     lines.append(_candidate_line(plan))
     lines += _certificate_lines(plan)
     lines += [_execution_line(plan), *_drift_lines(plan)]
+    if plan.timed:
+        spec, took = plan.model.cell.design, plan.execution.total / 60
+        text = f"{took:.0f} minutes with {counted(spec.repeats, 'reading')} of each marker"
+        lines.append(("Time", f"{text}, moves and changes of load included."))
     if plan.polished:
         text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
         lines.append(("Polish", f"{text} candidates."))
@@ -392,4 +406,5 @@ def plan_contents(plan: Plan) -> dict[str, Any]:
         "intervals": interval_rows(plan),
         "removed": removal_rows(plan),
         "curve": curve_rows(plan),
+        "timed": timed_rows(plan),
     }

@@ -44,7 +44,14 @@ from elastocal.report.identification_view import (
 )
 from elastocal.report.judgement_view import judgement
 from elastocal.report.method_and_noise import candidate_rows, size_rows
-from elastocal.report.plan_view import curve_rows, interval_rows, plan_lines, pose_rows, reason_rows
+from elastocal.report.plan_view import (
+    curve_rows,
+    interval_rows,
+    plan_lines,
+    pose_rows,
+    reason_rows,
+    timed_rows,
+)
 from elastocal.screen import safe_console
 from elastocal.text import printable
 
@@ -246,6 +253,8 @@ def print_plan(console: Console, plan: Plan) -> None:
         tables = {"Why each pose": reason_rows(plan)} | tables
     if plan.curve:
         tables["Number of poses"] = curve_rows(plan)
+    if plan.timed:
+        tables["Poses and readings within the time"] = timed_rows(plan)
     console.print(_pose_table(plan, 2, reasons=True) if wide else _narrow_poses(console, plan))
     for title, table in tables.items():
         console.print(table_of(title, table, whole=True))
