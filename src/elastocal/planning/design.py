@@ -18,6 +18,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.checkpoint import Checkpoint, Stage, State
 from elastocal.planning.choices import Choice
+from elastocal.planning.conditions import Conditions
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.drift import Alias
 from elastocal.planning.exact_plan import (
@@ -436,25 +437,41 @@ class _Design:
     def _without_conditions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
         """The model without effects of time, temperature or the approach, none of which a pose
         has before it stands in an order."""
-        whole = self.model
-        names = tuple(
-            dict.fromkeys(
-                c.name
-                for c in whole.cell.model.effects
-                if not OPEN.isdisjoint(effect_of(c.name).needed(whole.cell))
+        whole, self.conditions = self.model, None
+        effects = dict.fromkeys(c.name for c in whole.cell.model.effects)
+        needs = {name: OPEN & set(effect_of(name).needed(whole.cell)) for name in effects}
+        unknown = tuple(name for name in effects if "temperature" in needs[name])
+        late = tuple(name for name in effects if needs[name] and name not in unknown)
+        if options.done is not None:
+            unknown, late = (*unknown, *late), ()
+        if unknown:
+            self.warnings.append(
+                f"the plan is made for the other parameters and holds {listed(unknown)} at "
+                "nominal: what drives them is not known before; record times and temperatures, and "
+                f"ask for reference poses ({option('reference_every', '10')}), so that "
+                "identification can tell them"
             )
-        )
-        if not names:
+            whole, options = _without(whole, unknown, options)
+        if not late:
             return whole, options
         self.warnings.append(
-            f"the plan is made for the other parameters and holds {listed(names)} at nominal: when "
-            "and from where a pose is visited follows from the order alone; record times, and ask "
-            f"for reference poses ({option('reference_every', '10')}), so that identification can "
-            "tell them"
+            f"poses are chosen for the other parameters, as time and order alone show "
+            f"{listed(late)}; the intervals count them, at the times and from the sides of "
+            "plan.csv: keep its order, and record times"
         )
-        return _without(whole, names, options)
+        rest, fewer = _without(whole, late, options)
+        self.conditions = Conditions(whole, rest), options.fixed
+        return rest, fewer
 
     def run(self) -> Plan:
+        """The plan, and what it promises of effects of time and approach."""
+        plan = self._chosen()
+        if self.conditions is None:
+            return plan
+        conditions, fixed = self.conditions
+        return conditions.promised(plan, self.targets()[0], replace(self.known(), fixed=fixed))
+
+    def _chosen(self) -> Plan:
         progress, options = self.progress, self.options
         shares = shares_of(self.cell)
         planned = [shares_of(self.cell, n) for n in options.curve]

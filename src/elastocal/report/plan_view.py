@@ -19,7 +19,7 @@ from elastocal.report.formatting import (
     joint_texts,
     significant,
 )
-from elastocal.text import printable
+from elastocal.text import listed, printable
 
 TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "serves (standard deviation without it)"
@@ -217,6 +217,13 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     lines.append(_candidate_line(plan))
     lines += _certificate_lines(plan)
     lines += [_execution_line(plan), *_drift_lines(plan)]
+    s = plan.scheduled
+    if s is not None and s.test_poses is not None and s.without is not None:
+        text = (
+            f"{s.test_poses * 1e6:.4g} µm at the test poses with {listed(s.effects)} found too, "
+            f"{s.without * 1e6:.4g} µm were they known"
+        )
+        lines.append(("In time", f"{text}."))
     if plan.timed:
         spec, took = plan.model.cell.design, plan.execution.total / 60
         text = f"{took:.0f} minutes with {counted(spec.repeats, 'reading')} of each marker"
