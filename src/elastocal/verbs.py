@@ -54,6 +54,7 @@ def design(
     poses: int | None = None,
     criterion: str | None = None,
     target: float | None = None,
+    minutes: float | None = None,
     curve: Sequence[int] = (),
     fixed: str | Sequence[str] = (),
     augment: Table | None = None,
@@ -100,6 +101,8 @@ def design(
             same with what the model may lack), "D", "A", "E", "G", "I", "c", "O1" to "O5".
         target: Find the smallest number of poses that reaches this error, in m; goes with the
             criteria test_pose, I and G, and instead of `poses`.
+        minutes: Find the numbers of poses and of readings at each that leave the least error
+            within this time; instead of `poses` and `target`.
         curve: Numbers of poses to compare.
         fixed: Parameters, places or effects held as known.
         augment: Measurements already done, or their file, which the plan adds to.
@@ -240,10 +243,17 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     for key, zero in (("target", False), ("repeatability", True)):
         if key in chosen:
             chosen[key] = _length(key, chosen[key], zero)
-    if "poses" in chosen and "target" in chosen:
+    if "minutes" in chosen:
+        require(
+            np.isfinite(float(chosen["minutes"])) and float(chosen["minutes"]) > 0,
+            f"{option('minutes')} takes a positive number; found {chosen['minutes']}",
+        )
+        chosen["minutes"] = float(chosen["minutes"])
+    wishes = [key for key in ("poses", "target", "minutes") if key in chosen]
+    if len(wishes) > 1:
         raise InputError(
-            f"{option('poses', chosen['poses'])} and {option('target', chosen['target'])}: a "
-            "target asks for the number of poses; drop one"
+            f"{' and '.join(option(key, chosen[key]) for key in wishes)}: a target or a time asks "
+            "for the number of poses; drop one"
         )
     if "loads" in chosen:
         chosen["loads"] = _vectors("loads", chosen["loads"])
@@ -287,9 +297,11 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     if "per_level" in chosen:
         chosen["per_level"] = tuple(_whole("per_level", n, 1) for n in chosen["per_level"])
     # What the cell says of the number of poses gives way to what is asked for here.
-    number = {"per_level": (), "target": None} if "poses" in chosen else {}
+    number: dict[str, Any] = {"minutes": None} if wishes else {}
+    if "poses" in chosen or "minutes" in chosen:
+        number |= {"per_level": (), "target": None}
     if chosen.get("per_level"):
-        number = {"poses": sum(chosen["per_level"]), "target": None}
+        number = {"poses": sum(chosen["per_level"]), "target": None, "minutes": None}
     return replace(cell.design, **(number | chosen))
 
 

@@ -37,7 +37,14 @@ def test_a_cell_with_a_drift_can_be_planned_for_and_what_is_held_is_said() -> No
     assert [choice.name for choice in found.model.cell.model.effects] == ["joint_compliance"]
     assert found.options.fixed == ("joint1",)
     (told,) = found.warnings
-    assert "holds base_drift at nominal" in told and "reference poses" in told
+    assert "time and order alone show base_drift" in told
+    assert found.conditions is not None and found.conditions[1] == ("base_drift", "joint1")
+    warm = plan_cell(
+        ("joint_compliance", "thermal_expansion"), model={"thermal_driver": "temperature"},
+        loads=DOWN[None],
+    )  # fmt: skip
+    (told,) = begun(warm).warnings
+    assert "holds thermal_expansion at nominal" in told and "reference poses" in told
 
 
 def test_parameters_that_no_load_shows_are_told_of_once() -> None:

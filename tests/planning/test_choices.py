@@ -86,8 +86,8 @@ def test_what_is_asked_for_at_the_test_poses_does_not_move_with_the_markers() ->
     cell = replace(cell, tool=replace(cell.tool, load_point=np.zeros(3)))
     made = search(cell)
     moved = {name: at + 0.2 for name, at in cell.tool.markers.items()}
-    there = made._relaxed(replace(cell, tool=replace(cell.tool, markers=moved)))
-    here = made._relaxed(cell)
+    there = made.relaxed(replace(cell, tool=replace(cell.tool, markers=moved)))
+    here = made.relaxed(cell)
     assert here is not None and there is not None
     assert np.allclose(here.setup.target_rows.T @ here.setup.target_rows,
                        there.setup.target_rows.T @ there.setup.target_rows)  # fmt: skip

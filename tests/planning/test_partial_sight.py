@@ -20,7 +20,7 @@ from elastocal.cell.workspace_rules import Visibility, Workspace
 from elastocal.errors import InputError
 from elastocal.model import observe
 from elastocal.planning import Plan
-from elastocal.planning.information import ALL_LOADS, _weights
+from elastocal.planning.information import ALL_LOADS, observed_weights
 
 STATES = np.array([[0.0, 0, 0], DOWN])
 Q = TABLE_2[:6]
@@ -60,7 +60,7 @@ def test_information_is_that_of_the_readings_that_are_made(observed: str, tau: f
     seen = part.seen(Q, load)
     assert 0 < seen.mean() < 1
     read = observe(part.rows(Q, load, x).take(seen.reshape(-1)), observed)
-    B = _weights(model, read, x).apply(model.regressor(read.table, x, None, read).B)
+    B = observed_weights(model, read, x).apply(model.regressor(read.table, x, None, read).B)
     assert relative(gathered(part, Q), B.T @ B) < 1e-9
 
 

@@ -125,8 +125,8 @@ class TargetBox:
 @record
 class Motion:
     """How the arm moves between poses: joint `speed` (n,) rad/s or m/s, (1,) where all are alike
-    (None: equal speeds), `home` (n,), `dwell` s of
-    measuring per pose, `load_change` s for hanging or taking off the load by hand,
+    (None: equal speeds), `home` (n,), `dwell` s of a stop and `reading` s more for each reading of
+    a marker in it, `load_change` s for hanging or taking off the load by hand,
     `both_directions`: approach every pose from both sides (`overshoot` rad), to show backlash.
     `load_changes`: how often at most the load may be hung, exchanged or taken off (None: as rarely
     as can be), `extra_time`: how much longer than by the shortest way all may take so that a
@@ -137,6 +137,7 @@ class Motion:
     speed: Positives | None = keyed(keys=SPEED_KEYS, default=None)
     home: Numbers | None = keyed("one number per joint, in {}", "home_deg", "home_si", default=None)
     dwell: NonNegative = keyed("a number >= 0 in s", "dwell_s", default=30.0)
+    reading: NonNegative = keyed("a number >= 0 in s", "reading_s", default=0.0)
     load_change: NonNegative = keyed("a number >= 0 in s", "load_change_s", default=600.0)
     both_directions: bool = keyed(default=False)
     overshoot: Positive = keyed("a positive number in degrees", "overshoot_deg", default=0.05)
@@ -245,6 +246,7 @@ class DesignSpec:
     robust_samples: Count = keyed("a whole number >= 1", default=8)
     candidates: Count | None = keyed("a whole number >= 1", default=None)
     target: Positive | None = keyed("a positive number in µm", "target_um", default=None)
+    minutes: Positive | None = keyed("a positive number", default=None)
     test_poses: Many[TargetPose] = keyed(
         "tables, each headed [[design.test_pose]]", "test_pose", default=()
     )
@@ -269,6 +271,10 @@ class DesignSpec:
             self.loads is None or len(np.unique(self.loads, axis=0)) == len(self.loads),
             "key design.loads_N repeats a load; give each once ([design] repeats says how often "
             "each is read)",
+        )
+        require(
+            self.minutes is None or self.target is None,
+            "keys design.minutes and design.target_um both ask for the number of poses; drop one",
         )
         require(
             not self.combination or any(self.combination.values()),

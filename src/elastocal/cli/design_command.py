@@ -71,6 +71,10 @@ def design(
             help="Find the smallest number of poses that reaches this, for a criterion in µm.",
         ),
     ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(help="Find the poses and readings each that leave the least error within."),
+    ] = None,
     curve: Annotated[
         str | None,
         typer.Option(metavar="N,N,…", help="Compare numbers of poses, as in 10,15,20,30."),
@@ -170,6 +174,7 @@ def design(
         "poses": poses,
         "criterion": criterion,
         "target": _target(target, poses),
+        "minutes": minutes,
         "candidates": candidates,
         "elsewhere": elsewhere,
         "elsewhere_cap": elsewhere_cap,

@@ -15,6 +15,7 @@ from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Blockers, Unreachable
 from elastocal.planning.plan import Certificate
 from elastocal.planning.setup import FeasiblePool, Setup
+from elastocal.planning.time_budget import at_stops
 from elastocal.units import IntArray, Progress
 
 
@@ -130,7 +131,7 @@ def _execution(
 ) -> Execution:
     cell, states = feasibility.cell, setup.information.states
     return schedule(
-        pool.q[chosen], cell.design.motion, feasibility,
+        pool.q[chosen], at_stops(cell), feasibility,
         loads=states.forces,
         load=pool.load[chosen] if states.chosen else None,
         limits=joint_limits(cell, feasibility.chain),

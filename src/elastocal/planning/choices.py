@@ -23,7 +23,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError, InsufficientDataError, require
 from elastocal.model.effects.driven import Entry, HookMotion, MarkerMotion
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import draw
+from elastocal.planning.candidates import Candidates, draw
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation, load_states
@@ -132,7 +132,7 @@ class Boxes:
 
 
 @dataclass(frozen=True)
-class _Point:
+class RelaxedPoint:
     """The relaxed optimum of a cell on candidates that its rules allow."""
 
     cell: Cell
@@ -182,7 +182,7 @@ class Choice:
                 f"{where}: no choice within [design.choose] gives a plan; widen the boxes"
             )
         self.progress("comparing what was chosen with the cell as it stands")
-        before, after = (self._relaxed(c, COMPARED) for c in (cell, found.cell))
+        before, after = (self.relaxed(c, COMPARED) for c in (cell, found.cell))
         if after is None or (
             freedom.loads is None and before is not None and before.value <= after.value
         ):
@@ -200,11 +200,11 @@ class Choice:
             share=(None if before is None else before.share, after.share),
         )
 
-    def _loads(self, most: int | None) -> _Point | None:
+    def _loads(self, most: int | None) -> RelaxedPoint | None:
         """The best `most` of the loads that are not zero, where the cell has its places."""
         cell, given = self.work.cell, self.work.cell.design.loads
         if most is None or given is None:
-            return self._relaxed(cell)
+            return self.relaxed(cell)
         heavy = np.flatnonzero(given.any(axis=1))
         sets = list(combinations(heavy, min(most, len(heavy))))
         require(
@@ -216,10 +216,10 @@ class Choice:
         for k, kept in enumerate(sets):
             self.progress(f"choosing loads, {k + 1} of {len(sets)}")
             hung = [i for i in range(len(given)) if i in kept or i not in heavy]
-            points.append(self._relaxed(_with_loads(cell, given[hung])))
+            points.append(self.relaxed(_with_loads(cell, given[hung])))
         return _least(points)
 
-    def _placed(self, boxes: Boxes, begun: _Point | None) -> _Point | None:
+    def _placed(self, boxes: Boxes, begun: RelaxedPoint | None) -> RelaxedPoint | None:
         """The best places found from where the cell has them and from others in the boxes."""
         cell = self.work.cell if begun is None else begun.cell
         draws = qmc.Sobol(3 * len(boxes.names), rng=np.random.default_rng(self.seed))
@@ -227,14 +227,14 @@ class Choice:
         points = []
         for k, unit in enumerate(starts):
             self.progress(f"choosing places, start {k + 1} of {len(starts)}")
-            points.append(self._relaxed(boxes.placed(cell, boxes.at(unit))))
+            points.append(self.relaxed(boxes.placed(cell, boxes.at(unit))))
         best = _least(points)
         for k in range(ROUNDS if best is not None else 0):
             assert best is not None
             unit, there = boxes.unit(boxes.places(best.cell)), self._moved(boxes, best)
             self.progress(f"choosing places, round {k + 1}")
             # All the way, or a part of it where the rules leave too little there.
-            way = (self._relaxed(boxes.placed(cell, boxes.at(unit + part * (there - unit))))
+            way = (self.relaxed(boxes.placed(cell, boxes.at(unit + part * (there - unit))))
                    for part in (1.0, 0.5, 0.25))  # fmt: skip
             better = next((p for p in way if p is not None and p.value < best.value), None)
             if better is None:
@@ -244,7 +244,7 @@ class Choice:
                 break
         return best
 
-    def _moved(self, boxes: Boxes, point: _Point) -> Array:
+    def _moved(self, boxes: Boxes, point: RelaxedPoint) -> Array:
         """The point (3 k,) of the unit cube that lowers Φ most at the weights of `point`."""
         setup, pool, w = point.setup, point.pool, point.relaxed.weights
         used = np.flatnonzero(w > USED * w.max())
@@ -260,13 +260,19 @@ class Choice:
         how = {"maxiter": 20, "eps": STEP, "ftol": 1e-4}
         return np.asarray(minimize(value, unit, method="L-BFGS-B", bounds=limits, options=how).x)
 
-    def _relaxed(self, cell: Cell, candidates: int = SEARCHED) -> _Point | None:
-        """The relaxed optimum of a cell; None where it leaves something open."""
+    def draw(self, cell: Cell, candidates: int = SEARCHED) -> Candidates:
+        """Candidates that the rules of a cell allow."""
+        rules = Feasibility(cell, self.work.chain)
+        return draw(cell, self.work.chain, load_states(cell), rules, candidates, self.seed)
+
+    def relaxed(self, cell: Cell, drawn: Candidates | int = SEARCHED) -> RelaxedPoint | None:
+        """The relaxed optimum of a cell on candidates drawn, or so many; None where it leaves
+        something open."""
         chain, states = self.work.chain, load_states(cell)
         shares: IntArray = shares_of(cell)
         try:
             rules = Feasibility(cell, chain)
-            drawn = draw(cell, chain, states, rules, candidates, self.seed)
+            drawn = self.draw(cell, drawn) if isinstance(drawn, int) else drawn
             setup = set_up(
                 Model.assembled(chain, cell), states, drawn.q, drawn.load, int(shares.sum()),
                 self.targets, self.known, self.seed, self.region,
@@ -276,7 +282,7 @@ class Choice:
             relaxed = relax(setup.problem(pool, shares), tolerance=GAIN / 10)
         except ElastocalError:
             return None
-        return _Point(cell, setup, pool, relaxed, drawn.feasible / drawn.tried)
+        return RelaxedPoint(cell, setup, pool, relaxed, drawn.feasible / drawn.tried)
 
 
 def _mobile(
@@ -308,7 +314,7 @@ def _with_loads(cell: Cell, loads: Array) -> Cell:
     return replace(cell, design=replace(cell.design, loads=loads))
 
 
-def _least(points: list[_Point | None]) -> _Point | None:
+def _least(points: list[RelaxedPoint | None]) -> RelaxedPoint | None:
     """The point with the least Φ."""
     found = [point for point in points if point is not None]
     return min(found, key=lambda point: point.value, default=None)

@@ -20,6 +20,7 @@ from elastocal.planning.arrangement import Selection, ordered
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice
+from elastocal.planning.conditions import Conditions
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
 from elastocal.planning.drift import left_by_drift
@@ -57,6 +58,7 @@ from elastocal.planning.setup import (
     shares_of,
 )
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
+from elastocal.planning.time_budget import within
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
@@ -304,12 +306,21 @@ def design(
     """
     rest = options or DesignOptions(), checkpoint or Checkpoint(), progress
     whole = _Design(cell, *rest)
-    if cell.design.choose is None:
+    spec = cell.design
+    if spec.choose is None and spec.minutes is None:
         return whole.run()
-    targets, region = whole.targets()
-    known = Known(whole.options.fixed, whole.options.prior)
-    chosen = Choice(whole.model, targets, region, known, rest[0].seed, progress).best()
-    return replace(_Design(chosen.applied(cell), *rest, whole.model).run(), chosen=chosen)
+    choice = Choice(whole.model, *whole.targets(), whole.known(), rest[0].seed, progress)
+    chosen = None if spec.choose is None else choice.best()
+    placed = cell if chosen is None else chosen.applied(cell)
+
+    def plan_of(cell: Cell) -> Plan:
+        folder, own = rest[1].folder, rest[1]
+        if folder is not None and spec.minutes:  # poses come in several numbers
+            own = replace(own, folder=folder / f"{cell.design.poses}x{cell.design.repeats}")
+        made = _Design(cell, rest[0], own, progress, whole.model)
+        return replace(made.run(), chosen=chosen)
+
+    return plan_of(placed) if not spec.minutes else within(choice, placed, plan_of, spec.minutes)
 
 
 class _Design:
@@ -358,25 +369,41 @@ class _Design:
     def _without_conditions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
         """The model without effects of time, temperature or the approach, none of which a pose
         has before it stands in an order."""
-        whole = self.model
-        names = tuple(
-            dict.fromkeys(
-                c.name
-                for c in whole.cell.model.effects
-                if not OPEN.isdisjoint(effect_of(c.name).needed(whole.cell))
+        whole, self.conditions = self.model, None
+        effects = dict.fromkeys(c.name for c in whole.cell.model.effects)
+        needs = {name: OPEN & set(effect_of(name).needed(whole.cell)) for name in effects}
+        unknown = tuple(name for name in effects if "temperature" in needs[name])
+        late = tuple(name for name in effects if needs[name] and name not in unknown)
+        if options.done is not None:
+            unknown, late = (*unknown, *late), ()
+        if unknown:
+            self.warnings.append(
+                f"the plan is made for the other parameters and holds {listed(unknown)} at "
+                "nominal: what drives them is not known before; record times and temperatures, and "
+                f"ask for reference poses ({option('reference_every', '10')}), so that "
+                "identification can tell them"
             )
-        )
-        if not names:
+            whole, options = _without(whole, unknown, options)
+        if not late:
             return whole, options
         self.warnings.append(
-            f"the plan is made for the other parameters and holds {listed(names)} at nominal: when "
-            "and from where a pose is visited follows from the order alone; record times, and ask "
-            f"for reference poses ({option('reference_every', '10')}), so that identification can "
-            "tell them"
+            f"poses are chosen for the other parameters, as time and order alone show "
+            f"{listed(late)}; the intervals count them, at the times and from the sides of "
+            "plan.csv: keep its order, and record times"
         )
-        return _without(whole, names, options)
+        rest, fewer = _without(whole, late, options)
+        self.conditions = Conditions(whole, rest), options.fixed
+        return rest, fewer
 
     def run(self) -> Plan:
+        """The plan, and what it promises of effects of time and approach."""
+        plan = self._chosen()
+        if self.conditions is None:
+            return plan
+        conditions, fixed = self.conditions
+        return conditions.promised(plan, self.targets()[0], replace(self.known(), fixed=fixed))
+
+    def _chosen(self) -> Plan:
         progress, options = self.progress, self.options
         pins, pinned_at = options.pins, (np.zeros((2, 0), dtype=np.int64))
         if pins is not None and len(pins.q):
@@ -392,11 +419,7 @@ class _Design:
         model, known = self.model, Known(options.fixed, options.prior)
         if "doubts" in CRITERIA[self.cell.design.criterion].needs:
             model, known = in_doubt(model, known, self.states, q, load, options.doubts)
-        if options.done is not None:
-            progress("information of the measurements done")
-            done = measured(self.model, options.done, options.fixed, model)
-            known = replace(known, done=done)
-            self.warnings.append(f"B is taken at {done.note}")
+        known = self._with_done(known, model)
         progress("information of the candidates")
         setup = set_up(
             model,
@@ -442,6 +465,20 @@ class _Design:
             f"{' with their shares of the levels' if len(shares) > 1 else ''}; ask for more poses",
         )
         return shares
+
+    def known(self) -> Known:
+        """What is known before."""
+        return self._with_done(Known(self.options.fixed, self.options.prior), self.model)
+
+    def _with_done(self, known: Known, model: Model) -> Known:
+        """With the measurements done, of the parameters of `model`."""
+        options = self.options
+        if options.done is None:
+            return known
+        self.progress("information of the measurements done")
+        done = measured(self.model, options.done, options.fixed, model)
+        self.warnings.append(f"B is taken at {done.note}")
+        return replace(known, done=done)
 
     def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
         """The test poses of the cell as it stands, and the rest of the joint ranges."""

@@ -49,7 +49,8 @@ class Stop:
     `travel` s.  `change_after`: the load is changed once that many of these k + 1 moves are done;
     None: it stays.  `approach` (n,): +1 or −1, the direction of each joint's last motion, and
     `side` 0 or 1 where the pose is approached from both sides.  `again`: how often it has been
-    visited for reference, this time included; 0 for the plan's own reading.
+    visited for reference, this time included; 0 for the plan's own reading.  `time` s from the
+    beginning to its readings, where that is asked for.
     """
 
     pose: int
@@ -61,6 +62,7 @@ class Stop:
     approach: IntArray | None = None
     side: int = 0
     again: int = 0
+    time: float | None = None
 
     def name(self, configurations: Sequence[str]) -> str:
         """That of its pose, of `configurations` (N,); "7r2" for the second time that pose 7 is

@@ -335,14 +335,27 @@ def estimable(
     first = replace(information, scenarios=information.scenarios[:1])
     blocks = first.blocks(q[some], load[some])[0]
     columns = np.searchsorted(information.columns, free)
-    B = blocks.reshape(-1, blocks.shape[-1])[:, columns] * np.sqrt(n_poses / len(some))
-    known = prior[np.ix_(free, free)]
+    B = np.zeros((blocks.shape[0] * blocks.shape[1], len(prior)))
+    B[:, free] = blocks.reshape(len(B), -1)[:, columns] * np.sqrt(n_poses / len(some))
+    return minimal_set(model, B, free, information.sizes, prior, stated)
+
+
+def minimal_set(
+    model: Model,
+    B: Array,
+    free: IntArray,
+    sizes: Array,
+    prior: Array,
+    stated: NDArray[np.bool_] | None = None,
+) -> Estimable:
+    """A minimal complete set of the `free` parameters, from readings with B (rows, parameters),
+    whitened and scaled by `sizes`; `prior` and `stated` as of `estimable`."""
+    B, known = B[:, free], prior[np.ix_(free, free)]
     if known.any():
         values, vectors = linalg.eigh(known)
         B = np.vstack([B, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T])
     if stated is not None:
         B = np.vstack([B, SURE * np.eye(len(free))[stated[free]]])
-    sizes = information.sizes
     structure, reduction = (
         _reduced(model, B, free, sizes, threshold) for threshold in (0.0, WORTH_A_COLUMN)
     )
@@ -465,7 +478,7 @@ def measured(
         x = np.array([known.get(p.name, p.nominal) for p in whole.parameters])
         model = whole
     observed = observe(table, model.observe)
-    weights = _weights(model, observed, x)
+    weights = observed_weights(model, observed, x)
     at = model.regressor(table, x, None, observed)
     B = weights.apply(at.B)
     return Done(x, B.T @ B, B.T @ weights.apply(at.residual), len(B), note)
@@ -478,7 +491,7 @@ def next_number(labels: Iterable[str]) -> int:
     return max(numbers, default=0) + 1
 
 
-def _weights(model: Model, observed: Observations, x: Array) -> Weights:
+def observed_weights(model: Model, observed: Observations, x: Array) -> Weights:
     """The stated noise, and with it what readings of one visit share."""
     stated = weights_for(observed, model.cell.tracker)
     tau, scatters = model.cell.design.repeatability, model.cell.noise.joints.any()

@@ -119,7 +119,8 @@ class PlanRows:
     """R rows of plan.csv: `configuration` names, `q` (R, n) rad or m, `level` (R,) from 1 on,
     `order` (R,) of execution from 1 on, and where the plan states them `force` (R, 3) N and
     `approach` (R, n) of ±1, and `marker` (R,) of `marker_names` where not all of them are read.
-    `notes`: further columns for people, passed over when read."""
+    `time` (R,) in s, where it counts.  `notes`: further columns for people, passed over when read.
+    """
 
     configuration: tuple[str, ...]
     q: Array
@@ -130,6 +131,7 @@ class PlanRows:
     notes: Mapping[str, Sequence[str]] | None = None
     marker: IntArray | None = None
     marker_names: tuple[str, ...] = (DEFAULT_MARKER,)
+    time: Array | None = None
 
     def table(self, joint_kinds: Sequence[str]) -> Measurements:
         """What `measurement_reader.read_plan` reads of these rows once they are written."""
@@ -152,6 +154,7 @@ class PlanRows:
             marker_names=self.marker_names,
             force=np.zeros((n, 3)) if self.force is None else self.force,
             approach=None if self.approach is None else self.approach.astype(float),
+            time=None if self.time is None else np.round(self.time, 3),
         )
 
 
@@ -181,7 +184,9 @@ def plan_rows(
         readings.setdefault(key, []).append((k, stop))
     rows = list(readings.values())
     first = [row[0][1] for row in rows]
-    sides = ("", "") if first[0].approach is None else ("+", "-")
+    sides = ("", "")
+    if any(stop.side for stop in execution.stops) or execution.motion.both_directions:
+        sides = ("+", "-")
     most = max(len(row) for row in rows)
     notes = {
         f"note_order_{i + 1}": [str(row[i][0]) if i < len(row) else "" for row in rows]
@@ -195,6 +200,7 @@ def plan_rows(
         rows, first = [rows[k] for k in of], [first[k] for k in of]
         approach = [approach[k] for k in of] if approach else []
         notes = {name: [cells[k] for k in of] for name, cells in notes.items()}
+    time = [stop.time for stop in first if stop.time is not None]
     return PlanRows(
         configuration=tuple(stop.name(configurations) + sides[stop.side] for stop in first),
         q=np.array([stop.q for stop in first]),
@@ -205,6 +211,7 @@ def plan_rows(
         notes=notes,
         marker=marker,
         marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
+        time=np.array(time) if time else None,
     )
 
 
@@ -247,6 +254,8 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
     if rows.approach is not None:
         for stem, values in zip(known["approach"].units, rows.approach.T, strict=True):
             columns[stem] = [str(int(v)) for v in values]
+    if rows.time is not None:
+        columns["time_s"] = [repr(round(float(t), 3)) for t in rows.time]
     columns["level"] = [str(int(v)) for v in rows.level]
     columns["order"] = [str(int(v)) for v in rows.order]
     return columns | dict(rows.notes or {})
@@ -414,6 +423,27 @@ class PlanSize:
     bound: float | None
 
 
+@dataclass(frozen=True)
+class Scheduled:
+    """`effects` that show by time and order alone, found with all else: rms position error in m at
+    the `test_poses`, and that `without` them; None where no plan can make it certain."""
+
+    effects: tuple[str, ...]
+    test_poses: float | None
+    without: float | None
+
+
+@dataclass(frozen=True)
+class TimedSize:
+    """`poses` with `repeats` readings of each marker in each load state take about `minutes` and
+    reach `value`, the criterion in the plan's unit, on few candidates."""
+
+    poses: int
+    repeats: int
+    minutes: float
+    value: float
+
+
 @dataclass(frozen=True, repr=False)
 class Plan(Result):
     """A measurement plan: poses in their order, what they promise, how far from the best they are.
@@ -445,6 +475,8 @@ class Plan(Result):
         names: Of the configurations, where poses of an earlier plan were kept.
         gain: What the plan adds to measurements done, where it does.
         chosen: What was chosen besides the poses, where [design.choose] asks for it.
+        scheduled: What effects of time and approach make of it, where the cell has some.
+        timed: Numbers of poses and readings that a time allows, where one was given.
 
     Examples:
         >>> plan = ec.design(
@@ -486,6 +518,8 @@ class Plan(Result):
     names: tuple[str, ...] = ()
     gain: Gain | None = None
     chosen: Chosen | None = None
+    timed: tuple[TimedSize, ...] = ()
+    scheduled: Scheduled | None = None
 
     def __repr__(self) -> str:
         sure = self.certificate.efficiency_pool
@@ -552,6 +586,7 @@ class Plan(Result):
         usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2
         again = any(stop.again for stop in self.execution.stops)
         alike = self.seen is None or bool((self.seen == self.seen[:, :1]).all())
+        again |= self.scheduled is not None or self.execution.stops[0].time is not None
         every = usual and alike and (self.load < 0).all() and not again
         return None if every else self.forces
 
@@ -602,6 +637,9 @@ class Plan(Result):
                 }
                 for k, r in enumerate(self.reasons)
             ],
+            "scheduled": None if self.scheduled is None else asdict(self.scheduled),
+            "timed": [asdict(size) for size in self.timed],
+            "minutes": self.execution.total / 60,
             "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
             "warnings": list(self.warnings),
             "seed": self.seed,

@@ -218,9 +218,9 @@ def set_up(
     raw = PoseInformation(model, states, scenarios, every, np.ones(len(every)), sight)
     sizes = typical_sizes(raw, q, load)
     information = replace(raw, sizes=sizes)
-    prior = _prior(model, known, sizes)
+    prior, stated = known_before(model, known, sizes)
     free = fixed_and_free(model, known.fixed)
-    found = estimable(information, q, load, free, prior, n_poses, _stated(model, known))
+    found = estimable(information, q, load, free, prior, n_poses, stated)
     kept = found.columns
     information = replace(information, columns=kept, sizes=sizes[kept])
     interest = interest_of(model, found)
@@ -319,8 +319,9 @@ def _scenarios(model: Model, known: Known, seed: int) -> Array:
     return np.stack([best, *moved])
 
 
-def _prior(model: Model, known: Known, sizes: Array) -> Array:
-    """Information known before (parameters, parameters), scaled by `sizes`."""
+def known_before(model: Model, known: Known, sizes: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Information known before (parameters, parameters), scaled by `sizes`, and of which
+    parameters (parameters,) a size is known and asked to be counted."""
     n = len(sizes)
     information = np.zeros((n, n))
     if model.cell.design.prior == "typical":
@@ -331,16 +332,10 @@ def _prior(model: Model, known: Known, sizes: Array) -> Array:
         information += P.T @ P
     if known.done is not None:
         information += known.done.information * np.outer(sizes, sizes)
-    return information
-
-
-def _stated(model: Model, known: Known) -> NDArray[np.bool_]:
-    """(parameters,) those of which a size is known beforehand and asked to be counted."""
     names = () if known.prior is None else known.prior.names
     typical = model.cell.design.prior == "typical"
-    return np.array(
-        [p.name in names or (typical and p.typical is not None) for p in model.parameters]
-    )
+    counted = [p.name in names or (typical and p.typical is not None) for p in model.parameters]
+    return information, np.array(counted)
 
 
 def _combination(model: Model, found: Estimable) -> Array | None:

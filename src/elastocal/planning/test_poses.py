@@ -607,6 +607,8 @@ def _table(
         marker_names=names,
         force=targets.force[pose],
         position=np.zeros((n, 3)),
+        time=np.zeros(n),  # the arm as it is at first, its joints come from either side
+        approach=np.zeros((n, targets.q.shape[1])),
     )
 
 

@@ -20,7 +20,7 @@ from elastocal.report.formatting import (
     joint_texts,
     significant,
 )
-from elastocal.text import printable
+from elastocal.text import listed, printable
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
@@ -98,6 +98,16 @@ def curve_rows(plan: Plan) -> ShownTable:
         for s in plan.curve
     ]
     return ShownTable(heads, rows, ())
+
+
+def timed_rows(plan: Plan) -> ShownTable:
+    """The criterion against numbers of poses and of readings that the time allows."""
+    heads = ("poses", "readings each", "minutes", f"{plan.criterion} {plan.unit}".strip())
+    return ShownTable(
+        heads,
+        [(str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed],
+        (),
+    )
 
 
 def removed(plan: Plan) -> list[tuple[str, int]]:
@@ -210,6 +220,17 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     lines.append(_candidate_line(plan))
     lines += _certificate_lines(plan)
     lines += [_execution_line(plan), *_drift_lines(plan)]
+    s = plan.scheduled
+    if s is not None and s.test_poses is not None and s.without is not None:
+        text = (
+            f"{s.test_poses * 1e6:.4g} µm at the test poses with {listed(s.effects)} found too, "
+            f"{s.without * 1e6:.4g} µm were they known"
+        )
+        lines.append(("In time", f"{text}."))
+    if plan.timed:
+        spec, took = plan.model.cell.design, plan.execution.total / 60
+        text = f"{took:.0f} minutes with {counted(spec.repeats, 'reading')} of each marker"
+        lines.append(("Time", f"{text}, moves and changes of load included."))
     if plan.polished:
         text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
         lines.append(("Polish", f"{text} candidates."))
@@ -449,4 +470,5 @@ def plan_contents(plan: Plan) -> dict[str, Any]:
         "intervals": interval_rows(plan),
         "removed": removal_rows(plan),
         "curve": curve_rows(plan),
+        "timed": timed_rows(plan),
     }

@@ -52,6 +52,7 @@ from elastocal.report.plan_view import (
     plan_lines,
     pose_rows,
     reason_rows,
+    timed_rows,
 )
 from elastocal.screen import safe_console
 from elastocal.text import printable
@@ -286,6 +287,8 @@ def print_plan(console: Console, plan: Plan) -> None:
         tables = {"Why each pose": reason_rows(plan)} | tables
     if plan.curve:
         tables["Number of poses"] = curve_rows(plan)
+    if plan.timed:
+        tables["Poses and readings within the time"] = timed_rows(plan)
     console.print(_pose_table(plan, 2, reasons=True) if wide else _narrow_poses(console, plan))
     for title, table in tables.items():
         console.print(table_of(title, table, whole=True))
