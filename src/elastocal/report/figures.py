@@ -25,7 +25,7 @@ from elastocal.report.diagnosis_view import error_steps
 from elastocal.report.effect_names import driver_name, effect_at, name_of, place, probability
 from elastocal.report.formatting import display, length, short_name, significant
 from elastocal.report.plan_view import removed
-from elastocal.report.residual_view import reach, running_mean
+from elastocal.report.residual_view import reach
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -406,8 +406,8 @@ def effects_over_joints(d: Diagnosis) -> str:
                 own = np.sign(shape.side) == side
                 told = "" if len(sides) == 1 else f" ({'from below' if side > 0 else 'from above'})"
                 dots(axes, q[own], 1e6 * shape.seen[own], SERIES[k], 1.8, f"readings{told}")
-                middle, mean, _ = running_mean(q[own], 1e6 * shape.explained[own], 20)
-                axes.plot(middle, mean, color=SERIES[k], linewidth=1.8, label=f"effect{told}")
+                axes.plot(q[own], 1e6 * shape.explained[own], "_", color=SERIES[k], markersize=9,
+                          markeredgewidth=1.8, label=f"effect{told}")  # fmt: skip
             axes.set_title(shape.name)
             axes.set_xlabel(f"joint in {'°' if revolute else 'mm'}")
             axes.set_ylabel(f"motion of the joint in {'µrad' if revolute else 'µm'}")
