@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from rich.text import Text
 from typer.testing import CliRunner
 
 from elastocal.cli.app import app, reporting_errors
-from elastocal.screen import complain, safe_console, say
+from elastocal.screen import SHARE, complain, progress_line, safe_console, say
 from elastocal.text import printable
 
 TITLE, MARK = "\x1b]0;owned\x07", "\u202egpj.exe"
@@ -206,3 +207,15 @@ def test_a_closed_pipe_is_no_error(tmp_path):
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     say("")
+
+
+def test_the_progress_line_shows_time_and_where_it_is_known_the_share(monkeypatch):
+    """Without a terminal a line for each message."""
+    text = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", text)
+    with progress_line(False) as tell:
+        tell("pose 3 of 12")
+    assert re.fullmatch(r"… pose 3 of 12 \(\d+ s\)\n", text.getvalue())
+    found = SHARE.search("pose 3 of 12")
+    assert found and found.groups() == ("3", "12")
+    assert SHARE.search("fitting with the noise found (stated)") is None

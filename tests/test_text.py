@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.tables import NUMBER, csv_text
-from elastocal.text import cell_meaning, cell_text, is_label, json_text, printable
+from elastocal.text import cell_meaning, cell_text, gathered, is_label, json_text, printable
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -66,3 +66,9 @@ def test_a_table_of_names_and_numbers_keeps_the_numbers():
     assert text.splitlines() == [
         "# made of \\x1b]0;x", "'=name,a,b", "'=1+1,-2.5,-2.5", "'@x,+1e3,1000.0", "''=y,'-x,0",
     ]  # fmt: skip
+
+
+def test_parameters_alike_are_told_together():
+    names = ["joint1.compliance", "joint2.compliance", "joint5.compliance", "link3.dx", "base.x"]
+    told = "compliance of joints 1, 2 and 5, dx of link 3, x of base"
+    assert gathered(names) == told

@@ -85,7 +85,8 @@ class Result(Saved):
         Args:
             kind: Which of the result's figures; default the first.  A `Calibration` has
                 "residuals" and "parameters", a `Plan` "poses" and "intervals", a `Diagnosis`
-                "budget" and "candidates", a `Compensation` "errors" and "uncertainty".
+                "budget" and "candidates", a `Compensation` "errors" and "uncertainty"; and each has
+                those of its page, such as "waterfall" or "spread" (they stand still).
             interactive: A figure to zoom and hover.
 
         Returns:

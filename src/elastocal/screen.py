@@ -207,7 +207,7 @@ def progress_line(quiet: bool) -> Iterator[Callable[[str], None]]:
             return "" if task.total is None else super().render(task)
 
     text = TextColumn("{task.description}", markup=False)
-    columns = (SpinnerColumn(), TimeElapsedColumn(), text, Share(bar_width=20))
+    columns = (SpinnerColumn("line"), TimeElapsedColumn(), text, Share(bar_width=20))
     with Progress(*columns, console=screen, transient=True) as shown_line:
         task = shown_line.add_task("starting", total=None)
 

@@ -6,6 +6,7 @@ import json
 import re
 import warnings
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -15,8 +16,12 @@ import numpy as np
 import pytest
 from support.pages import Page
 
+from elastocal.identification import gap_budget
+from elastocal.identification.error_budget import places, pose_accuracy
 from elastocal.model import observe
 from elastocal.report import residual_view
+from elastocal.report.formatting import length
+from elastocal.report.judgement_view import judgement
 from elastocal.report.page import page_of, write_page
 from elastocal.report.residual_figures import by_region
 
@@ -58,6 +63,39 @@ def test_structure(page: str) -> None:
     assert "model evaluated by" in structure.named_rows()
     assert "prefers-color-scheme: dark" in page
     assert "@media print" in page
+
+
+def test_the_page_lists_its_sections_and_says_when_it_was_made(page: str) -> None:
+    nav = page[page.index("<nav") : page.index("</nav>")]
+    parts = re.findall(r'<a id="(part\d+)"></a><h2>(.*?)</h2>', page)
+    assert len(parts) == page.count("<h2>")
+    assert all(f'<a href="#{part}">{head}</a>' in nav for part, head in parts)
+    assert Page(page).named_rows()["made on"][1] == date.today().isoformat()
+
+
+def test_errors_before_and_after_are_told_by_mean_spread_and_quantile(page: str, case: Any) -> None:
+    budget = gap_budget(case.result)
+    rows = {row[0]: row for row in Page(page).rows if len(row) == 6}
+    for name, step in (("nominal arm (base and markers by other poses)", budget.steps[0]),
+                       ("calibrated", budget.steps[-1])):  # fmt: skip
+        e = np.linalg.norm(step.errors, axis=1)
+        told = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())
+        assert rows[name][1:] == [str(len(e)), *map(length, told)]
+        assert step.heldout_rms == pytest.approx(float(np.sqrt(np.mean(e**2))))
+
+
+def test_the_certificate_is_one_page_of_accuracy_data_and_verdict(case: Any) -> None:
+    text = page_of(case.result, {"d.csv": "abc123"}, certificate=True)
+    page = Page(text)
+    page.check_harmless(text)
+    rows = page.named_rows()
+    n = len(np.unique(places(case.result.observations)))
+    accuracy = pose_accuracy(case.result.observations, gap_budget(case.result).steps[-1].errors)
+    assert rows["calibrated"][1:3] == [str(n), length(float(accuracy.mean()))]
+    assert rows["d.csv"][1] == "SHA-256abc123" and rows["made on"][1]
+    assert "10.0 µm" in rows["Instrument, standard deviations"][1] or "µm" in text
+    assert judgement(case.result).headline in page.text and "ISO 9283" in page.text
+    assert "<nav" not in text and not page.tags["svg"]
 
 
 def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:

@@ -13,7 +13,10 @@ from support.diagnoses import VERDICTS
 
 from elastocal.errors import InputError
 from elastocal.measurements import read_measurements, write_measurements
+from elastocal.report.figures import INK
 from elastocal.report.notebook import view_of
+from elastocal.report.page import figures_of
+from elastocal.report.residual_view import residuals_of
 
 VOID = {"br", "hr", "img"}
 
@@ -141,6 +144,22 @@ def test_kinds_of_figures(case, plan):
             assert result.plot(kind, interactive=True).data
         with pytest.raises(InputError, match="there are "):
             result.plot("none of them")
+
+
+def test_every_figure_of_the_page_is_there_in_its_own_colours(case):
+    found = figures_of(case.result)
+    assert {"waterfall", "spread", "sureness", "by_region", "matrix", "histogram"} <= set(found)
+    figure = case.result.plot("spread")
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    assert figure.axes[0].xaxis.label.get_color() == INK != "black"
+
+
+def test_configurations_are_told_by_their_names_and_parameters_each_on_its_scale(case):
+    ticks = case.result.plot().axes[-1].get_xticklabels()
+    assert {tick.get_text() for tick in ticks} <= set(residuals_of(case.result).labels)
+    figure = case.result.plot("parameters")
+    assert np.abs(drawn_points(figure)).max() <= 1.0
+    assert all("±" in tick.get_text() for tick in figure.axes[0].get_yticklabels())
 
 
 def test_both_libraries_draw_the_same(case):

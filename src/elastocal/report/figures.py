@@ -6,29 +6,36 @@ import hashlib
 import io
 import math
 import re
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.cell.arm_description import EffectChoice
 from elastocal.diagnosis.diagnosis import Curve, Diagnosis
+from elastocal.errors import ElastocalError
+from elastocal.model.manipulator import Model
 from elastocal.planning.plan import Plan
 from elastocal.report.causes_view import causes, family, share_text
 from elastocal.report.diagnosis_view import error_steps
 from elastocal.report.effect_names import driver_name, effect_at, name_of, place, probability
 from elastocal.report.formatting import display, length, short_name, significant
 from elastocal.report.plan_view import removed
+from elastocal.report.residual_view import reach
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Stand-ins that the page's style sheet replaces by colours for light and dark, screen and print.
-INK, GRID, FAINT = "#010203", "#010204", "#010205"
-SERIES = ("#010206", "#010207", "#010208", "#010209", "#01020a", "#01020b")
-ARM = "#01020c"
+# The colours of a figure by itself; a page has its style sheet's in their place, for light and
+# dark, screen and print.
+INK, GRID, FAINT = "#1c2226", "#e6e9eb", "#8a949b"
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+ARM = "#b9c4cc"
 _VARIABLES = {
     INK: "var(--ink)",
     GRID: "var(--grid)",
@@ -76,7 +83,20 @@ def style() -> AbstractContextManager[None]:
     return matplotlib.style.context(["default", {**_STYLE, "axes.prop_cycle": cycle}])
 
 
-def drawn(draw: Draw, width: float, height: float, title: str) -> str:
+_as_figures = ContextVar("_as_figures", default=False)
+
+
+@contextmanager
+def as_figures() -> Iterator[None]:
+    """Within it `drawn` gives matplotlib's Figures."""
+    token = _as_figures.set(True)
+    try:
+        yield
+    finally:
+        _as_figures.reset(token)
+
+
+def drawn(draw: Draw, width: float, height: float, title: str) -> Any:
     """The SVG element of what `draw` puts on a figure of the given size in inches.
 
     `title` says what the figure shows to those who cannot see it; it is not user text.
@@ -86,6 +106,9 @@ def drawn(draw: Draw, width: float, height: float, title: str) -> str:
     with style():
         figure = Figure(figsize=(width, height), layout="constrained")
         draw(figure)
+        if _as_figures.get():
+            figure.draw_without_rendering()  # what is made when drawing is made in this style
+            return figure
         buffer = io.StringIO()
         nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
         figure.savefig(buffer, format="svg", metadata=nothing)
@@ -302,6 +325,101 @@ def _curve(axes: Axes, curve: Curve) -> None:
     axes.plot(x * wide, y * high, color=INK, linewidth=1.4, label="estimated shape")
     axes.set_xlabel(f"{_axis_name(driver_name(curve.driver))} in {x_unit}")
     axes.set_ylabel(f"{short_name(driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}")
+
+
+MOST_SHAPES = 6
+
+
+@dataclass(frozen=True)
+class EffectShape:
+    """What a found effect of a joint does to it, reading by reading: `q` (N,) and, in rad or m too,
+    `explained` (N,) its motion, `seen` (N,) that with the residual left; `side` (N,) from where
+    the joint came, zero where nobody says."""
+
+    name: str
+    kind: str
+    q: NDArray
+    seen: NDArray
+    explained: NDArray
+    side: NDArray
+
+
+def effect_shapes(d: Diagnosis) -> list[EffectShape]:
+    """Of every named effect at a joint whose offset the model has.
+
+    With b = ∂p/∂q_j of a reading, bᵀr/bᵀb is the joint's motion that explains most of r: of the
+    effect, and of the effect with the residual that is left where it and all other parameters are
+    fitted (a component-plus-residual plot; to first order).
+    """
+    base, found = d.calibrated, []
+    if base is None or base.planned:
+        return []
+    model, observed = base.model, base.observed
+    wanted = [f for f in d.effects if f"{f.where}.offset" in model.names and f.parameters]
+    B = model.regressor(observed.table, base.x, observations=observed).B if wanted else None
+    for f in wanted[:MOST_SHAPES]:
+        assert B is not None
+        spec, new = model.cell.model, {p.name: p.value for p in f.parameters}
+        settings = {**spec.nominal.settings, **({f.where: f.settings} if f.settings else {})}
+        more = replace(
+            spec, effects=(*spec.effects, EffectChoice(f.effect, f.where)),
+            nominal=replace(spec.nominal, settings=settings),
+        )  # fmt: skip
+        values = dict(zip(model.names, base.x, strict=True)) | new
+        try:
+            full = Model.assembled(model.chain, replace(model.cell, model=more))
+            x = np.array([values[name] for name in full.names])
+            moved = full.predict(observed.table, x, observed)
+        except (ElastocalError, KeyError):
+            continue  # what it needs besides is not in the table
+        moved = moved - model.predict(observed.table, base.x, observed)
+        left = base.residual - moved + B @ np.linalg.lstsq(B, moved, rcond=None)[0]
+        b = B[:, model.names.index(f"{f.where}.offset")].reshape(-1, observed.size)
+        size = (b**2).sum(axis=1)
+        good = size > 0.1 * np.median(size)
+        seen, explained = (
+            (b * v.reshape(b.shape)).sum(axis=1)[good] / size[good] for v in (moved + left, moved)
+        )
+        joint, table = int(f.where.removeprefix("joint")) - 1, observed.table
+        lead = observed.lead[good]
+        side = np.zeros(len(lead)) if table.approach is None else table.approach[lead, joint]
+        found.append(
+            EffectShape(effect_at(f), model.chain.kinds[joint], table.q[lead, joint], seen,
+                        explained, side)
+        )  # fmt: skip
+    return found
+
+
+def effects_over_joints(d: Diagnosis) -> str:
+    """Every found effect of a joint over that joint's position, with the residuals behind it."""
+    shapes = effect_shapes(d)
+    if not shapes:
+        return ""
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(-(-len(shapes) // 2), min(2, len(shapes)), squeeze=False).ravel()
+        for axes, shape in zip(panels, shapes, strict=False):
+            revolute = shape.kind == "revolute"
+            q = np.degrees(shape.q) if revolute else shape.q * 1e3
+            sides = np.unique(np.sign(shape.side))
+            for k, side in enumerate(sides):
+                own = np.sign(shape.side) == side
+                told = "" if len(sides) == 1 else f" ({'from below' if side > 0 else 'from above'})"
+                dots(axes, q[own], 1e6 * shape.seen[own], SERIES[k], 1.8, f"readings{told}")
+                axes.plot(q[own], 1e6 * shape.explained[own], "_", color=SERIES[k], markersize=9,
+                          markeredgewidth=1.8, label=f"effect{told}")  # fmt: skip
+            axes.set_title(shape.name)
+            axes.set_xlabel(f"joint in {'°' if revolute else 'mm'}")
+            axes.set_ylabel(f"motion of the joint in {'µrad' if revolute else 'µm'}")
+            height = reach(1e6 * np.concatenate([shape.seen, shape.explained]))
+            axes.set_ylim(-height, height)
+            axes.legend(fontsize=7, loc="upper right", ncols=2)
+        for axes in panels[len(shapes) :]:
+            axes.set_visible(False)
+
+    return drawn(
+        draw, WIDTH, 0.3 + 2.7 * -(-len(shapes) // 2), "Found effects over the joints they act at"
+    )
 
 
 def _axis_name(text: str) -> str:

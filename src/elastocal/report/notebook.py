@@ -22,7 +22,7 @@ from elastocal.compensation.compensate import (
 from elastocal.diagnosis.changes import Comparison
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import InputError
-from elastocal.identification.result import Calibration
+from elastocal.identification.result import Calibration, Estimate
 from elastocal.model.effects import effect_of
 from elastocal.planning.plan import Plan
 from elastocal.report.causes_view import cause_rows, causes, field_rows, place_rows
@@ -40,7 +40,9 @@ from elastocal.report.identification_view import (
     combination_rows,
     leading_lines,
     parameter_rows,
+    signed_half,
     summary_lines,
+    texts,
 )
 from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
 from elastocal.report.plan_view import first_stops, plan_lines
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_BARS = 40
+MOST_TICKS = 20
 
 
 def residuals(result: Calibration, interactive: bool) -> Any:
@@ -66,6 +69,8 @@ def residuals(result: Calibration, interactive: bool) -> Any:
     found = residuals_of(result)
     panels = [f"{c} in {u}" for c, u in zip(found.components, found.units, strict=True)]
     rows = found.shown
+    at_poses = list(range(0, len(found.labels), -(-len(found.labels) // MOST_TICKS)))
+    names = [printable(found.labels[k]) for k in at_poses]
     hover = [
         f"configuration {printable(found.labels[found.pose[i]])}, marker "
         f"{printable(found.markers[found.marker[i]])}"
@@ -89,7 +94,8 @@ def residuals(result: Calibration, interactive: bool) -> Any:
                     row=k + 1, col=1,
                 )  # fmt: skip
             figure.update_yaxes(title_text=title, row=k + 1, col=1)
-        figure.update_xaxes(title_text="configuration", row=len(panels), col=1)
+        figure.update_xaxes(title_text="configuration", row=len(panels), col=1, tickvals=at_poses,
+                            ticktext=[_plain(name) for name in names])  # fmt: skip
         return figure.update_layout(height=160 + 180 * len(panels), template="plotly_white")
 
     def draw(figure: Any) -> None:
@@ -101,6 +107,7 @@ def residuals(result: Calibration, interactive: bool) -> Any:
                 axes.plot(found.pose[at], found.value[at, k], ".", markersize=4,
                           color=COLOURS[m % len(COLOURS)], label=printable(name))  # fmt: skip
             axes.set_ylabel(title)
+        grid[-1].set_xticks(at_poses, names)
         grid[-1].set_xlabel("configuration")
         if 1 < len(found.markers) <= 12:
             figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=6)
@@ -109,16 +116,23 @@ def residuals(result: Calibration, interactive: bool) -> Any:
 
 
 def parameters(result: Calibration, interactive: bool) -> Any:
-    """Deviation of each identified parameter from nominal in units of its 95 % half width."""
+    """Deviation of each identified parameter from nominal with its 95 % interval, each on a scale
+    of its own; the numbers stand with the names."""
     kept = [e for e in result.ordinary if e.value is not None and e.ci95 is not None]
     kept = [e for e in kept if np.isfinite(e.ci95).all()][:MOST_BARS]  # type: ignore[arg-type]
-    value = np.array([e.value - e.nominal for e in kept if e.value is not None])
-    ends = np.array([e.ci95 for e in kept], dtype=float).reshape(-1, 2)
     nominal = np.array([e.nominal for e in kept])
-    half = np.maximum((ends[:, 1] - ends[:, 0]) / 2, np.finfo(float).tiny)
-    axis = "deviation from nominal, in half widths of the 95 % interval"
-    ends = (ends - nominal[:, None]) / half[:, None]
-    return _bars([e.name for e in kept], value / half, axis, interactive, ends)
+    value = np.array([e.value for e in kept], dtype=float) - nominal
+    ends = np.array([e.ci95 for e in kept], dtype=float).reshape(-1, 2) - nominal[:, None]
+    reach = np.maximum(np.abs(ends).max(axis=1, initial=0.0), np.finfo(float).tiny)
+    axis = "deviation from nominal, each over its own largest"
+    return _bars([_with_numbers(e) for e in kept], value / reach, axis, interactive,
+                 ends / reach[:, None])  # fmt: skip
+
+
+def _with_numbers(e: Estimate) -> str:
+    """ "joint2.compliance  2.10 ± 0.05 µrad/(N·m)"."""
+    value, half, unit, _ = texts(e, None)
+    return f"{e.name}  {value} {signed_half(half)} {unit}"
 
 
 def intervals(plan: Plan, interactive: bool) -> Any:
@@ -244,6 +258,7 @@ def _bars(
         axes.errorbar(value, at, xerr=widths, fmt="o", color=COLOURS[0], elinewidth=1.6)
         axes.set_yticks(at, [_axis_label(printable(name)) for name in names])
         axes.set_ylim(n - 0.4, -0.6)
+        axes.margins(x=0.06)
         if logarithmic:
             axes.set_xscale("log")
         elif not (value < 0).any():
@@ -277,7 +292,7 @@ def _png(figure: Any) -> bytes:
     return picture.getvalue()
 
 
-def _axis_label(name: str, most: int = 44) -> str:
+def _axis_label(name: str, most: int = 64) -> str:
     return name if len(name) <= most else name[: most - 1] + "…"
 
 
@@ -302,14 +317,21 @@ class View:
     figures: Mapping[str, Drawn]
 
     def plot(self, result: Any, kind: str | None, interactive: bool) -> Any:
-        """The figure `kind`.  Raises InputError for a kind that the result does not have."""
+        """The figure `kind`: one of these, or one of the page's, which stand still.
+
+        Raises InputError for a kind that the result does not have.
+        """
         chosen = next(iter(self.figures)) if kind is None else kind
-        if chosen not in self.figures:
-            raise InputError(
-                f"no figure {quoted(chosen)}{did_you_mean(chosen, self.figures)}; there are "
-                f"{listed(self.figures)}"
-            )
-        return self.figures[chosen](result, interactive)
+        if chosen in self.figures:
+            return self.figures[chosen](result, interactive)
+        from elastocal.report.page import figures_of
+
+        found = figures_of(result)
+        if chosen not in found:
+            every = [*self.figures, *(name for name in found if name not in self.figures)]
+            hint = did_you_mean(chosen, every)
+            raise InputError(f"no figure {quoted(chosen)}{hint}; there are {listed(every)}")
+        return _showing(found[chosen])
 
 
 def view_of(result: object) -> View:

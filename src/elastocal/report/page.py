@@ -43,9 +43,11 @@ from elastocal.report.diagnosis_view import diagnosis_contents
 from elastocal.report.figures import (
     INK,
     SERIES,
+    as_figures,
     candidate_bars,
     diagnosis_waterfall,
     drawn,
+    effects_over_joints,
     plan_curve,
     plan_intervals,
     plan_removed,
@@ -188,6 +190,15 @@ def _digest(text: str) -> str:
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
+def figures_of(result: object) -> dict[str, Any]:
+    """The figures of a result's page as matplotlib's, by name; none where it has no model."""
+    if isinstance(result, Diagnosis) and result.model is None:
+        return {}
+    contents = next(contents for kind, (_, contents) in PAGES.items() if isinstance(result, kind))
+    with as_figures():
+        return {name: f for name, f in contents(result).get("figures", {}).items() if f}
+
+
 def sources(result: Any) -> list[Path]:
     """The cell and the tables that a result came from, as far as they are files."""
     if isinstance(result, Comparison):
@@ -255,6 +266,7 @@ def _diagnosis(d: Diagnosis) -> dict[str, Any]:
         "waterfall": diagnosis_waterfall(d) if d.budget else "",
         "candidates": candidate_bars(d),
         "curves": unknown_curves(d) if d.curves else "",
+        "effects": effects_over_joints(d),
     }
     shown: dict[str, Any] = {"view": None}
     if base is not None:
@@ -305,7 +317,7 @@ def _of(model: Model, figures: Mapping[str, str]) -> dict[str, Any]:
     names = dict.fromkeys([model.chain.name, model.cell.name])
     return {
         "title": " – ".join(name for name in names if name),
-        "figures": {name: Markup(svg) for name, svg in figures.items()},
+        "figures": {n: Markup(f) if isinstance(f, str) else f for n, f in figures.items()},
         "backend": model.backend_report(),
     }
 

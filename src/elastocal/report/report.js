@@ -223,7 +223,7 @@ class View {
   draw() {
     this.told.textContent = this.words();
     return Plotly.react(this.plot, this.traces(), this.layout(),
-      { responsive: true, displaylogo: false, scrollZoom: false,  // the wheel scrolls the page
+      { responsive: true, displaylogo: false, scrollZoom: true,
         modeBarButtons: [["zoom3d", "pan3d", "tableRotation", "resetCameraDefault3d"]] });
   }
 
@@ -276,6 +276,10 @@ class View {
     this.live.append(this.controls(), this.plot);
     this.live.hidden = false;
     await this.draw();
+    // The wheel scrolls the page; with Ctrl it zooms.
+    this.plot.addEventListener("wheel", event => {
+      if (!event.ctrlKey) event.stopPropagation();
+    }, { capture: true });
     // Where it was turned to stays, whatever is drawn next.
     this.plot.on("plotly_relayout", change => {
       this.camera = change["scene.camera"] ?? this.camera;
