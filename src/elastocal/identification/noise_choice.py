@@ -59,8 +59,8 @@ from elastocal.units import Array, BoolArray, IntArray
 #     criterion = −2ℓ + k_own · log(rows − p) + 2 · k_shared
 #
 # For the structure of single readings the price per variance is Schwarz's (BIC): one that is not
-# clearly better only makes the judgement of faulty readings erratic.  For shared effects it is
-# Akaike's (AIC): one that is left out wrongly makes intervals too narrow.
+# clearly better only makes the judgement of faulty readings erratic; so for joints told apart.  For
+# shared effects it is Akaike's (AIC): one that is left out wrongly makes intervals too narrow.
 
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
 LEAST_START = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
@@ -218,6 +218,9 @@ class _Choice:
         own, common = fit.structure.n_own, len(told)
         if fit.structure.shrunk:
             own = self.readings.size + 2  # means of log θ and its two variances
+        if kind.joints == EACH:  # what tells their sizes apart, those found to be none included
+            common += 1 - sum(bool(e.joints) for e in told)
+            own += sum(bool(e.joints) for e in fit.shared) - 1
         drifting = len(fit.structure.names) - fit.structure.n_own
         spent = common + drifting + kind.time
         criterion = own * self.price + 2 * spent - 2 * fit.log_likelihood

@@ -256,7 +256,7 @@ class Position:
         return normal * np.sqrt(self._quantile(level) / stats.chi2.ppf(level, 3))[:, None]
 
     def _quantile(self, level: float) -> Array:
-        return np.asarray(3 * stats.f.ppf(level, 3, np.minimum(self.dof, 1e9)))
+        return np.asarray(3 * stats.f.ppf(level, 3, np.clip(self.dof, 1, 1e9)))
 
     def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
         """Whether the regions of that `level` hold the places (n, 3)."""
@@ -287,10 +287,12 @@ def position_at(
     place = tool.poses(rows, q)[0]
     J = tool.errors(rows, q, place, None)[1]
     visit = (J * scatter.joints**2) @ J.transpose(0, 2, 1) + scatter.common**2 * np.eye(3)
-    index = {name: i for i, name in enumerate(tool.calibrated.model.names)}
-    known = [index[name] for name in tool.calibrated.determined]
-    dof = spread.dof_of(tool.sensitivity(rows, q)[..., known])
-    return Position(place, found.total, visit, dof)
+    arm = tool.calibrated
+    moved = np.zeros((len(q), 0, len(arm.determined)))
+    if spread.among:
+        known = [arm.model.names.index(name) for name in arm.determined]
+        moved = tool.sensitivity(rows, q)[..., known]
+    return Position(place, found.total, visit, spread.dof_of(moved))
 
 
 @dataclass(frozen=True)

@@ -142,6 +142,15 @@ def test_what_is_there_is_chosen_and_its_size_found(joints, drift, part):
     if joints:
         sizes = [np.sqrt(k.fit.common[-1]) for k in kinds]
         assert abs(np.mean(sizes) / SCATTER - 1) < 0.2
+        assert not any("each-joint" in k.kind for k in kinds)
+
+
+def test_joints_that_scatter_unlike_each_other_are_told_apart():
+    r = readings()
+    motion = r.visits.motion * np.array([4.0, 1.0, 0.2])
+    uneven = replace(r, visits=replace(r.visits, motion=motion))
+    e = drawn(uneven, np.random.default_rng(6), SCATTER).e
+    assert "each-joint" in estimate_noise(r.moved(e)).kind
 
 
 def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
