@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -177,11 +178,10 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         for name in stated
         if name not in kept_names
     ]
-    omissions += [
-        Omission(name, f"no cost without {' and '.join(map(_stating, needs))}", None)
-        for name, needs in unstated.items()
-        if needs
-    ]
+    for name, needs in unstated.items():
+        if needs:
+            missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
+            omissions.append(Omission(name, f"no cost without {missing}", None))
     exported = full if len(kept_names) == len(stated) else _part(calibrated, kept_names)
     if elastic:
         exported, changed = _as_springs(exported)
@@ -189,11 +189,6 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
             Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
         ]
     return Kept(full, exported, conditions, tuple(omissions), instrument)
-
-
-def _stating(need: str) -> str:
-    """What would state what an effect needs."""
-    return RECORDED.get(need) or option(OPTIONS[need])
 
 
 def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
@@ -444,22 +439,12 @@ def random_table(model: Model, conditions: Conditions, poses: int, seed: int) ->
     q = rng.uniform(low, high, (poses, chain.n_joints))
     for joint, levels in cell.model.compliance_levels.items():
         q[:, int(joint.removeprefix("joint")) - 1] = rng.choice(levels, poses)
-    return Measurements(
-        source="random poses",
-        row=np.arange(poses) + 2,
-        q=q,
-        configuration=np.arange(poses),
-        configuration_labels=tuple(str(i + 1) for i in range(poses)),
-        repeat=np.zeros(poses, dtype=np.int64),
-        marker=np.zeros(poses, dtype=np.int64),
-        marker_names=tuple(cell.tool.markers)[:1],
-        force=np.tile(conditions.force, (poses, 1)),
-        approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)),
-        time=None if conditions.time is None else np.full(poses, conditions.time),
-        temperature=None
-        if conditions.temperature is None
-        else np.full(poses, conditions.temperature),
-    )
+    stated = {"time": conditions.time, "temperature": conditions.temperature}
+    more: dict[str, Any] = {k: np.full(poses, v) for k, v in stated.items() if v is not None}
+    return Measurements.of_poses(
+        "random poses", q, conditions.force, marker_names=tuple(cell.tool.markers)[:1],
+        approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)), **more,
+    )  # fmt: skip
 
 
 def _positions(part: Valued, table: Measurements, points: Array) -> Array:
